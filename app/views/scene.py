@@ -29,7 +29,7 @@ class Scene:
         self._comparison_trace: Trace | None = None
         self._comparison: ComparisonEstimate | None = None
         self._closed = False
-        self._key = ""
+        self._key = self._task = ""
         self.set_dark(dark)
 
     def set_dark(self, dark: bool) -> None:
@@ -55,10 +55,7 @@ class Scene:
         with self._lock:
             if self._closed or self._belief is None or viewpoint not in self._belief.viewpoints:
                 return
-            position, target = self._belief.viewpoints[viewpoint]
-            for client in self._server.get_clients().values():
-                with client.atomic():
-                    client.camera.position, client.camera.look_at = position, target
+            self._move_cameras(self._belief, viewpoint)
             self._server.flush()
 
     def show(
@@ -100,7 +97,16 @@ class Scene:
             server.scene.reset()
             self._belief = BeliefScene(server, run, trace, self._layers)
             self._comparison = self._comparison_trace = None
+        if run.checkpoint.task.name != self._task:
+            self._task = run.checkpoint.task.name
+            self._move_cameras(self._belief, "first")
         self._key = run.scene_key
+
+    def _move_cameras(self, belief: BeliefScene, viewpoint: Viewpoint) -> None:
+        position, target = belief.viewpoints[viewpoint]
+        for client in self._server.get_clients().values():
+            with client.atomic():
+                client.camera.position, client.camera.look_at = position, target
 
     def _set_comparison(self, run: TracedRun, trace: Trace | None) -> None:
         if self._comparison is not None:

@@ -10,8 +10,12 @@ import {
   pairwiseMeasures,
   positionText,
   shapeName,
+  tilesScale,
   valuesAt,
 } from '../../app/page/maps/map_summary.js';
+import { moved, offsetAt } from '../../app/page/maps/crosshair.js';
+import { fitsCloseUp, mapLayout } from '../../app/page/maps/map_layout.js';
+import { comparable } from '../../app/page/maps/reference.js';
 import {
   areaUnit,
   borders,
@@ -202,13 +206,68 @@ test('small maps show the change to contact and the steps around the cursor', ()
   assert.deepEqual(tileSteps(contact, 27)[1], { step: 12, phase: 'contact', pair: true });
   const short = tileSteps([0, 0, 0], 1).map((tile) => tile.step);
   assert.deepEqual(short, [0, 1, 2]);
-  const { values, low, high } = tileShade(maps, 2, 'normalised');
+  const { values, low, high } = tileShade(maps, 2, 'normalised', 'own');
   assert.deepEqual([values[4], low, high], [1, 0, 1]);
   assert.ok(Math.abs(values[0] - Math.exp(-20)) < 1e-6);
   assert.deepEqual(
-    [tileShade(maps, 2, 'log').values[0], tileShade(maps, 2, 'log').low],
+    [tileShade(maps, 2, 'log', 'own').values[0], tileShade(maps, 2, 'log', 'own').low],
     [-20, -40],
   );
+  assert.deepEqual(
+    [0, 1, 2].map((i) => tileShade(maps, i, 'log', 'same').values[4]),
+    [-2, -3, 0],
+  );
+  assert.deepEqual(tilesScale('likelihood', 'log', 'same', tileShade(maps, 0, 'log', 'same')), {
+    low: '≤−40',
+    high: '0',
+    label: "log likelihood below the step's highest peak, nats",
+  });
+});
+
+test('maps are as large as their panel allows, in two rows where that is larger', () => {
+  assert.deepEqual(mapLayout(3, 640, 200, 18), { columns: 3, side: 164 }); // the height limits them
+  assert.equal(mapLayout(3, 460, 400, 18).columns, 3);
+  assert.equal(mapLayout(6, 600, 500, 18).columns, 3);
+  assert.equal(mapLayout(6, 1600, 200, 18).columns, 6);
+  assert.equal(mapLayout(2, 10, 10, 18).side, 60);
+});
+
+test('the close-up contains peaks and regions', () => {
+  const numbers = { ...maps.numbers, area95: [0.001, 0.001, 0.001], elongation: [1, 1, null] };
+  const peaks = maps.peak.map(() => [0, 0.02]);
+  assert.ok(fitsCloseUp({ ...maps, numbers, peak: peaks }));
+  assert.ok(!fitsCloseUp({ ...maps, numbers, peak: [...peaks.slice(1), [0.07, 0]] }));
+  assert.ok(
+    !fitsCloseUp({ ...maps, numbers: { ...numbers, elongation: [40, 1, 1] }, peak: peaks }),
+  );
+});
+
+test('the crosshair stays on the visible area', () => {
+  assert.deepEqual(offsetAt(maps, 4, 0.5, 0.5), [0, 0]);
+  assert.deepEqual(offsetAt(maps, 2, 1, 1), [0.15, -0.15]);
+  assert.equal(offsetAt(maps, 1, 1.01, 0.5), null);
+  const close = (/** @type {number[]} */ a, /** @type {number[]} */ b) =>
+    assert.ok(
+      a.every((value, i) => Math.abs(value - b[i]) < 1e-12),
+      `${a} ${b}`,
+    );
+  close(moved(maps, 1, null, [1, 0], 1), [0.2, 0]);
+  close(moved(maps, 1, [0.2, 0], [1, 0], 5), [0.2, 0]);
+  close(moved(maps, 1, [0, 0], [0, -1], 1), [0, -0.2]);
+});
+
+test('maps are compared with maps of the same layers, content and extent', () => {
+  assert.ok(comparable(maps, { ...maps }));
+  const [x, y] = maps.axes;
+  const others = [
+    { layers: ['image'] },
+    { quantity: /** @type {const} */ ('posterior') },
+    { others: /** @type {const} */ ('marginal') },
+    { axes: [x, { ...y, half_width: 0.2 }] },
+    { axes: [y, x] },
+  ];
+  for (const other of others)
+    assert.ok(!comparable(maps, { ...maps, ...other }), Object.keys(other)[0]);
 });
 
 test('values of cells', () => {
@@ -239,7 +298,7 @@ test('measures as text', () => {
   assert.equal(layerMeasures(maps, 1, true).cells[0], '110.0, 190.0 cm');
   assert.deepEqual(
     [0, 1, 2].map((layer) => shapeName(maps, layer)),
-    ['round', 'ridge 90°, 3.0:1', 'ring, radius 6.2 cm'],
+    [['round'], ['ridge 90°', '3.0:1'], ['ring', 'radius 6.2 cm']],
   );
   const { description } = layerMeasures(maps, 2, false);
   assert.match(description, /around \+3\.0, −1\.0 cm from the truth, over 90 % of the circle/);

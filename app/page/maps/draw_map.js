@@ -112,9 +112,7 @@ export function drawMap(context, layer, side, options) {
   context.beginPath();
   context.rect(0, 0, side, side);
   context.clip();
-  layer.borders.forEach((segments, i) =>
-    drawBorder(context, segments, side, options.zoom, BORDER_OPACITIES[i]),
-  );
+  layer.borders.forEach((segments, i) => drawBorder(context, segments, side, options.zoom, i));
   drawMarks(context, layer, side, options);
   context.restore();
 }
@@ -221,19 +219,20 @@ function ticks(middle, half, side) {
 }
 
 /**
+ * Draws the border of a region.
  * @param {Context} context
- * @param {number[]} segments
- * @param {number} side
+ * @param {number[]} segments see `borders` in map_values.js
+ * @param {number} side px
  * @param {number} zoom
- * @param {number} opacity
+ * @param {number} region 0 for the smallest one
  */
-function drawBorder(context, segments, side, zoom, opacity) {
+export function drawBorder(context, segments, side, zoom, region) {
   /** @param {number} share */
   const position = (share) => ((share - 0.5) * zoom + 0.5) * side;
   /** @type {Stroke[]} */
   const strokes = [
     ['rgb(0 0 0 / 0.3)', 2.25],
-    [`rgb(255 255 255 / ${opacity})`, 1],
+    [`rgb(255 255 255 / ${BORDER_OPACITIES[region]})`, 1],
   ];
   strokeAll(context, strokes, () => {
     for (let i = 0; i < segments.length; i += 4) {

@@ -17,14 +17,16 @@ const SHEET = { padding: 14, title: 24, bar: 8, footer: 40, pixelRatio: 2 };
 const INK = '#222';
 const LEFT = MARGIN.left + MARGIN.name;
 const COLUMN = SIDE + LEFT + MARGIN.right;
+const TILE = { side: 140, gap: 8, names: 70, head: 36 }; // px, of a sheet with several steps
 
-/** @type {Record<string, (sheet: DisplayedMaps, name: string) => Promise<string> | string>} */
+/** Exports of the displayed steps. @type {Record<string, (sheets: DisplayedMaps[], name: string) => Promise<string> | string>} */
 const ACTIONS = {
-  png: async (sheet, name) => download(await png(sheet), `${name}.png`),
-  svg: (sheet, name) => download(new Blob([svg(sheet)], { type: 'image/svg+xml' }), `${name}.svg`),
-  csv: (sheet, name) => download(new Blob([csv(sheet)], { type: 'text/csv' }), `${name}.csv`),
-  copy: async (sheet) => {
-    await navigator.clipboard.write([new ClipboardItem({ 'image/png': png(sheet) })]);
+  png: async (sheets, name) => download(await png(sheets), `${name}.png`),
+  svg: (sheets, name) =>
+    download(new Blob([svg(sheets)], { type: 'image/svg+xml' }), `${name}.svg`),
+  csv: (sheets, name) => download(new Blob([csv(sheets)], { type: 'text/csv' }), `${name}.csv`),
+  copy: async (sheets) => {
+    await navigator.clipboard.write([new ClipboardItem({ 'image/png': png(sheets) })]);
     return 'Image copied.';
   },
 };
@@ -32,7 +34,7 @@ const ACTIONS = {
 /**
  * Connects the buttons of the export.
  * @param {HTMLElement} host
- * @param {() => DisplayedMaps | null} displayed
+ * @param {() => DisplayedMaps[]} displayed maps of each displayed step
  * @returns {(layers: string[]) => void} sets the layers to choose from
  */
 export function bindExport(host, displayed) {
@@ -40,12 +42,14 @@ export function bindExport(host, displayed) {
   const output = html('output', host);
   host.addEventListener('click', async ({ target }) => {
     const action = target instanceof HTMLElement && ACTIONS[target.dataset.as ?? ''];
-    const sheet = displayed();
-    if (!action || !sheet) return;
-    const selected = sheet.layers.filter(({ name }) => name === select.value);
-    const layers = selected.length ? selected : sheet.layers;
+    const sheets = displayed();
+    if (!action || !sheets.length) return;
+    const selected = sheets.map((sheet) => {
+      const layers = sheet.layers.filter(({ name }) => name === select.value);
+      return layers.length ? { ...sheet, layers } : sheet;
+    });
     try {
-      output.textContent = await action({ ...sheet, layers }, fileName(sheet, select.value));
+      output.textContent = await action(selected, fileName(sheets, select.value));
     } catch (error) {
       output.textContent = sentence(`Export failed: ${messageOf(error)}`);
     }
@@ -59,60 +63,72 @@ export function bindExport(host, displayed) {
 }
 
 /**
- * @param {DisplayedMaps} sheet
+ * @param {DisplayedMaps[]} sheets
  * @param {string} layer
  */
-function fileName({ trace, maps }, layer) {
+function fileName(sheets, layer) {
+  const [{ trace, maps }] = sheets;
   const { task, filter, episode } = trace.selection;
-  return [task, filter, `episode${episode}`, `step${maps.step}`, layer || 'maps']
+  const steps = `step${sheets.length > 1 ? 's' : ''}${sheets.map((sheet) => sheet.maps.step).join('-')}`;
+  return [task, filter, `episode${episode}`, steps, layer || 'maps']
     .concat(maps.quantity === 'likelihood' ? [] : maps.quantity)
     .join('-')
     .replaceAll(/[^\w.-]+/g, '-');
 }
 
-/** @param {DisplayedMaps} sheet */
-function caption({ trace, maps }) {
+/** @param {DisplayedMaps[]} sheets */
+function caption(sheets) {
+  const [{ trace, maps }] = sheets;
   const { task, filter, data, episode, faults } = trace.selection;
   const off = trace.components.findIndex((_, i) => maps.axes.every(({ index }) => index !== i));
   const { unit, scale } = off < 0 ? { unit: '', scale: 1 } : trace.unitOf(off);
   const angle =
     maps.angle === null ? '' : `, cross-section at ${fixed(maps.angle * scale, 1)}${unit}`;
-  return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `faults ${faults}, ` : ''}step ${maps.step}${angle}`;
+  const steps = sheets.map((sheet) => sheet.maps.step).join(', ');
+  const named = `${sheets.length > 1 ? 'steps' : 'step'} ${steps}`;
+  return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `faults ${faults}, ` : ''}${named}${angle}`;
 }
 
 /**
- * Writes a table with one row per cell.
- * @param {DisplayedMaps} sheet
+ * Writes a table with one row per cell. With several steps, the first column is the step.
+ * @param {DisplayedMaps[]} sheets
  */
-export function csv(sheet) {
-  const { maps, layers } = sheet;
+export function csv(sheets) {
+  const [{ maps, layers }] = sheets;
+  const several = sheets.length > 1;
+  const lowest = sheets.map(({ maps: { step, log_max: max, log_range: range }, layers: drawn }) => {
+    const values = drawn.map(({ name, index }) => `${name} ${fixed(max[index] - range[index], 3)}`);
+    return `${several ? `step ${step}: ` : ''}${values.join(' / ')}`;
+  });
+  const comments = [
+    `# Beliefscope: ${caption(sheets)}: natural logarithm. ${mapTitle(maps)}`,
+    `# offset: from the true value. Values are clipped at: ${lowest.join('; ')}`,
+  ];
+  const columns = [
+    ...(several ? ['step'] : []),
+    ...maps.axes.map(({ name, shown }) => columnName(`${name}_offset`, shown)),
+    ...maps.axes.map(({ name, shown }) => columnName(name, shown)),
+    ...layers.map(({ name }) => `${name}_ln_${maps.quantity}_nats`),
+  ];
+  const rows = sheets.flatMap((sheet) =>
+    several ? csvRows(sheet).map((row) => `${sheet.maps.step},${row}`) : csvRows(sheet),
+  );
+  const head = [...comments.map((line) => line.replaceAll('−', '-')), columns.join(',')];
+  return `${[...head, ...rows].join('\n')}\n`;
+}
+
+/** @param {DisplayedMaps} sheet */
+function csvRows({ maps, layers }) {
   const logs = layers.map(({ index }) => logLikelihood(maps, index));
   const { size, rows: height, axes, centre } = maps;
   /** @param {number} index @param {number} axis */
   const offset = (index, axis) => (((index + 0.5) / size) * 2 - 1) * axes[axis].half_width;
-  const lowest = layers.map(
-    ({ name, index }) => `${name} ${fixed(maps.log_max[index] - maps.log_range[index], 3)}`,
-  );
-  const comments = [
-    `# Beliefscope: ${caption(sheet)}: natural logarithm. ${mapTitle(maps)}`,
-    `# offset: from the true value. Values are clipped at: ${lowest.join(' / ')}`,
-  ];
-  const names = layers.map(({ name }) => `${name}_ln_${maps.quantity}_nats`);
-  const rows = [
-    ...comments.map((line) => line.replaceAll('−', '-')),
-    [
-      ...axes.map(({ name, shown }) => columnName(`${name}_offset`, shown)),
-      ...axes.map(({ name, shown }) => columnName(name, shown)),
-      ...names,
-    ].join(','),
-  ];
-  for (let i = 0; i < size * height; i++) {
-    const offsets = axes.map((_, axis) => offset(axis ? Math.floor(i / size) : i % size, axis));
+  return Array.from({ length: size * height }, (_, i) => {
+    const offsets = axes.map((__, axis) => offset(axis ? Math.floor(i / size) : i % size, axis));
     const positions = [...offsets, ...offsets.map((d, axis) => d + centre[axis])];
     const numbers = positions.map((value, k) => (value * axes[k % axes.length].scale).toFixed(3));
-    rows.push([...numbers, ...logs.map((values) => values[i].toFixed(4))].join(','));
-  }
-  return `${rows.join('\n')}\n`;
+    return [...numbers, ...logs.map((values) => values[i].toFixed(4))].join(',');
+  });
 }
 
 /**
@@ -121,25 +137,25 @@ export function csv(sheet) {
  */
 const columnName = (name, unit) => (unit ? `${name}_${unit}` : name);
 
-/** @param {DisplayedMaps} sheet */
-function svg(sheet) {
+/** @param {DisplayedMaps[]} sheets */
+function svg(sheets) {
   const context = new SvgContext();
-  const [width, height] = sheetSize(sheet);
-  drawSheet(context, sheet, width, height);
+  const [width, height] = sheetSize(sheets);
+  drawSheet(context, sheets, width, height);
   return context.document(width, height);
 }
 
 /**
- * @param {DisplayedMaps} sheet
+ * @param {DisplayedMaps[]} sheets
  * @returns {Promise<Blob>}
  */
-async function png(sheet) {
-  const [width, height] = sheetSize(sheet);
+async function png(sheets) {
+  const [width, height] = sheetSize(sheets);
   const { pixelRatio } = SHEET;
   const canvas = create('canvas', { width: pixelRatio * width, height: pixelRatio * height });
   const context = context2d(canvas);
   context.scale(pixelRatio, pixelRatio);
-  drawSheet(context, sheet, width, height);
+  drawSheet(context, sheets, width, height);
   return new Promise((resolve, reject) => {
     canvas.toBlob(
       (blob) => (blob ? resolve(blob) : reject(new Error('the image is too large'))),
@@ -148,27 +164,53 @@ async function png(sheet) {
   });
 }
 
-/** @param {DisplayedMaps} sheet */
-function sheetSize({ layers }) {
+/** @param {DisplayedMaps[]} sheets */
+function sheetSize(sheets) {
   const { padding, title, footer } = SHEET;
+  const { length } = sheets[0].layers;
+  if (sheets.length > 1) {
+    const pitch = TILE.side + TILE.gap;
+    const left = TILE.names + MARGIN.left;
+    return [
+      2 * padding + left + sheets.length * pitch,
+      2 * padding + TILE.head + length * (pitch + MARGIN.bottom) + footer,
+    ];
+  }
   return [
-    2 * padding + layers.length * COLUMN,
+    2 * padding + length * COLUMN,
     padding + title + SIDE + MARGIN.bottom + MARGIN.name + footer + padding,
   ];
 }
 
 /**
  * @param {Context} context
- * @param {DisplayedMaps} sheet
+ * @param {DisplayedMaps[]} sheets
  * @param {number} width
  * @param {number} height
  */
-function drawSheet(context, sheet, width, height) {
-  const { padding, title } = SHEET;
+function drawSheet(context, sheets, width, height) {
+  const { padding } = SHEET;
   context.fillStyle = '#fff';
   context.beginPath();
   context.rect(0, 0, width, height);
   context.fill();
+  if (sheets.length > 1) drawSteps(context, sheets);
+  else drawStep(context, sheets[0]);
+  context.fillStyle = INK;
+  context.font = '10px system-ui, sans-serif';
+  [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
+  const [{ maps, title }] = sheets;
+  context.fillText(caption(sheets), padding, height - padding - 12);
+  context.fillText(`${mapTitle(maps)}. Colour: ${title}`, padding, height - padding);
+}
+
+/**
+ * Draws the maps of one step side by side.
+ * @param {Context} context
+ * @param {DisplayedMaps} sheet
+ */
+function drawStep(context, sheet) {
+  const { padding, title } = SHEET;
   sheet.layers.forEach((layer, i) => {
     context.save();
     context.translate(padding + i * COLUMN + LEFT, padding + title);
@@ -182,11 +224,38 @@ function drawSheet(context, sheet, width, height) {
     draw(context, layer, SIDE, options);
     context.restore();
   });
-  context.fillStyle = INK;
-  context.font = '10px system-ui, sans-serif';
-  [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
-  context.fillText(caption(sheet), padding, height - padding - 12);
-  context.fillText(`${mapTitle(sheet.maps)}. Colour: ${sheet.title}`, padding, height - padding);
+}
+
+/**
+ * Draws a column of maps for each step.
+ * @param {Context} context
+ * @param {DisplayedMaps[]} sheets
+ */
+function drawSteps(context, sheets) {
+  const { side, gap, names, head } = TILE;
+  context.translate(SHEET.padding, SHEET.padding);
+  sheets.forEach(({ maps, layers, options, phase }, column) => {
+    const x = names + MARGIN.left + column * (side + gap);
+    context.fillStyle = INK;
+    [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
+    context.font = '600 13px system-ui, sans-serif';
+    context.fillText(`step ${maps.step}`, x, 12);
+    context.font = '10px system-ui, sans-serif';
+    context.fillText(phase ?? '', x, 26);
+    layers.forEach((layer, row) => {
+      const y = head + row * (side + gap + MARGIN.bottom);
+      context.font = '600 13px system-ui, sans-serif';
+      [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
+      context.fillStyle = INK;
+      if (!column) context.fillText(layer.name, 0, y + 12);
+      context.save();
+      context.translate(x, y);
+      const shown = { ...options, textColour: INK, withY: !column, named: false, hover: null };
+      drawMap(context, layer, side, shown);
+      context.restore();
+    });
+  });
+  context.translate(-SHEET.padding, -SHEET.padding);
 }
 
 /**

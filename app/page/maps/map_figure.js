@@ -47,6 +47,19 @@ export function createFigure(name, fuses) {
 }
 
 /**
+ * Shows the name of a shape and, where there is room, its size.
+ * @param {Figure} figure
+ * @param {string[]} parts
+ */
+export function showShape({ shape }, parts) {
+  if (shape.dataset.text === parts.join()) return;
+  shape.dataset.text = parts.join();
+  shape.replaceChildren(
+    ...parts.map((part, i) => create('span', { textContent: i ? `, ${part}` : part })),
+  );
+}
+
+/**
  * Shows the colours of all maps, their range, and the quantity with its unit.
  * @param {HTMLElement} host
  * @param {ColourMap} colourMap

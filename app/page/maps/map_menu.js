@@ -115,12 +115,25 @@ export function mapMenu(menu, button, store, maps) {
       : 'Show change from this step';
   };
   const setLayers = bindExport(html('.export', menu), () => maps.displayed);
+  const restrict = () => {
+    const tiled = store.state.tiles === 'several';
+    const cloud = rows[OPTIONS.findIndex(({ key }) => key === 'cloud')];
+    for (const control of [pin, ...cloud.querySelectorAll('input')]) control.disabled = tiled;
+    cloud.title = tiled ? 'Particles are drawn on the maps of the current step only' : '';
+    pin.title = tiled
+      ? 'Changes are shown on the maps of the current step only'
+      : 'Show other maps relative to those of this step (m)';
+  };
+  restrict();
+  store.listen((_, changed) => {
+    if (changed.has('tiles') || changed.has('cloud')) restrict();
+  });
   menu.addEventListener('beforetoggle', (event) => {
     if (/** @type {ToggleEvent} */ (event).newState !== 'open') return;
     maps.showMeasures();
     const { top, left } = html('#maps').getBoundingClientRect(); // the maps stay visible
     [menu.style.top, menu.style.right] = [`${top}px`, `${innerWidth - left + GAP}px`];
-    setLayers(maps.displayed?.layers.map(({ name }) => name) ?? []);
+    setLayers(maps.displayed[0]?.layers.map(({ name }) => name) ?? []);
   });
   return (trace) => {
     const isCurve = mapPlane(store.state, trace).length === 1;

@@ -2,59 +2,49 @@
 
 /** @import { ColourMap } from '../core/palette.js' */
 /** @import { Store } from '../core/state.js' */
-/** @import { Selection } from '../data/api.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { Layer, MapOptions } from './draw_map.js' */
 /** @import { Figure } from './map_figure.js' */
 /** @import { Maps, Range, Scale } from './map_values.js' */
+/** @import { Reference } from './reference.js' */
 
 import { MAP_QUANTITIES } from '../core/constants.js';
 import { context2d, html } from '../core/dom.js';
 import { colour } from '../core/palette.js';
-import { displayName, mainName, sentence } from '../core/units.js';
+import { displayName, sentence } from '../core/units.js';
 import { choice } from '../widgets/pickers.js';
+import { Crosshair } from './crosshair.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap, paintCells } from './draw_map.js';
-import { createFigure, showColourBar } from './map_figure.js';
+import { createFigure, showColourBar, showShape } from './map_figure.js';
+import { CLOSE_UP, fitsCloseUp, isMany, mapLayout } from './map_layout.js';
 import { showMeasures } from './map_measures.js';
 import { MapTiles } from './map_tiles.js';
 import { MapReadout } from './map_readout.js';
 import {
   QUANTITY_NAMES,
   axesText,
+  axesSubject,
   colourScale,
+  colourTitle,
   layerMeasures,
   mapTitle,
   positionText,
   shapeName,
   valuesAt,
 } from './map_summary.js';
-import { borders, isCurve, shades, tileShade } from './map_values.js';
-import { formatPin, parsePin } from './pin.js';
-import { mapChoices } from './map_choices.js';
+import { REGION_SHARES, borders, isCurve, shades } from './map_values.js';
+import { References } from './reference.js';
 
 const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom', 'tiles']; // keys of the state
 const EXPLANATIONS = {
   likelihood: 'Likelihood of the observation given the state',
   posterior: 'Posterior of the state: prior times likelihood',
 };
-const REGION_SHARES = [0.5, 0.95];
-const CLOSE_UP = 4; // zoom while all maps of the run fit into it
-const MIN_SIDE = 60; // px
-const MAX_COLUMNS = 4;
-/** @type {Record<string, number[]>} */
-const ARROWS = {
-  ArrowLeft: [-1, 0],
-  ArrowRight: [1, 0],
-  ArrowUp: [0, 1],
-  ArrowDown: [0, -1],
-};
-
 /**
- * @typedef {{maps: Maps, selection: Selection}} Pinned
- * @typedef {{maps: Maps, name: string, selection: Selection | null}} Reference of likelihood ratios; selection: null for the comparison run
- * @typedef {{trace: Trace, maps: Maps, layers: Layer[], title: string, options: MapOptions}} DisplayedMaps
+ * @typedef {{trace: Trace, maps: Maps, layers: Layer[], title: string, options: MapOptions, phase?: string}} DisplayedMaps
+ *   of one step
  */
 
 export class MapPanel {
@@ -63,20 +53,14 @@ export class MapPanel {
   #panel;
   #host;
   #store;
-  #requestMaps;
   /** @type {Figure[]} */
   #figures = [];
   /** @type {Maps | null} */
   #maps = null;
   /** @type {Trace | null} */
   #trace = null;
-  /** @type {Pinned | null} */
-  #pinned = null;
-  #requestedPin = '';
-  #comparisonName = '';
-  /** Offset of the crosshair. @type {number[] | null} */
-  #hover = null;
-  #hoverLayer = 0; // its map
+  #references;
+  #crosshair;
   #readout;
   #tiles;
   /** Whether some maps of the run did not fit into the close-up. */
@@ -92,16 +76,24 @@ export class MapPanel {
   constructor(panel, store, requestMaps) {
     this.#panel = panel;
     this.#store = store;
-    this.#requestMaps = requestMaps;
     this.#host = html('#heatmaps', panel);
-    this.#tiles = new MapTiles(html('#map-tiles', panel), store, requestMaps);
     this.#readout = new MapReadout(html('#maps-readout', panel));
+    this.#tiles = new MapTiles(html('#map-tiles', panel), store, requestMaps, this.#readout);
+    this.#references = new References(store, requestMaps, () => {
+      this.#shade();
+      this.changed();
+    });
+    this.#crosshair = new Crosshair(
+      () => this.#geometry,
+      () => this.redraw(),
+      (offset) => this.#announce(offset),
+    );
     new ResizeObserver(() => this.#resize()).observe(this.#host);
     store.listen((_, changed) => {
       if (changed.has('map')) this.#showSwitch();
       if (changed.has('tiles')) this.#side = 0;
       if (OPTIONS.some((key) => changed.has(key))) this.#shade();
-      if (changed.has('pin')) this.#restorePin();
+      if (changed.has('pin')) this.#references.restore();
     });
   }
 
@@ -112,7 +104,6 @@ export class MapPanel {
    * @param {string} [comparisonName] label of the comparison run
    */
   draw(maps, trace, comparisonName = '') {
-    this.#comparisonName = comparisonName;
     const rebuild = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
     // The zoom does not return to the close-up: axes that change from step to step are hard to read.
     this.#wide = (this.#wide && this.#trace === trace) || !fitsCloseUp(maps);
@@ -121,15 +112,7 @@ export class MapPanel {
     // With a single measurement model the fused map equals that of the model.
     if (rebuild)
       this.#build(trace.fuses || maps.layers.length === 1 ? maps.layers : trace.modalities);
-    const pinned = this.#pinned;
-    if (pinned && content(pinned.maps) !== content(maps)) {
-      [this.#pinned, this.#requestedPin] = [null, '']; // requested again, with the new quantity and axes
-    } else if (
-      pinned &&
-      (pinned.selection.task !== trace.selection.task || !comparable(pinned.maps, maps))
-    )
-      this.togglePin();
-    this.#restorePin();
+    this.#references.follow(maps, trace, comparisonName);
     this.#showSwitch();
     this.#shade();
   }
@@ -161,72 +144,38 @@ export class MapPanel {
     });
   }
 
-  /** Pins the displayed maps as the reference of later ones, or releases the pinned ones. */
+  /** Pins the displayed maps as the reference of later ones, or releases the pinned ones. Maps of several steps have none. */
   togglePin() {
-    const [maps, trace] = [this.#maps, this.#trace];
-    if (!maps || !trace) return;
-    this.#setPinned(this.#pinned ? null : { maps, selection: trace.selection });
-    const pin = this.#pinned ? formatPin(trace.selection, maps.step, this.#store.state.angle) : '';
-    this.#store.set({ pin });
-  }
-
-  /** @param {Pinned | null} pinned */
-  #setPinned(pinned) {
-    this.#pinned = pinned;
-    this.#shade();
-    this.changed();
-  }
-
-  /** Follows the state: requests the maps of a pinned step that a link names, or releases them. */
-  async #restorePin() {
-    const { pin, task } = this.#store.state;
-    if (!pin && this.#pinned) this.#setPinned(null);
-    if (!pin || !this.#maps || this.#pinned || this.#requestedPin === pin) return;
-    this.#requestedPin = pin;
-    const { selection, step, angle } = parsePin(pin, task);
-    const shown = content(this.#maps);
-    const choices = mapChoices(this.#store.state, this.#trace);
-    const maps = await this.#requestMaps({ ...selection, step, angle, ...choices });
-    if (!maps || this.#store.state.pin !== pin || this.#pinned || shown !== content(this.#maps))
-      return;
-    if (comparable(maps, this.#maps)) this.#setPinned({ maps, selection });
-    else this.#store.set({ pin: '' });
-  }
-
-  /** Maps to which the displayed ones are compared: the pinned ones, or those of the comparison run. @returns {Reference | null} */
-  get #reference() {
-    if (this.#pinned) return { ...this.#pinned, name: `step ${this.#pinned.maps.step}` };
-    const beside = this.#maps?.beside;
-    if (!beside || !this.#maps || !comparable(beside, this.#maps)) return null;
-    return { maps: beside, name: this.#comparisonName, selection: null };
+    if (!this.#isTiled) this.#references.toggle();
   }
 
   get pinned() {
-    return this.#pinned;
+    return this.#references.pinned;
   }
 
-  /** The displayed maps, for an export. @returns {DisplayedMaps | null} */
+  /** The displayed maps for an export, of one step or several. @returns {DisplayedMaps[]} */
   get displayed() {
     const [maps, trace] = [this.#maps, this.#trace];
-    if (!maps || !trace) return null;
-    return {
-      maps,
-      trace,
-      layers: this.#figures.map((figure, index) => ({ ...figure, index, maps, trace })),
-      title: this.#title(),
-      options: this.#options(0),
-    };
+    if (!maps || !trace) return [];
+    const options = this.#options(0);
+    if (this.#isTiled) return this.#tiles.sheets({ ...options, cloud: false });
+    const layers = this.#figures.map((figure, index) => ({ ...figure, index, maps, trace }));
+    return [{ maps, trace, layers, title: this.#title(), options }];
+  }
+
+  get #isTiled() {
+    return this.#panel.classList.contains('tiled');
   }
 
   #resize() {
-    if (this.#panel.classList.contains('tiled')) return;
+    if (this.#isTiled) return;
     if (this.#figures.length) this.#side = this.#availableSide();
     this.redraw();
   }
 
   redraw() {
     const [maps, trace] = [this.#maps, this.#trace];
-    if (!maps || !trace || this.#panel.classList.contains('tiled')) return;
+    if (!maps || !trace || this.#isTiled) return;
     if (!this.#side) this.#side = this.#availableSide();
     this.#figures.forEach((figure, index) => this.#drawLayer(figure, { maps, trace, index }));
     this.#showReadout();
@@ -239,7 +188,7 @@ export class MapPanel {
     const { scale, range, colours, regions } = this.#store.state;
     if (html('#maps-options', this.#panel).matches(':popover-open')) this.showMeasures();
     const tiled = this.#showTiles(maps);
-    const reference = tiled ? null : this.#reference;
+    const reference = tiled ? null : this.#references.current;
     this.#showTitle(reference);
     if (tiled) return;
     const layers = shades(
@@ -266,28 +215,16 @@ export class MapPanel {
    * @param {Maps} maps
    */
   #showTiles(maps) {
-    const { tiles, scale, colours } = this.#store.state;
-    const tiled = tiles === 'several' && !isCurve(maps);
+    const tiled = this.#store.state.tiles === 'several' && !isCurve(maps);
     html('#map-tiles', this.#panel).hidden = !tiled;
     this.#panel.classList.toggle('tiled', tiled);
     if (!tiled || !this.#trace) return tiled;
-    this.#hover = null;
+    this.#crosshair.offset = null;
     this.#readout.hide();
     const layers = this.#figures.map(({ name }) => name);
-    const shown = { maps, trace: this.#trace, layers, zoom: this.#zoom, content: content(maps) };
-    this.#tiles.draw(shown);
-    const shade = tileShade(maps, 0, /** @type {Scale} */ (scale));
-    const labels = colourScale(
-      maps.quantity,
-      /** @type {Scale} */ (scale),
-      'own',
-      [{ name: '', shade, peak: 0 }],
-      '',
-    );
-    const bar = html('#maps-scale', this.#panel);
-    bar.hidden = false;
-    showColourBar(bar, /** @type {ColourMap} */ (colours), labels);
-    html('#maps-axis-names', this.#panel).textContent = axesText(maps, false);
+    this.#tiles.draw({ maps, trace: this.#trace, layers, zoom: this.#zoom });
+    this.#tiles.showColours(html('#maps-scale', this.#panel));
+    html('#maps-axis-names', this.#panel).textContent = axesText(maps, this.#world);
     return tiled;
   }
 
@@ -334,32 +271,16 @@ export class MapPanel {
       ? ` · ${title}`
       : title.replace(/^\w+/, '');
     html('#maps-of', this.#panel).hidden = Boolean(reference);
-    html('#maps-quantity', this.#panel).textContent = this.#subject();
-  }
-
-  /** Names the state components of the axes. */
-  #subject() {
-    const task = this.#trace?.task;
-    const names = this.#maps?.axes.map(({ name }) => name) ?? [];
-    const isPosition =
-      task?.main.name === 'position' && names.join() === task.map.components.join();
-    return isPosition ? mainName(task) : names.map(displayName).join(', ');
+    html('#maps-quantity', this.#panel).textContent = this.#maps
+      ? axesSubject(this.#maps, this.#trace?.task)
+      : '';
   }
 
   /** Describes what the colours show. */
   #title() {
     const { scale, range } = this.#store.state;
-    const quantity = this.#maps?.quantity;
-    const reference = this.#reference;
-    if (reference) {
-      const { selection, name } = reference;
-      const run = selection
-        ? `${name} (${selection.filter}, episode ${selection.episode})`
-        : `the comparison run (${name})`;
-      return `log of the ${quantity} relative to ${run}, both as densities over the displayed area`;
-    }
-    if (scale === 'log') return `log ${quantity}`;
-    return `${quantity} relative to ${range === 'same' ? 'the highest' : 'its own'} peak`;
+    const reference = this.#isTiled ? null : this.#references.current;
+    return colourTitle(this.#maps?.quantity ?? 'likelihood', scale, range, reference);
   }
 
   /** @param {string[]} layers */
@@ -367,24 +288,12 @@ export class MapPanel {
     this.#side = 0;
     for (const { figure } of this.#figures) figure.remove();
     this.#figures = layers.map((name) => createFigure(name, layers.length > 1));
-    this.#figures.forEach(({ canvas }, layer) => this.#bindCanvas(canvas, layer));
-    this.#host.classList.toggle('many', layers.length > MAX_COLUMNS);
+    this.#figures.forEach(({ canvas }, layer) => this.#crosshair.bind(canvas, layer));
+    this.#host.classList.toggle('many', isMany(layers.length));
     this.#host.append(...this.#figures.map(({ figure }) => figure));
   }
 
-  /**
-   * @param {HTMLCanvasElement} canvas
-   * @param {number} layer
-   */
-  #bindCanvas(canvas, layer) {
-    canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
-    canvas.addEventListener('pointerleave', () => this.#setHover(null));
-    canvas.addEventListener('pointerdown', (event) => event.preventDefault()); // keeps the focus
-    canvas.addEventListener('keydown', (event) => this.#moveCrosshair(event, layer));
-    canvas.addEventListener('blur', () => this.#setHover(null));
-  }
-
-  /** Returns the side of a map's square that fits the panel, in px. */
+  /** Arranges the maps and returns the side of the square of each, in px. */
   #availableSide() {
     const count = this.#figures.length;
     const { clientWidth, clientHeight } = this.#host;
@@ -393,17 +302,9 @@ export class MapPanel {
     const height = clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom);
     this.#arrange(count);
     const { head } = this.#figures[0];
-    /** @param {number} rows */
-    const side = (rows) => {
-      const columns = Math.ceil(count / rows);
-      const horizontal =
-        (width - MARGIN.left - (columns - 1) * MARGIN.gap - columns * MARGIN.right) / columns;
-      const vertical = height / rows - MARGIN.bottom - MARGIN.top - head.offsetHeight;
-      return Math.floor(Math.min(horizontal, vertical));
-    };
-    const [one, two] = [side(1), count > MAX_COLUMNS ? side(2) : 0];
-    if (two > one) this.#arrange(Math.ceil(count / 2));
-    return Math.max(MIN_SIDE, one, two);
+    const { columns, side } = mapLayout(count, width, height, head.offsetHeight);
+    if (columns < count) this.#arrange(columns);
+    return side;
   }
 
   /**
@@ -428,9 +329,12 @@ export class MapPanel {
     return this.#store.state.axes === 'world';
   }
 
-  /** @param {number} layer */
-  #leftMargin(layer) {
-    return layer % this.#columns === 0 ? MARGIN.left : MARGIN.gap;
+  /** Left margin of a map, px. @param {number} layer */
+  #leftMargin = (layer) => (layer % this.#columns === 0 ? MARGIN.left : MARGIN.gap);
+
+  get #geometry() {
+    const [maps, zoom, side] = [this.#maps, this.#zoom, this.#side];
+    return maps && { maps, zoom, side, leftMargin: this.#leftMargin };
   }
 
   /**
@@ -446,7 +350,7 @@ export class MapPanel {
       textColour: colour('muted'),
       withY: layer % this.#columns === 0,
       named: false,
-      hover: this.#hover,
+      hover: this.#crosshair.offset,
     };
   }
 
@@ -470,9 +374,8 @@ export class MapPanel {
     context.translate(left, MARGIN.top);
     const draw = isCurve(maps) ? drawCurve : drawMap;
     draw(context, { ...figure, index, maps, trace }, side, this.#options(index));
-    figure.shape.textContent = this.#hover
-      ? this.#shownValue(maps, index, this.#hover)
-      : shapeName(maps, index);
+    const hover = this.#crosshair.offset;
+    showShape(figure, hover ? [this.#shownValue(maps, index, hover)] : shapeName(maps, index));
     canvas.ariaLabel = `${name}: ${this.#title()}; ${figure.head.title}. Arrow keys read values.`;
   }
 
@@ -482,7 +385,7 @@ export class MapPanel {
    * @param {number[]} offset
    */
   #values(maps, layer, offset) {
-    const ratios = this.#reference ? this.#figures[layer].shade.values : null;
+    const ratios = this.#references.current ? this.#figures[layer].shade.values : null;
     return valuesAt(maps, layer, offset, ratios);
   }
 
@@ -498,38 +401,12 @@ export class MapPanel {
   }
 
   /**
-   * @param {PointerEvent} event
-   * @param {number} layer
+   * Announces the values of all maps at an offset.
+   * @param {number[]} offset
    */
-  #point(event, layer) {
-    if (!this.#maps) return;
-    const [halfX, halfY] = this.#maps.axes.map((axis) => axis.half_width / this.#zoom);
-    const x = (event.offsetX - this.#leftMargin(layer)) / this.#side;
-    const y = (event.offsetY - MARGIN.top) / this.#side;
-    const inside = x >= 0 && x <= 1 && y >= 0 && y <= 1;
-    const offset = [(2 * x - 1) * halfX, (1 - 2 * y) * halfY];
-    this.#setHover(inside ? offset.slice(0, this.#maps.axes.length) : null, layer);
-  }
-
-  /**
-   * Moves the crosshair cell by cell with the arrow keys and announces the values.
-   * @param {KeyboardEvent} event
-   * @param {number} layer
-   */
-  #moveCrosshair(event, layer) {
-    if (event.key === 'Escape') this.#setHover(null);
-    const direction = ARROWS[event.key];
+  #announce(offset) {
     const maps = this.#maps;
-    if (!direction || !maps) return;
-    event.preventDefault();
-    const from = this.#hover ?? [0, 0];
-    const offset = direction.slice(0, maps.axes.length).map((d, i) => {
-      const { half_width: half } = maps.axes[i];
-      const cell = (2 * half) / maps.size;
-      const limit = half / this.#zoom - cell / 2;
-      return Math.min(Math.max(from[i] + (event.shiftKey ? 5 : 1) * cell * d, -limit), limit);
-    });
-    this.#setHover(offset, layer);
+    if (!maps) return;
     const values = this.#figures.map(
       ({ name }, i) => `${displayName(name)} ${this.#values(maps, i, offset).join(', ')}`,
     );
@@ -537,61 +414,12 @@ export class MapPanel {
       `${positionText(maps, offset, this.#world)}: ${values.join('; ')}`;
   }
 
-  /**
-   * @param {number[] | null} offset
-   * @param {number} [layer]
-   */
-  #setHover(offset, layer = 0) {
-    if (offset === this.#hover) return;
-    [this.#hover, this.#hoverLayer] = [offset, layer];
-    this.redraw();
-  }
-
   /** Shows the values at the crosshair beside it. */
   #showReadout() {
-    const [maps, offset] = [this.#maps, this.#hover];
-    const pointed = this.#figures[this.#hoverLayer];
-    if (!maps || !offset || !pointed) return this.#readout.hide();
-    const { left, top } = pointed.canvas.getBoundingClientRect();
-    const [x, y] = offset.map((d, i) => (d * this.#zoom) / maps.axes[i].half_width);
-    const values = this.#values(maps, this.#hoverLayer, offset);
-    this.#readout.show(positionText(maps, offset, this.#world), values, {
-      x: left + this.#leftMargin(this.#hoverLayer) + (this.#side * (1 + x)) / 2,
-      y: top + MARGIN.top + (this.#side * (1 - (y ?? 0))) / 2,
-    });
+    const { offset, layer } = this.#crosshair;
+    const place = this.#figures[layer] && this.#crosshair.place(this.#figures[layer].canvas);
+    if (!this.#maps || !offset || !place) return this.#readout.hide();
+    const values = this.#values(this.#maps, layer, offset);
+    this.#readout.show(positionText(this.#maps, offset, this.#world), values, place);
   }
-}
-
-/**
- * Identifies the quantity, the axes and the treatment of the other components of maps.
- * @param {Maps} maps
- */
-const content = ({ quantity, axes, others }) =>
-  [quantity, others, ...axes.map(({ name }) => name)].join();
-
-/**
- * @param {Maps} a
- * @param {Maps} b
- */
-const comparable = (a, b) =>
-  a.layers.join() === b.layers.join() &&
-  content(a) === content(b) &&
-  a.axes.every(({ half_width: half }, i) => Math.abs(half / b.axes[i].half_width - 1) < 1e-5);
-
-/**
- * Returns whether peaks and 95 % regions, approximated by ellipses, fit into the close-up.
- * @param {Maps} maps
- */
-function fitsCloseUp({ axes, peak, numbers }) {
-  const [halfX, halfY] = axes.map(({ half_width: half }) => half);
-  if (axes.length === 1)
-    return peak.every(
-      ([offset], layer) => Math.abs(offset) + numbers.area95[layer] / 2 <= halfX / CLOSE_UP,
-    );
-  return peak.every((offset, layer) => {
-    const area = numbers.area95[layer] / (halfX * halfY);
-    const radius = Math.sqrt((area / Math.PI) * (numbers.elongation[layer] ?? 1));
-    const farthest = Math.max(Math.abs(offset[0]) / halfX, Math.abs(offset[1]) / halfY);
-    return farthest + radius <= 1 / CLOSE_UP;
-  });
 }

@@ -1,8 +1,10 @@
 /** Texts about likelihood maps: measures, colours, and the values at the crosshair. */
 
+/** @import { Task } from '../data/api.js' */
 /** @import { Maps, Range, Scale, Shade } from './map_values.js' */
+/** @import { Reference } from './reference.js' */
 
-import { displayName, displayUnit, fixed, percent, signed } from '../core/units.js';
+import { displayName, displayUnit, fixed, mainName, percent, signed } from '../core/units.js';
 import { areaUnit, cellAt, rangeDigits, rangeLabels, valueAt } from './map_values.js';
 
 export const QUANTITY_NAMES = { likelihood: 'Likelihood', posterior: 'Posterior' };
@@ -39,6 +41,36 @@ export function positionText({ axes, centre }, offset, world) {
  */
 export const mapTitle = ({ quantity, layers, rule, note }) =>
   QUANTITY_NAMES[quantity] + (note && `, ${note}`) + (layers.length > 2 ? `. Fused: ${rule}` : '');
+
+/**
+ * Names the state components of the axes.
+ * @param {Maps} maps
+ * @param {Task} [task]
+ */
+export function axesSubject({ axes }, task) {
+  const names = axes.map(({ name }) => name);
+  const isPosition = task?.main.name === 'position' && names.join() === task.map.components.join();
+  return isPosition ? mainName(task) : names.map(displayName).join(', ');
+}
+
+/**
+ * Describes what the colours show.
+ * @param {Maps['quantity']} quantity
+ * @param {string} scale
+ * @param {string} range
+ * @param {Reference | null} reference
+ */
+export function colourTitle(quantity, scale, range, reference) {
+  if (reference) {
+    const { selection, name } = reference;
+    const run = selection
+      ? `${name} (${selection.filter}, episode ${selection.episode})`
+      : `the comparison run (${name})`;
+    return `log of the ${quantity} relative to ${run}, both as densities over the displayed area`;
+  }
+  if (scale === 'log') return `log ${quantity}`;
+  return `${quantity} relative to ${range === 'same' ? 'the highest' : 'its own'} peak`;
+}
 
 /**
  * Returns the measures of a layer as cells of a table (`measureColumns`), and as one description.
@@ -123,11 +155,27 @@ export function colourScale(quantity, scale, range, layers, reference) {
 }
 
 /**
- * Names the shape of a layer that is drawn on its map, with its size.
+ * Names the shape of a layer that is drawn on its map, and its size.
  * @param {Maps} maps
  * @param {number} layer
  */
-export const shapeName = (maps, layer) => shapeText(maps, layer).short.replace(/, \d+° off.*/, '');
+export const shapeName = (maps, layer) => shapeText(maps, layer).short.split(', ').slice(0, 2);
+
+/**
+ * Returns the labels of the colour bar of small maps of several steps, whose colours have the same ends.
+ * @param {Maps['quantity']} quantity
+ * @param {string} scale
+ * @param {string} range
+ * @param {Shade} shade of any of them
+ * @returns {ColourScale}
+ */
+export function tilesScale(quantity, scale, range, shade) {
+  const [low, high] = rangeLabels(shade, 0);
+  const peak = range === 'same' ? "the step's highest peak" : 'each peak';
+  const log = scale === 'log';
+  const label = log ? `log ${quantity} below ${peak}, nats` : `${quantity} relative to ${peak}`;
+  return { low, high, label };
+}
 
 /**
  * Describes the shape of a layer, in short and in full.

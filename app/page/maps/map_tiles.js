@@ -4,14 +4,21 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
-/** @import { Maps, Scale } from './map_values.js' */
+/** @import { MapOptions } from './draw_map.js' */
+/** @import { DisplayedMaps } from './map_panel.js' */
+/** @import { MapReadout } from './map_readout.js' */
+/** @import { Maps, Range, Scale } from './map_values.js' */
 
 import { MAP_SIZE } from '../core/constants.js';
 import { context2d, create, html } from '../core/dom.js';
 import { displayName } from '../core/units.js';
-import { paintCells } from './draw_map.js';
+import { offsetAt } from './crosshair.js';
+import { drawBorder, paintCells } from './draw_map.js';
 import { mapChoices } from './map_choices.js';
-import { tileShade, tileSteps } from './map_values.js';
+import { showColourBar } from './map_figure.js';
+import { positionText, tilesScale, valuesAt } from './map_summary.js';
+import { REGION_SHARES, borders, tileShade, tileSteps } from './map_values.js';
+import { content } from './reference.js';
 
 const GAP = 3; // px between tiles
 const NAMES = 66; // px of the column with the names of the layers
@@ -19,12 +26,13 @@ const HEAD = 34; // px of the row with the steps
 const MIN_SIDE = 28; // px
 const MAX_KEPT = 200; // maps of other steps that are kept
 
-/** @typedef {{maps: Maps, trace: Trace, layers: string[], zoom: number, content: string}} Shown */
+/** @typedef {{maps: Maps, trace: Trace, layers: string[], zoom: number}} Shown */
 
 export class MapTiles {
   #host;
   #store;
   #requestMaps;
+  #readout;
   /** Maps by step, of one selection and content. @type {Map<number, Maps>} */
   #kept = new Map();
   #key = '';
@@ -39,9 +47,11 @@ export class MapTiles {
    * @param {HTMLElement} host
    * @param {Store} store
    * @param {(cursor: Cursor, size: number) => Promise<Maps | null>} requestMaps
+   * @param {MapReadout} readout
    */
-  constructor(host, store, requestMaps) {
+  constructor(host, store, requestMaps, readout) {
     this.#host = host;
+    this.#readout = readout;
     this.#store = store;
     this.#requestMaps = requestMaps;
     new ResizeObserver(() => this.redraw()).observe(host);
@@ -49,19 +59,23 @@ export class MapTiles {
       const tile = target instanceof Element && target.closest('button');
       if (tile) store.set({ step: Number(tile.dataset.step) });
     });
+    host.addEventListener('pointermove', (event) => this.#point(event));
+    host.addEventListener('pointerleave', () => readout.hide());
   }
 
   /** @param {Shown} shown maps at the cursor and how they are displayed */
   draw(shown) {
-    const { maps, trace, content } = shown;
-    const key = JSON.stringify([trace.selection, content, this.#store.state.angle]);
+    const { maps, trace } = shown;
+    const { angle, follow } = this.#store.state;
+    const key = JSON.stringify([trace.selection, content(maps), angle]);
     if (key !== this.#key) this.#kept.clear();
     this.#key = key;
     this.#shown = shown;
     if (this.#kept.size > MAX_KEPT) this.#kept.clear();
     if (this.#kept.get(maps.step)?.size !== MAP_SIZE.fine) this.#kept.set(maps.step, maps);
     this.redraw();
-    if (maps.size === MAP_SIZE.fine && !trace.live) this.#load(); // the cursor rests; live runs keep only the current maps
+    // The cursor rests. With the newest step of a live run, it moves before the maps of other steps arrive.
+    if (maps.size === MAP_SIZE.fine && !(trace.live && follow)) this.#load();
   }
 
   /** Requests the missing maps, one after the other, until the cursor moves. */
@@ -119,7 +133,7 @@ export class MapTiles {
         button.classList.toggle('current', step === maps.step);
         button.classList.toggle('pair', pair);
         if (row === 0) continue;
-        button.title = `${displayName(layers[row - 1])}, step ${step}, ${phase}`;
+        [button.dataset.row, button.dataset.phase] = [String(row - 1), phase];
         this.#paint(button, this.#kept.get(step) ?? null, row - 1, side);
       }
     });
@@ -156,8 +170,8 @@ export class MapTiles {
   #paint(tile, maps, row, side) {
     const canvas = /** @type {HTMLCanvasElement} */ (html('canvas', tile));
     const pixels = Math.round(side * devicePixelRatio);
-    const { scale, colours } = this.#store.state;
-    const style = [pixels, scale, colours, this.#shown?.zoom].join();
+    const { scale, range, colours, regions } = this.#store.state;
+    const style = [pixels, scale, range, colours, regions, this.#shown?.zoom].join();
     const painted = this.#painted.get(tile);
     if (painted?.maps === maps && painted.style === style) return;
     this.#painted.set(tile, { maps, style });
@@ -166,11 +180,18 @@ export class MapTiles {
     context.clearRect(0, 0, pixels, pixels);
     if (!maps || !this.#shown) return;
     const layer = maps.layers.indexOf(this.#shown.layers[row]);
-    const shade = tileShade(maps, layer, /** @type {Scale} */ (scale));
-    paintCells(this.#cells, shade, maps.size, /** @type {ColourMap} */ (colours));
-    const visible = maps.size / this.#shown.zoom;
+    const { zoom } = this.#shown;
+    paintCells(
+      this.#cells,
+      this.#shade(maps, layer),
+      maps.size,
+      /** @type {ColourMap} */ (colours),
+    );
+    const visible = maps.size / zoom;
     const start = (maps.size - visible) / 2;
     context.drawImage(this.#cells, start, start, visible, visible, 0, 0, pixels, pixels);
+    for (const [i, segments] of this.#borders(maps, layer).entries())
+      drawBorder(context, segments, pixels, zoom, i);
     if (maps.truth[maps.axes[0].index] === null) return;
     const [middle, tick] = [pixels / 2, Math.round(pixels / 12)];
     [context.strokeStyle, context.lineWidth] = ['#fff', devicePixelRatio];
@@ -183,5 +204,81 @@ export class MapTiles {
       context.lineTo(inner, middle);
     }
     context.stroke();
+  }
+
+  /**
+   * @param {Maps} maps
+   * @param {number} layer
+   */
+  #shade(maps, layer) {
+    const { scale, range } = this.#store.state;
+    return tileShade(maps, layer, /** @type {Scale} */ (scale), /** @type {Range} */ (range));
+  }
+
+  /**
+   * @param {Maps} maps
+   * @param {number} layer
+   */
+  #borders(maps, layer) {
+    return this.#store.state.regions === 'shown' ? borders(maps, layer, REGION_SHARES) : [];
+  }
+
+  /** @param {HTMLElement} host shows the colour bar of all tiles */
+  showColours(host) {
+    if (!this.#shown) return;
+    host.hidden = false;
+    const { colours } = this.#store.state;
+    showColourBar(host, /** @type {ColourMap} */ (colours), this.#scale(this.#shown.maps));
+  }
+
+  /** @param {Maps} maps of any step */
+  #scale(maps) {
+    const { scale, range } = this.#store.state;
+    return tilesScale(maps.quantity, scale, range, this.#shade(maps, 0));
+  }
+
+  /**
+   * Shows the values of the tile under the pointer.
+   * @param {PointerEvent} event
+   */
+  #point({ target, clientX: x, clientY: y }) {
+    const canvas = target instanceof HTMLCanvasElement ? target : null;
+    const tile = canvas?.closest('button');
+    const maps = this.#kept.get(Number(tile?.dataset.step));
+    if (!canvas || !tile || !maps || !this.#shown) return this.#readout.hide();
+    const { left, top, width, height } = canvas.getBoundingClientRect();
+    const offset = offsetAt(maps, this.#shown.zoom, (x - left) / width, (y - top) / height);
+    if (!offset) return this.#readout.hide();
+    const name = this.#shown.layers[Number(tile.dataset.row)];
+    const position = positionText(maps, offset, this.#store.state.axes === 'world');
+    const values = valuesAt(maps, maps.layers.indexOf(name), offset, null);
+    const title = `${displayName(name)}, step ${maps.step}, ${tile.dataset.phase}`;
+    this.#readout.show(title, [position, ...values], { x, y });
+  }
+
+  /**
+   * Returns the displayed maps of all steps that have arrived, for an export.
+   * @param {MapOptions} options
+   * @returns {DisplayedMaps[]}
+   */
+  sheets(options) {
+    if (!this.#shown) return [];
+    const title = this.#scale(this.#shown.maps).label;
+    const { trace, layers, maps: current } = this.#shown;
+    const colourMap = /** @type {ColourMap} */ (this.#store.state.colours);
+    return tileSteps(trace.contact, current.step).flatMap(({ step, phase }) => {
+      const maps = this.#kept.get(step);
+      if (!maps) return [];
+      const drawn = layers.map((name) => {
+        const index = maps.layers.indexOf(name);
+        const [shade, cells] = [this.#shade(maps, index), create('canvas')];
+        paintCells(cells, shade, maps.size, colourMap);
+        return {
+          ...{ name, index, maps, trace, cells, shade, colourMap },
+          borders: this.#borders(maps, index),
+        };
+      });
+      return [{ maps, trace, layers: drawn, title, options, phase }];
+    });
   }
 }

@@ -65,6 +65,7 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
  */
 
 const MAX_RANGE = { log: 40, ratio: 12 }; // nats between the ends of the colours
+export const REGION_SHARES = [0.5, 0.95]; // of the likelihood within the borders on maps
 const decoder = new TextDecoder();
 
 /**
@@ -117,15 +118,18 @@ export function shades(maps, scale, range, reference) {
 }
 
 /**
- * Returns the colours of a layer relative to its own peak, with the same range for all layers and steps.
+ * Returns the colours of a layer relative to its own peak or to the highest one of its step, with the same ends for all
+ * layers and steps.
  * @param {Maps} maps
  * @param {number} layer
  * @param {Scale} scale
+ * @param {Range} range
  * @returns {Shade}
  */
-export function tileShade(maps, layer, scale) {
+export function tileShade(maps, layer, scale, range) {
   const [cells, span] = [maps.cells[layer], maps.log_range[layer]];
-  const values = Float32Array.from(cells, (cell) => span * (cell / CELL_STEPS - 1));
+  const peak = range === 'same' ? maps.log_max[layer] - Math.max(...maps.log_max) : 0;
+  const values = Float32Array.from(cells, (cell) => peak + span * (cell / CELL_STEPS - 1));
   if (scale === 'log') return { values, low: -MAX_RANGE.log, high: 0, clipped: true };
   return { values: values.map(Math.exp), low: 0, high: 1, clipped: false };
 }

@@ -140,6 +140,8 @@ function firstRun(task, state) {
     step,
     angle: null,
     component: task.map.components[0],
+    plane: '',
+    zoom: 'fit', // of maps of another size
     playing: false,
   };
 }
