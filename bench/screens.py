@@ -79,7 +79,7 @@ def close(page: Page) -> None:
 def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, views: list[str]) -> None:
     width, height = map(int, size.split("x"))
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=theme)
-    page.goto(f"{url}?step=40", timeout=TIMEOUT)
+    page.goto(f"{url}?task=door&step=40", timeout=TIMEOUT)
     page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=TIMEOUT)
     tabs = [
         name.removeprefix("tab-") for name in page.eval_on_selector_all("[role=tab]", "all => all.map((t) => t.id)")

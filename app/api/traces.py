@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope import __version__
-from beliefscope.app.api.models.catalog import Catalog, Health, Progress
+from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Progress
 from beliefscope.app.api.models.traces import TraceHeader
 from beliefscope.app.protocol.errors import InProgress
 from beliefscope.app.protocol.etag import tagged
 from beliefscope.app.protocol.trace_format import displayed_sensors, sensor_pixels
+from beliefscope.app.runs import episode_list
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -52,6 +53,17 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
     def catalog(request: Request) -> dict[str, Any]:
         server = {"version": __version__, "read_only": request.app.state.read_only, "faults": fault_catalog()}
         return {**server, **store.catalog()}
+
+    @router.get("/api/episodes/{task}", response_model=EpisodeList)
+    def episodes(
+        task: str,
+        data: str = "",
+        query: str = "",
+        first: Annotated[int, Query(ge=0)] = 0,
+        limit: Annotated[int, Query(ge=1)] = episode_list.LISTED,
+    ) -> dict[str, Any]:
+        count, found = episode_list.find(store.dataset(task, data)[1], query, first, limit)
+        return {"count": count, "episodes": found}
 
     @router.get(
         "/api/trace/{task}/{filter}/{episode}",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from beliefscope.app.protocol.trace_format import component_json
+from beliefscope.app.runs import episode_list
 from beliefscope.app.runs.first_moment import first_moment
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
@@ -232,9 +233,8 @@ def _filter_json(name: str, checkpoint: Checkpoint, path: Path | None) -> dict[s
 
 def _data_json(name: str, data: Dataset) -> dict[str, Any]:
     episode, step = first_moment(data)
-    has_contact = "contact" in data.task.covariates
-    episodes = [asdict(s) | ({} if has_contact else {"contact_fraction": None}) for s in data.summaries]
-    return {"name": name, "first": episode, "first_step": step, "episodes": episodes}
+    episodes = episode_list.nearby(data, episode)
+    return {"name": name, "first": episode, "first_step": step, "count": len(data), "episodes": episodes}
 
 
 @contextmanager

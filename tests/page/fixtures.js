@@ -28,6 +28,7 @@ export const TASK = {
       name: 'door',
       first: 9,
       first_step: 2,
+      count: 2,
       episodes: [8, 9].map((index) => ({
         index,
         steps: 4,

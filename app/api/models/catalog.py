@@ -124,11 +124,22 @@ class FaultPreset(Reply):
 
 
 class DataInfo(Reply):
-    """A data set in the catalog. first, first_step: the episode and step to open first."""
+    """A data set in the catalog. first, first_step: the episode and step to open first.
+
+    episodes: all ``count`` of them, or some around the first one; ``EpisodeList`` has the others.
+    """
 
     name: str
     first: int
     first_step: int
+    count: int
+    episodes: list[EpisodeSummary]
+
+
+class EpisodeList(Reply):
+    """A part of the episodes of a data set that match a query. count: of all that match."""
+
+    count: int
     episodes: list[EpisodeSummary]
 
 

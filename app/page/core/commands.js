@@ -1,8 +1,15 @@
 /** All commands of the page: its tabs, buttons and choices, read from the page itself, and layouts and examples. */
 
+/** @import { Catalog } from '../types/server.js' */
 /** @import { Page } from './page.js' */
+/** @import { Store } from './state.js' */
 
+import { episodes } from '../data/api.js';
+import { FIND, episodeLabel } from '../widgets/pickers.js';
+import { isComplete } from './episodes.js';
 import { LAYOUTS } from './layouts.js';
+
+const MAX_EPISODES = 30; // found by a query
 
 /**
  * @typedef {object} Command
@@ -61,6 +68,27 @@ export function stepCommand(page, query) {
   if (!/^\d+$/.test(query.trim())) return [];
   const step = Number(query);
   return [{ group: 'Go to', title: `Step ${step}`, run: () => page.goTo(step) }];
+}
+
+/**
+ * Returns the episodes with all words of a query, for a data set that the catalog lists in part.
+ * @param {Catalog} catalog
+ * @param {Store} store
+ * @param {string} query
+ * @returns {Promise<Command[]>}
+ */
+export async function episodeCommands(catalog, store, query) {
+  const { task, data } = store.state;
+  const set = catalog.tasks
+    .find(({ name }) => name === task)
+    ?.data.find(({ name }) => name === data);
+  if (!set || isComplete(set) || !query.trim()) return [];
+  const found = await episodes(task, data, { query, limit: MAX_EPISODES });
+  return found.episodes.map((entry) => ({
+    group: 'Episode',
+    title: episodeLabel(entry),
+    run: () => store.set({ episode: entry.index, step: 0, playing: false }),
+  }));
 }
 
 /** @param {Page} page */
@@ -146,6 +174,7 @@ function radioCommands(selector, group) {
 function selectCommands(selector, group) {
   const select = document.querySelector(selector);
   if (!(select instanceof HTMLSelectElement) || select.disabled || select.length < 2) return [];
+  if (select.options[0].value === FIND) return []; // of many episodes: see episodeCommands
   return [...select.options].map(({ value, text }) => ({
     group,
     title: text,

@@ -38,7 +38,7 @@ import { ReportDialog } from '../widgets/report_dialog.js';
 import { connectSaveButton } from '../widgets/save_button.js';
 import { Tour } from '../widgets/tour.js';
 import { Clock } from './clock.js';
-import { commands, stepCommand } from './commands.js';
+import { commands, episodeCommands, stepCommand } from './commands.js';
 import { bindControls } from './controls.js';
 import {
   markUseful,
@@ -89,7 +89,9 @@ export class Page {
       element('#fault-dialog', HTMLDialogElement),
       catalog.faults,
     );
-    const refreshPickers = connectPickers(catalog, store, faultDialog);
+    const refreshPickers = connectPickers(catalog, store, faultDialog, () =>
+      this.commands.toggle('episode '),
+    );
     this.finding = new FindingBar(html('#finding'), catalog, store);
     this.intro = new Intro(html('#intro'), catalog, store, () => this.tour.start());
     this.tour = new Tour();
@@ -155,6 +157,7 @@ export class Page {
       element('#commands', HTMLDialogElement),
       () => commands(this),
       (/** @type {string} */ query) => stepCommand(this, query),
+      (/** @type {string} */ query) => episodeCommands(catalog, store, query),
     );
     this.#start();
   }

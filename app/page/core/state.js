@@ -1,9 +1,11 @@
 /** The state of the page and its permalink: opening the link restores the state. */
 
 /** @import { Catalog } from '../data/api.js' */
+/** @import { DataSet } from '../types/server.js' */
 
 import { SCALAR, TRACKS } from '../timeline/tracks.js';
 import { MAP_QUANTITIES, SCENE_CHOICES } from './constants.js';
+import { episodeRange, hasEpisode } from './episodes.js';
 import { displayName } from './units.js';
 
 /**
@@ -267,11 +269,7 @@ export function parsePermalink(search, catalog) {
     task: task.name,
     filter: link.named('filter', filters, data.live?.filter).name,
     data: data.name,
-    episode: link.integer(
-      'episode',
-      data.first,
-      data.episodes.map(({ index }) => index),
-    ),
+    episode: link.integer('episode', data.first, data),
     step: link.integer('step', link.query.has('episode') ? 0 : data.first_step),
     angle: Number.isFinite(angle) ? angle : null,
     component: link.choice(
@@ -361,21 +359,15 @@ class LinkReader {
   /**
    * @param {string} key
    * @param {number} fallback
-   * @param {number[]} [options] any integer from 0 by default
+   * @param {DataSet} [set] whose episodes are valid; any integer from 0 by default
    */
-  integer(key, fallback, options) {
+  integer(key, fallback, set) {
     const text = this.query.get(key);
     if (text === null) return fallback;
     const value = Number(text);
-    if (Number.isInteger(value) && value >= 0 && (!options || options.includes(value)))
-      return value;
-    this.#report(
-      key,
-      text,
-      options
-        ? `Available: ${Math.min(...options)} to ${Math.max(...options)}.`
-        : 'It must be an integer from 0.',
-    );
+    if (Number.isInteger(value) && value >= 0 && (!set || hasEpisode(set, value))) return value;
+    const hint = set && `Available: ${episodeRange(set).join(' to ')}.`;
+    this.#report(key, text, hint ?? 'It must be an integer from 0.');
     return fallback;
   }
 

@@ -15,6 +15,7 @@ export { ServerError };
  * @typedef {import('../types/server.js').DiagnosticResult} DiagnosticResult
  * @typedef {import('../types/server.js').FailureEvent} FailureEvent
  * @typedef {import('../types/server.js').Diagnosis} Diagnosis
+ * @typedef {import('../types/server.js').EpisodeList} EpisodeList
  * @typedef {import('../types/server.js').EpisodeResults} EpisodeResults
  * @typedef {import('../types/server.js').ExperimentRow} ExperimentRow
  * @typedef {import('../types/server.js').Experiments} Experiments
@@ -114,6 +115,17 @@ function path(parts, query) {
 
 /** @returns {Promise<Catalog>} */
 export const catalog = () => get('/api/catalog');
+
+/**
+ * @param {string} task
+ * @param {string} data
+ * @param {{query?: string, first?: number, limit?: number}} part
+ * @returns {Promise<EpisodeList>}
+ */
+export const episodes = (task, data, part) => {
+  const texts = Object.entries(part).map(([key, value]) => [key, String(value)]);
+  return get(`${path(['episodes', task])}?${new URLSearchParams([['data', data], ...texts])}`);
+};
 
 /**
  * Gets the live runs, the newest first, and their tasks.

@@ -1,15 +1,19 @@
 /** Table of the episodes of a data set, with the errors of the filter once it has run over them. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
+/** @import { Catalog, DataSet, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
 import { create, element, html } from '../core/dom.js';
+import { isComplete } from '../core/episodes.js';
 import { fixed, mainText, mainUnit, percent, withUnit } from '../core/units.js';
+import { episodes } from '../data/api.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
 import { markRow } from './event_table.js';
 import { sparkline, sparklineScale } from './sparkline.js';
+
+const PAGE = 200; // rows that are added at a time
 
 /**
  * @typedef {object} EpisodeRow
@@ -123,6 +127,9 @@ export class Episodes {
   /** Rows and their buttons by episode index. @type {Map<number, {row: HTMLTableRowElement, button: HTMLButtonElement}>} */
   #rows = new Map();
   #key = ''; // of the displayed table
+  #limit = PAGE; // rows
+  /** All episodes of data sets that the catalog lists in part. @type {Map<DataSet, EpisodeSummary[]>} */
+  #listed = new Map();
 
   /**
    * @param {HTMLTableElement} table
@@ -164,9 +171,10 @@ export class Episodes {
     const { data } = this.#store.state;
     const selected = this.#task;
     const sets = selected?.data ?? [];
-    const summaries = sets.find(({ name }) => name === data)?.episodes ?? [];
+    const set = sets.find(({ name }) => name === data);
+    const summaries = (set && this.#listed.get(set)) ?? set?.episodes ?? [];
     const byIndex = new Map(this.#results?.episodes.map((errors) => [errors.index, errors]));
-    const episodes = summaries.map((summary) => {
+    const rows = summaries.map((summary) => {
       const errors = byIndex.get(summary.index);
       const failures = errors && this.#score ? (this.#score.counts?.[summary.index] ?? 0) : null;
       return { summary, errors, failures };
@@ -174,15 +182,16 @@ export class Episodes {
     const { name: key, down } = this.#sort;
     const columns = selected ? columnsOf(selected) : [];
     const column = columns.find(({ name }) => name === key) ?? columns[0];
-    return column ? sortRows(episodes, column.value, down) : [];
+    return column ? sortRows(rows, column.value, down) : [];
   }
 
   #draw() {
     const { task, data, filter, faults, among, episode } = this.#store.state;
     const selected = this.#task;
     if (!selected) return;
-    const run = [task, data, filter, faults, among];
-    const key = JSON.stringify([...run, this.#score?.name, Boolean(this.#results), this.#sort]);
+    this.#list(selected.data.find(({ name }) => name === data));
+    const run = [task, data, filter, faults, among, this.#score?.name, Boolean(this.#results)];
+    const key = JSON.stringify([...run, this.#sort, this.#listed.size, this.#limit]);
     if (key === this.#key) return;
     this.#key = key;
     const { activeElement } = document;
@@ -190,19 +199,22 @@ export class Episodes {
       activeElement instanceof HTMLElement && this.#table.contains(activeElement)
         ? activeElement.dataset.column
         : undefined;
-    const episodes = this.#episodes;
-    const scale = sparklineScale(episodes.flatMap(({ errors }) => errors?.worst || []));
+    const sorted = this.#episodes;
+    const scale = sparklineScale(sorted.flatMap(({ errors }) => errors?.worst || []));
     const columns = columnsOf(selected).filter(
-      ({ isResult, value }) => isResult || episodes.some((row) => value(row) !== ''),
+      ({ isResult, value }) => isResult || sorted.some((row) => value(row) !== ''),
     );
     const headings = columns.map((column) =>
       sortHeading(column, this.#sort, (sort) => this.#sortBy(sort), column.isResult),
     );
     this.#head.replaceChildren(create('tr', {}, ...headings, sparklineHeading(selected, scale)));
     this.#rows = new Map(
-      episodes.map((row, i) => [row.summary.index, this.#row(selected, columns, row, scale, i)]),
+      sorted
+        .slice(0, this.#limit)
+        .map((row, i) => [row.summary.index, this.#row(selected, columns, row, scale, i)]),
     );
     this.#body.replaceChildren(...[...this.#rows.values()].map(({ row }) => row));
+    if (sorted.length > this.#limit) this.#body.append(this.#more(sorted.length, columns));
     if (focused) html(`[data-column="${focused}"]`, this.#head).focus();
     this.#markEpisode();
     if (this.#table.parentElement) this.#table.parentElement.scrollTop = 0;
@@ -210,6 +222,37 @@ export class Episodes {
     const current = this.#rows.get(episode);
     if (current && this.#sort.name === 'index' && !this.#selectedSort)
       setTabStop(current.row, false);
+  }
+
+  /**
+   * Requests all episodes of a data set that the catalog lists in part.
+   * @param {DataSet} [set]
+   */
+  async #list(set) {
+    if (!set || isComplete(set) || this.#listed.has(set)) return;
+    this.#listed.set(set, set.episodes);
+    const all = await episodes(this.#store.state.task, set.name, { limit: set.count });
+    this.#listed.set(set, all.episodes);
+    this.#key = '';
+    if (!this.#table.hidden) this.#draw();
+  }
+
+  /**
+   * Returns the row that shows more rows.
+   * @param {number} count of all rows
+   * @param {EpisodeColumn[]} columns
+   */
+  #more(count, columns) {
+    const textContent = `Show ${Math.min(PAGE, count - this.#limit)} more of ${count} episodes`;
+    const button = create('button', { type: 'button', className: 'text', textContent });
+    button.addEventListener('click', () => {
+      const scrolled = this.#table.parentElement;
+      const top = scrolled?.scrollTop ?? 0;
+      this.#limit += PAGE;
+      this.#draw();
+      scrolled?.scrollTo({ top });
+    });
+    return create('tr', {}, create('td', { colSpan: columns.length + 1 }, button));
   }
 
   /** @param {Sort} sort */

@@ -44,6 +44,7 @@ export function addLiveRuns(catalog, { runs, tasks }) {
       name: run.data,
       first: run.episode,
       first_step: 0,
+      count: 1,
       live: run,
       episodes: [{ index: run.episode, steps: run.steps, label }],
     });

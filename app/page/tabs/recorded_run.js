@@ -3,6 +3,8 @@
 /** @import { State } from '../core/state.js' */
 /** @import { Catalog, RecordingEntry, ReportEntry } from '../types/server.js' */
 
+import { hasEpisode } from '../core/episodes.js';
+
 /** @typedef {Pick<State, 'task' | 'filter' | 'data' | 'episode' | 'faults'>} Run */
 
 /**
@@ -24,7 +26,7 @@ export function reportedRun(catalog, { task: name, filter, episode, faults }) {
   const task = catalog.tasks.find((item) => item.name === name);
   if (!task?.filters.some((item) => item.name === filter))
     return { problem: `This server has no filter ${filter} for task ${name}.` };
-  const set = task.data.find(({ episodes }) => episodes.some(({ index }) => index === episode));
+  const set = task.data.find((entry) => hasEpisode(entry, episode));
   if (!set) return { problem: `No data set of this server has an episode ${episode}.` };
   return { run: { task: name, filter, data: set.name, episode, faults } };
 }

@@ -104,6 +104,8 @@ export interface components {
         /**
          * DataInfo
          * @description A data set in the catalog. first, first_step: the episode and step to open first.
+         *
+         *     episodes: all ``count`` of them, or some around the first one; ``EpisodeList`` has the others.
          */
         DataInfo: {
             /** Name */
@@ -112,6 +114,8 @@ export interface components {
             first: number;
             /** First Step */
             first_step: number;
+            /** Count */
+            count: number;
             /** Episodes */
             episodes: components["schemas"]["EpisodeSummary"][];
         };
@@ -314,6 +318,16 @@ export interface components {
             error: (number | null)[];
             /** Contact */
             contact: boolean[];
+        };
+        /**
+         * EpisodeList
+         * @description A part of the episodes of a data set that match a query. count: of all that match.
+         */
+        EpisodeList: {
+            /** Count */
+            count: number;
+            /** Episodes */
+            episodes: components["schemas"]["EpisodeSummary"][];
         };
         /**
          * EpisodeResult
@@ -1978,6 +1992,7 @@ export type DiagnosticOption = components['schemas']['DiagnosticOption'];
 export type DiagnosticResult = components['schemas']['DiagnosticResult'];
 export type DisplayedSensor = components['schemas']['DisplayedSensor'];
 export type EpisodeErrors = components['schemas']['EpisodeErrors'];
+export type EpisodeList = components['schemas']['EpisodeList'];
 export type EpisodeResult = components['schemas']['EpisodeResult'];
 export type EpisodeResults = components['schemas']['EpisodeResults'];
 export type EpisodeSummary = components['schemas']['EpisodeSummary'];

@@ -6,6 +6,7 @@ import { create, element, html } from '../core/dom.js';
 import { search } from '../core/search.js';
 
 const MAX_OPTIONS = 60;
+const PAUSE = 120; // ms without input before the server is asked
 
 export class CommandPalette {
   #dialog;
@@ -14,6 +15,9 @@ export class CommandPalette {
   #none;
   #source;
   #byQuery;
+  #remote;
+  /** @type {number | undefined} */
+  #timer;
   /** @type {Command[]} */
   #all = [];
   /** @type {Command[]} */
@@ -24,11 +28,13 @@ export class CommandPalette {
    * @param {HTMLDialogElement} dialog
    * @param {() => Command[]} source commands that are available when it opens
    * @param {(query: string) => Command[]} byQuery commands that the query itself stands for
+   * @param {(query: string) => Promise<Command[]>} remote commands that the server finds
    */
-  constructor(dialog, source, byQuery) {
+  constructor(dialog, source, byQuery, remote) {
     this.#dialog = dialog;
     this.#source = source;
     this.#byQuery = byQuery;
+    this.#remote = remote;
     this.#input = element('input', HTMLInputElement, dialog);
     this.#list = html('[role=listbox]', dialog);
     this.#none = html('.none', dialog);
@@ -44,10 +50,11 @@ export class CommandPalette {
     });
   }
 
-  toggle() {
+  /** @param {string} [query] */
+  toggle(query = '') {
     if (this.#dialog.open) return this.#close();
     this.#all = this.#source();
-    this.#input.value = '';
+    this.#input.value = query;
     this.#draw();
     this.#dialog.showModal();
   }
@@ -55,12 +62,30 @@ export class CommandPalette {
   #draw() {
     const query = this.#input.value;
     const found = search(query, this.#all, ({ group, title }) => `${title} ${group}`);
-    this.#shown = [...this.#byQuery(query), ...found].slice(0, MAX_OPTIONS);
+    this.#show([...this.#byQuery(query), ...found]);
+    this.#activate(0);
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => this.#request(query), PAUSE);
+  }
+
+  /**
+   * Adds the commands that the server finds, unless the query has changed.
+   * @param {string} query
+   */
+  async #request(query) {
+    const found = await this.#remote(query).catch(() => []);
+    if (!found.length || query !== this.#input.value || !this.#dialog.open) return;
+    this.#show([...this.#shown, ...found]);
+    this.#activate(this.#active);
+  }
+
+  /** @param {Command[]} commands */
+  #show(commands) {
+    this.#shown = commands.slice(0, MAX_OPTIONS);
     this.#list.replaceChildren(...this.#shown.map(option));
     this.#list.hidden = !this.#shown.length;
     this.#none.textContent = this.#shown.length ? '' : 'No command has these words.';
     this.#input.ariaExpanded = String(this.#shown.length > 0);
-    this.#activate(0);
   }
 
   /** @param {KeyboardEvent} event */

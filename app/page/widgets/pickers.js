@@ -5,11 +5,16 @@
 /** @import { FaultDialog } from './fault_dialog.js' */
 
 import { create, element } from '../core/dom.js';
+import { isComplete } from '../core/episodes.js';
 import { SPEEDS } from '../core/state.js';
 import { percent } from '../core/units.js';
-import { checkSelection } from '../data/api.js';
+import { checkSelection, episodes } from '../data/api.js';
 import { liveRunState } from '../tabs/live_runs.js';
 import { faultPicker } from './fault_dialog.js';
+
+const NEARBY = 100; // listed episodes around the selected one, of a large data set
+/** Value of the option that opens the search. */
+export const FIND = 'find';
 
 /** @typedef {[value: string | number, label: string | number]} Option */
 
@@ -18,9 +23,10 @@ import { faultPicker } from './fault_dialog.js';
  * @param {Catalog} catalog
  * @param {Store} store
  * @param {FaultDialog} dialog
+ * @param {() => void} findEpisode opens the search for an episode
  * @returns {() => void} to be called when the catalog has changed
  */
-export function connectPickers(catalog, store, dialog) {
+export function connectPickers(catalog, store, dialog, findEpisode) {
   const selects = {
     task: element('#task', HTMLSelectElement),
     filter: element('#filter', HTMLSelectElement),
@@ -44,11 +50,6 @@ export function connectPickers(catalog, store, dialog) {
     fill(task, names(catalog.tasks));
     fill(filter, names(filtersOf(currentTask(), store.state.data)));
     fill(data, names(currentTask().data));
-    const episodes = byName(currentTask().data, store.state.data)?.episodes ?? [];
-    fill(
-      episode,
-      episodes.map((summary) => [summary.index, episodeLabel(summary)]),
-    );
     for (const select of [task, data])
       if (select.parentElement) select.parentElement.hidden = select.length < 2;
   };
@@ -75,9 +76,30 @@ export function connectPickers(catalog, store, dialog) {
   filter.addEventListener('change', () =>
     store.set({ filter: filter.value, ...swapped(store.state, 'filter', filter.value) }),
   );
-  episode.addEventListener('change', () =>
-    store.set({ episode: Number(episode.value), step: 0, playing: false }),
-  );
+  const showEpisodes = async () => {
+    const set = byName(currentTask().data, store.state.data);
+    if (!set) return;
+    const { task: taskName, data: dataName, episode: index } = store.state;
+    if (!isComplete(set) && !set.episodes.some((entry) => entry.index === index)) {
+      fill(episode, [[index, index]]);
+      const first = Math.max(0, index - NEARBY / 2);
+      const list = await episodes(taskName, dataName, { first, limit: NEARBY }).catch(() => null);
+      if (list) set.episodes = list.episodes;
+      if (set !== byName(currentTask().data, store.state.data) || index !== store.state.episode)
+        return;
+    }
+    /** @type {Option[]} */
+    const options = set.episodes.map((entry) => [entry.index, episodeLabel(entry)]);
+    if (!isComplete(set)) options.unshift([FIND, `Find one of ${set.count} episodes…`]);
+    fill(episode, options);
+    episode.value = String(index);
+  };
+  episode.addEventListener('change', () => {
+    if (episode.value !== FIND)
+      return store.set({ episode: Number(episode.value), step: 0, playing: false });
+    episode.value = String(store.state.episode);
+    findEpisode();
+  });
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (/** @type {State} */ state, changed = new Set(['task'])) => {
     if (changed.has('task') || changed.has('data')) refill();
@@ -85,7 +107,7 @@ export function connectPickers(catalog, store, dialog) {
     task.value = state.task;
     filter.value = state.filter;
     data.value = state.data;
-    episode.value = String(state.episode);
+    if (['task', 'data', 'episode'].some((key) => changed.has(key))) showEpisodes();
     speed.value = String(state.speed);
   };
   show(store.state);
@@ -147,7 +169,7 @@ function firstRun(task, state) {
 }
 
 /** @param {EpisodeSummary} episode */
-function episodeLabel({ index, policy, split, steps, contact_fraction, label }) {
+export function episodeLabel({ index, policy, split, steps, contact_fraction, label }) {
   if (label) return label;
   const parts = [index, policy, split, `${steps} steps`];
   if (contact_fraction !== null) parts.push(`contact ${percent(contact_fraction)}`);

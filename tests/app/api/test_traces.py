@@ -45,6 +45,10 @@ def test_catalog(shared_client: TestClient, steps: int) -> None:
     assert (mine["name"], mine["first"], sample["name"]) == ("mine", 1, "sample")
     assert [(e["index"], e["steps"], e["split"]) for e in mine["episodes"]] == [(0, steps, "train"), (1, steps, "test")]
     assert sample["episodes"][sample["first"]]["split"] == "test"
+    assert sample["count"] == len(sample["episodes"])
+    listed = shared_client.get("/api/episodes/door?data=mine&query=test").json()
+    assert (listed["count"], [e["index"] for e in listed["episodes"]]) == (1, [1])
+    assert shared_client.get("/api/episodes/door?data=none").status_code == 400
 
 
 def test_columns_equal_the_trace(client: TestClient, trace_url: str, settings: Settings, steps: int) -> None:

@@ -1,0 +1,19 @@
+/** Episodes of a data set. The catalog lists large data sets in part. */
+
+/** @import { DataSet } from '../types/server.js' */
+
+/** @param {Pick<DataSet, 'count' | 'episodes'>} set */
+export const isComplete = ({ count, episodes }) => episodes.length === count;
+
+/**
+ * @param {DataSet} set
+ * @param {number} index
+ */
+export const hasEpisode = (set, index) =>
+  isComplete(set) ? set.episodes.some((episode) => episode.index === index) : index < set.count;
+
+/** Returns the first and the last index. @param {DataSet} set */
+export function episodeRange(set) {
+  const indices = set.episodes.map(({ index }) => index);
+  return isComplete(set) ? [Math.min(...indices), Math.max(...indices)] : [0, set.count - 1];
+}
