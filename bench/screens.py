@@ -19,15 +19,15 @@ from served import serving
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import shipped
 
-SIZES = ("1024x768", "1280x720", "1440x900", "3840x2160")
+SIZES = ("900x700", "1024x768", "1280x720", "1440x900", "1920x1080", "3840x2160")
 THEMES = ("light", "dark")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 LONG = "a-filter-trained-on-the-third-floor-with-the-new-camera-v12b"
 TIMEOUT = 120_000  # ms
 SETTLE = 1200  # ms for animations to end
 
-BAD = "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp"
-"""A link to a selection that does not exist."""
+LINKS = {"first": "", "bad-link": "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp"}
+"""View -> address that opens it: the first visit, and a selection that does not exist."""
 
 
 def tab(name: str, ready: str = "true", press: str = "") -> Callable[[Page], None]:
@@ -63,6 +63,8 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "report": click("#report"),
     "keys": click("#help"),
     "jobs": click("#jobs-button"),
+    "commands": click("#find"),
+    "maps-several": click("#maps-tiles input[value=several]"),
 }
 """View -> function that opens it; every tab is a view as well."""
 
@@ -91,17 +93,19 @@ def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, views: li
         page.wait_for_timeout(SETTLE)
         page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
         close(page)
-    if not views or "bad-link" in views:
-        page.goto(url + BAD, timeout=TIMEOUT)
-        page.wait_for_timeout(2 * SETTLE)
-        page.screenshot(path=folder / f"bad-link-{size}-{theme}.png", timeout=TIMEOUT)
+    for name, link in LINKS.items():
+        if not views or name in views:
+            page.goto(url + link, timeout=TIMEOUT)
+            page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=TIMEOUT)
+            page.wait_for_timeout(2 * SETTLE)
+            page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
     page.close()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--view", action="append", default=[], help="a tab or one of " + ", ".join(VIEWS))
+    parser.add_argument("--view", action="append", default=[], help="a tab or one of " + ", ".join([*VIEWS, *LINKS]))
     parser.add_argument("--size", action="append", choices=SIZES)
     parser.add_argument("--theme", action="append", choices=THEMES)
     parser.add_argument("--url", help="of a running server")
