@@ -52,7 +52,7 @@ def blueprint(
         tabs = (diagnostic_tab(diagnostic, name) for name, diagnostic in diagnostics.items())
         series = rrb.Tabs(series, *tabs, active_tab=0)
     return rrb.Blueprint(
-        rrb.Horizontal(scene, series, column_shares=[1, 1]),
+        rrb.Horizontal(scene, series, column_shares=[6, 5]),
         rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following" if growing else "paused"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -104,7 +104,7 @@ def _camera(key: str) -> rrb.Spatial2DView:
 
 def _map(layer: str, first: LikelihoodMap) -> rrb.View:
     side = len(first.offsets_x)
-    name = f"{layer} {first.quantity}" + (f": {first.rule}" if layer == "fused" and first.rule else "")
+    name = layer if first.quantity == "likelihood" else f"{layer} {first.quantity}"  # long titles are cut
     # Without bounds, the view would zoom out to include estimates outside the map.
     bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
     return rrb.Spatial2DView(origin=f"maps/{layer}", name=name, visual_bounds=bounds)
@@ -115,15 +115,15 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     shares: list[float] = []
     if "contact" in task.covariates:
         rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=_linked()))
-        shares.append(1.6)
+        shares.append(1.2)
     titles = {"weights": "Fusion weights beta", "effective_weights": "Effective weights"}
     fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in titles.items() if getattr(trace, name) is not None]
     if fusion:
         rows.append(rrb.Tabs(*fusion, active_tab=0))
         shares.append(2.5)
-    for component in task.components:
-        rows.append(_estimate(trace, task, component, growing))
-        shares.append(2.5)
+    # Tabs, because more rows than this have no height left for their lines on a laptop.
+    rows.append(rrb.Tabs(*(_estimate(trace, task, component, growing) for component in task.components), active_tab=0))
+    shares.append(2.5)
     main = task.main_error
     errors = [_plot("errors/position", with_unit(f"{main.title} error", main.unit))]
     errors += [
@@ -131,11 +131,10 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
         for c in angles(task)
         if (task.index(c.name),) != main.indices
     ]
+    if trace.log_weights is not None:
+        errors.append(_plot("diagnostics/effective_sample_size", "Effective sample size"))
     rows.append(rrb.Tabs(*errors, active_tab=0))
     shares.append(2.5)
-    if trace.log_weights is not None:
-        rows.append(_plot("diagnostics/effective_sample_size", "Effective sample size"))
-        shares.append(2.0)
     return rrb.Vertical(*rows, row_shares=shares, name="Run")
 
 
@@ -150,8 +149,9 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
         margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
-    name = f"{with_unit(component.label, component.shown[0])}: truth green, fused red"
-    name += ", thin lines 2 sigma" if trace.has_covariance else ""
+    name = with_unit(component.label, component.shown[0])
+    if i == 0:  # a legend of all modalities with their bands would hide the lines
+        name += ": truth green, fused red"
     return _plot(f"states/{component.name}", name, limits, legend=False)
 
 
