@@ -31,7 +31,8 @@ class Episode:
 
     Attributes:
         task: definition of the state, the sensors and the control.
-        states: (T, n) true state, components as in ``Task.components`` (m, rad), float32.
+        states: (T, n) true state, components as in ``Task.components`` (m, rad), or with quaternions
+            (``Task.states``); float32.
         controls: (T, c) control applied between steps t-1 and t, float32; default: none (c is 0).
         observations: observation key -> (T, ...) sensor readings, uint8 images and float32 (``Task.dtype``).
         contact: (T,) bool, ground truth of contact between robot and object; default: False.
@@ -61,6 +62,7 @@ class Episode:
         absent = {"contact": np.zeros(steps, bool), "controls": np.zeros((steps, 0)), "qpos": np.zeros((steps, 0))}
         values: dict[str, Any] = {name: array for name, array in absent.items() if getattr(self, name) is _MISSING}
         values |= {} if self.dt else {"dt": self.task.dt}
+        values["states"] = self.task.states(self.states)
         for name in ("states", "controls", "qpos"):
             values[name] = _single(values.get(name, getattr(self, name)))
         for name in ("observations", "covariates"):

@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import Covariate
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.simulation.camera import Camera
 
 DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
@@ -49,12 +50,14 @@ class Component:
         unit: of its values: ``rad`` for an angle, ``m``, or any other text, such as ``m/s``.
         static: whether it is constant in every episode.
         display: unit for display and its factor, such as ``("km/h", 3.6)``. Default: cm, degrees, else the unit.
+        rotation: name of the rotation whose vector it is a component of; see ``rotation``.
     """
 
     name: str
     unit: str
     static: bool = False
     display: tuple[str, float] | None = None
+    rotation: str = ""
 
     @property
     def shown(self) -> tuple[str, float]:
@@ -72,14 +75,25 @@ class Component:
         return display_name(self.name)
 
 
+def rotation(name: str) -> tuple[Component, Component, Component]:
+    """Three components of a rotation in space: its rotation vector in rad, body to world (``datasets/rotations.py``).
+
+    States and estimates may have its unit quaternion (w, x, y, z) in their place. Errors and covariances of the
+    components are those of the rotation from the true to the estimated orientation, in the true body axes.
+    """
+    x, y, z = (Component(f"{name}_{axis}", "rad", rotation=name) for axis in "xyz")
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class MainError:
     """The one error that a run is summarised by: that of the position, or of another map component.
 
     Attributes:
-        name: ``position``, or the labels of the components.
+        name: ``position``, the name of a rotation, or the labels of the components.
         unit, factor: for display, and the factor from the unit of the components.
-        indices: of the components in the state: those of the map if they share a unit, else the first one.
+        indices: of the components in the state: those of the map if they share a unit, else the first one; all three
+            of a rotation that the first one belongs to.
     """
 
     name: str
@@ -229,6 +243,58 @@ class Task:
             raise unknown_name(f"component of task {self.name!r}", component, names)
         return names.index(component)
 
+    @property
+    def rotations(self) -> tuple[slice, ...]:
+        """Where the vector of each rotation is in the state."""
+        names = [component.rotation for component in self.components]
+        return tuple(slice(names.index(name), names.index(name) + 3) for name in dict.fromkeys(names) if name)
+
+    def states(self, values: NDArray[Any]) -> NDArray[Any]:
+        """States (..., n) of values that may have a unit quaternion (w, x, y, z) in place of each rotation vector.
+
+        Values (..., n) are returned unchanged, others have one number more for each rotation. Raises BadInput for a
+        quaternion whose norm is not 1 within 1 %.
+        """
+        if not self.rotations or np.ndim(values) == 0 or values.shape[-1] != len(self.components) + len(self.rotations):
+            return values
+        parts: list[NDArray[Any]] = []
+        start = 0
+        for where in self.rotations:
+            first = where.start + len(parts) // 2  # each rotation before has one number more
+            quaternion = values[..., first : first + 4]
+            norm = np.linalg.norm(quaternion, axis=-1)
+            if (np.abs(norm - 1.0) > 0.01).any():
+                worst = norm.flat[np.nanargmax(np.abs(norm - 1.0))]
+                name = self.components[where.start].rotation
+                raise BadInput(f"quaternion of {name!r} has norm {worst:.4g}, expected 1: (w, x, y, z)")
+            parts += [values[..., start:first], rotations.to_vector(quaternion)]
+            start = first + 4
+        return np.concatenate([*parts, values[..., start:]], axis=-1)
+
+    def difference(self, states: NDArray[Any], reference: NDArray[Any]) -> Array:
+        """(..., n) differences of states, angles wrapped to -pi..pi; of rotations, see ``rotations.difference``."""
+        change = np.array(states - reference, dtype=np.float64)
+        angles = [i for i, component in enumerate(self.components) if component.unit == "rad"]
+        change[..., angles] = (change[..., angles] + np.pi) % (2.0 * np.pi) - np.pi
+        for where in self.rotations:
+            change[..., where] = rotations.difference(states[..., where], reference[..., where])
+        return change
+
+    def near(self, states: NDArray[Any], reference: NDArray[Any]) -> NDArray[Any]:
+        """States (..., n) to display beside a reference, whose rotation vectors are the reference plus the difference.
+
+        Rotation vectors jump at an angle of pi; these do not, and their errors are those of ``difference``. Where the
+        reference is unknown, and without rotations, states are unchanged.
+        """
+        if not self.rotations:
+            return states
+        result = np.array(states)
+        for where in self.rotations:
+            base = np.broadcast_to(reference[..., where], result[..., where].shape)
+            moved = base + rotations.difference(result[..., where], base)
+            result[..., where] = np.where(np.isnan(base), result[..., where], moved)
+        return result
+
     def start_variance(self) -> Array:
         """(n,) mean square of each component's start offset, SI units; NaN for components that start at the truth.
 
@@ -252,6 +318,10 @@ class Task:
     def main_error(self) -> MainError:
         """The error that runs are summarised by."""
         parts = [self.components[i] for i in self.map_indices]
+        for where in self.rotations:
+            if where.start <= self.map_indices[0] < where.stop:
+                indices = tuple(range(where.start, where.stop))
+                return MainError(display_name(parts[0].rotation), *parts[0].shown, indices)
         if any((c.unit, c.shown) != (parts[0].unit, parts[0].shown) for c in parts):
             parts = parts[:1]
         is_position = len(parts) == 2 and parts[0].unit in LENGTHS

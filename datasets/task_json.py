@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_args
 
+import numpy as np
+
 from beliefscope.datasets.covariate import CONTACT, Covariate, Kind
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
@@ -64,7 +66,11 @@ def task_from_json(values: Any) -> Task:
 def _component(values: Mapping[str, Any]) -> Component:
     display = values.get("display")
     return Component(
-        values["name"], values["unit"], values["static"], None if display is None else (display[0], display[1])
+        values["name"],
+        values["unit"],
+        values["static"],
+        None if display is None else (display[0], display[1]),
+        values.get("rotation", ""),  # definitions of earlier versions lack it
     )
 
 
@@ -128,6 +134,11 @@ def check_definition(task: Task, where: str = "") -> None:
         unit, factor = component.shown
         if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
             raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")
+    for name in dict.fromkeys(component.rotation for component in task.components):
+        parts = [i for i, component in enumerate(task.components) if name and component.rotation == name]
+        alike = {task.components[i].unit for i in parts} == {"rad"} and [*np.diff(parts)] == [1, 1]
+        if not isinstance(name, str) or (name and not alike):
+            raise BadInput(f"{place}: rotation {name!r:.200} has {len(parts)} components, expected three of unit rad.")
     if len(set(task.map_indices)) != len(task.map_components) or len(task.map_components) not in (1, 2):
         raise BadInput(f"{place}: map components are {list(task.map_components)!r:.200}, expected one or two names.")
     for key, shape in task.observations.items():

@@ -52,6 +52,8 @@ def main(folder: Path) -> None:
 
     own = bs.load_filter(follow_hand, task="push", name="hand")
     print(bs.trace(own, bs.open_dataset(episodes), 0))
+    attitude = bs.Task("attitude", bs.rotation("attitude"), {"compass": (3,)}, {"compass": ("compass",)}, 0, 0.02)
+    print(attitude.main_error.label)
 
 
 def follow_hand(*, observations: dict[str, np.ndarray], controls: np.ndarray) -> np.ndarray:

@@ -198,7 +198,7 @@ def _filter_runs(
             for model, moments in zip(filter_.names, updates, strict=True):
                 runs[UPDATE.format(model)] = _si_run(filter_, batch, Gaussian(*moments))
     mean = filter_.statistics.state_to_si(start.mean)
-    return runs | {STAY: _stay(mean.cpu(), batch.states.cpu())}
+    return runs | {STAY: _stay(filter_.task, mean.cpu(), batch.states.cpu())}
 
 
 def _si_run(filter_: Filter, batch: Batch, estimate: Gaussian) -> Run:
@@ -225,23 +225,30 @@ def _external_runs(
             check_name(f"modality of task {external.task.name!r}", modality, external.task.modalities)
         seen = [without(episode, absent, external.adapter.absent) for episode in episodes]
         values, names = external.run(seen, seed, start=start)
-        runs[run_name] = _external_run(values, truth)
+        runs[run_name] = _external_run(external.task, values, truth)
         if run_name == FILTER and modalities and "modality_mean" in values:
             for k, name in enumerate(names):
                 moments = {"estimate_mean": values["modality_mean"][:, :, k]}
-                runs[UPDATE.format(name)] = _external_run(moments, truth)
-    return runs if start.mean.isnan().any() else runs | {STAY: _stay(start.mean, truth)}
+                runs[UPDATE.format(name)] = _external_run(external.task, moments, truth)
+    return runs if start.mean.isnan().any() else runs | {STAY: _stay(external.task, start.mean, truth)}
 
 
-def _external_run(values: Mapping[str, Tensor], truth: Tensor) -> Run:
+def _external_run(task: Task, values: Mapping[str, Tensor], truth: Tensor) -> Run:
     mean = values["estimate_mean"]
     unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
-    return mean - truth, values.get("estimate_covariance", unknown)
+    return _errors(task, mean, truth), values.get("estimate_covariance", unknown)
 
 
-def _stay(mean: Tensor, states: Tensor) -> Run:
+def _errors(task: Task, mean: Tensor, truth: Tensor) -> Tensor:
+    """(..., n) errors of estimates; angles may exceed pi."""
+    if not task.rotations:
+        return mean - truth
+    return torch.from_numpy(task.difference(mean.numpy(), truth.numpy()))
+
+
+def _stay(task: Task, mean: Tensor, states: Tensor) -> Run:
     """The run of an estimator that keeps the start (N, n) as its estimate of the states (T, N, n)."""
-    return mean - states, torch.full((*states.shape, states.shape[-1]), torch.nan)
+    return _errors(task, mean, states), torch.full((*states.shape, states.shape[-1]), torch.nan)
 
 
 def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:

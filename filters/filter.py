@@ -125,6 +125,9 @@ class Filter(nn.Module, ABC):
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         task = architecture.task
+        if task.rotations:
+            name = task.components[task.rotations[0].start].rotation
+            raise BadInput(f"built-in filters estimate vectors; task {task.name!r} has the rotation {name!r}")
         self.architecture = architecture
         self.task = task
         self.n = len(task.components)

@@ -53,6 +53,9 @@ class StartOffset:
             unit, factor = units[shown]
             if not 0.0 < value < 1e6 or unit in lengths:
                 raise BadInput(f"start offset {part!r} of {text!r} is not one positive length, such as 3{shown}")
+            if task.rotations and unit == "rad":
+                name = task.components[task.rotations[0].start].rotation
+                raise BadInput(f"start offset {part!r}: {name!r} is a rotation, which starts at the truth")
             lengths[unit] = value / factor
         return cls(lengths)
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
@@ -31,7 +32,7 @@ from beliefscope.inspect.maps.plane import (
     plane_of,
 )
 from beliefscope.inspect.maps.statistics import has_layer_weights, layer_weights
-from beliefscope.inspect.statistics.measures import FLOOR, wrapped
+from beliefscope.inspect.statistics.measures import FLOOR
 from beliefscope.inspect.trace import Trace
 
 Doubles = NDArray[np.float64]
@@ -302,6 +303,8 @@ class MapEngine:
         states = np.tile(middle, (len(y), size, 1))
         states[..., ix] += x
         states[..., iy] += y[:, None]
+        for where in self.task.rotations:  # the axes of the map are body axes at its centre
+            states[..., where] = rotations.add(middle[where], states[..., where] - middle[where])
         cells, count = states.reshape(-1, states.shape[-1]).astype(np.float32), len(self.trace.modalities)
         values = log_likelihood(self.checkpoint, self.trace.episode, step, cells, count)
         return values.reshape(-1, len(y), size)
@@ -315,7 +318,8 @@ class MapEngine:
         x, y = plane.offsets(size)
         components = plane.components if others == "marginal" else None
         with np.errstate(divide="ignore"):
-            densities = [ParticleDensity(self.task, particles[step], np.log(layer), components) for layer in weights]
+            states = self.task.near(particles[step], middle)  # tangent space at the centre of the map
+            densities = [ParticleDensity(self.task, states, np.log(layer), components) for layer in weights]
         return np.stack([d.log_density(middle, plane.along, x, y) for d in densities]).astype(np.float32)
 
     def _moments(self, step: int, quantity: Quantity) -> tuple[Doubles, Doubles]:
@@ -345,7 +349,7 @@ class MapEngine:
         """
         ix, iy = plane.along
         mean, covariance = self._moments(step, quantity)
-        from_mean = wrapped(self.task, middle - mean)
+        from_mean = self.task.difference(middle, mean)
         if others == "marginal":
             kept = list(plane.components)
             from_mean, covariance = from_mean[:, kept], covariance[:, kept][:, :, kept]

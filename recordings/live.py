@@ -165,7 +165,7 @@ class LiveRecorder:
                 a dictionary. The batch axis N = 1 may be missing.
             observations: by the task's keys; some may be missing.
             control: (c,).
-            truth: (n,) true state, if measured. Default: NaN.
+            truth: (n,) true state, if measured, or with quaternions (``Task.states``). Default: NaN.
             contact: whether the robot truly touches the object. Default: the observation ``contact``, if any.
             covariates: values of the task's other covariates: a number, a bool or the name of a group. A missing one is
                 unknown.
@@ -176,10 +176,12 @@ class LiveRecorder:
         """
         arrays = {key: np.array(value) for key, value in observations.items()}
         row = _Row(
-            values if isinstance(values, StepTrace) else _with_batch_axis(named_values(_tensors(values), "the filter")),
+            values
+            if isinstance(values, StepTrace)
+            else _with_batch_axis(named_values(_tensors(values), "the filter", self._task)),
             {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in arrays.items()},
             np.array(np.zeros(self._task.control_size) if control is None else control, np.float32),
-            np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32),
+            self._task.states(np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32)),
             bool(np.any(arrays.get("contact", False))) if contact is None else contact,
             self._covariates(covariates),
             np.array(qpos, np.float32),
@@ -320,7 +322,7 @@ class LiveRecorder:
         """Steps of an external filter as a trace, without values that some of the steps lack."""
         n = self._sizes["n"]
         together = stacked(steps, self._channels)
-        values = derived({name: _typed(name, value[:, 0]) for name, value in together.items()})
+        values = derived({name: _typed(name, value[:, 0]) for name, value in together.items()}, self._task)
         modalities = model_names(values, 1, self._modalities, self._task)
         arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in values.items()}
         fields: dict[str, Any] = {"filter": "own"} | self._fields | fill_missing(arrays, len(modalities))

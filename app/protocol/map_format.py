@@ -97,7 +97,7 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
         "note": maps.note,
         "centre": maps.centre.tolist(),
         "truth": _json(trace.episode.states[index]),
-        "estimate": _json(trace.estimate_mean[index]),
+        "estimate": _json(task.near(trace.estimate_mean[index], trace.episode.states[index])),
         "log_max": _json(log_max),
         "log_range": _json(log_range),
         "peak": maps.peaks().tolist(),

@@ -31,9 +31,9 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {
         "truth": trace.episode.states,
-        "estimate_mean": trace.estimate_mean,
+        "estimate_mean": trace.task.near(trace.estimate_mean, trace.episode.states),
         "estimate_sigma": _sigma(trace.estimate_covariance) if trace.has_covariance else None,
-        "modality_mean": trace.modality_mean if unimodal else None,
+        "modality_mean": trace.task.near(trace.modality_mean, trace.episode.states[:, None]) if unimodal else None,
         "modality_sigma": _sigma(trace.modality_covariance) if unimodal else None,
         "nees": measures.nees(trace) if trace.has_covariance else None,
         "innovation": None if innovation is None else innovation[0],

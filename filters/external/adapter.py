@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.belief import Gaussian, moments
@@ -165,10 +166,11 @@ class Units:
         return value.float()
 
 
-def named_values(output: Any, source: str) -> Values:
+def named_values(output: Any, source: str, task: Task) -> Values:
     """A filter's return value for a step or all steps, by name, as tensors on the CPU.
 
-    Raises BadInput for unknown names, incomplete pairs and values that are no arrays.
+    Means and particles may have quaternions (``Task.states``). Raises BadInput for unknown names, incomplete pairs and
+    values that are no arrays.
     """
     if isinstance(output, Tensor | np.ndarray):
         output = {"estimate_mean": output}
@@ -195,6 +197,10 @@ def named_values(output: Any, source: str) -> Values:
         present = [name for name in pair if name in values]
         if len(present) == 1:
             raise BadInput(f"{source} returns only {present[0]}, expected both {pair[0]} and {pair[1]}, or neither")
+    if task.rotations:
+        for name, axes in letters.items():
+            if axes.endswith("n") and not axes.endswith("nn"):
+                values[name] = torch.from_numpy(task.states(values[name].numpy()))
     return values
 
 
@@ -283,7 +289,20 @@ def _is_finite(value: Tensor) -> bool:
     return not value.is_floating_point() or bool(value.sum().isfinite())
 
 
-def derived(values: Values) -> Values:
+def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
+    """Mean and covariance as ``moments``; of rotations, their mean and the covariance of the differences from it."""
+    linear = moments(particles, log_weights)
+    if not task.rotations:
+        return linear
+    states, weights, mean = particles.double().numpy(), log_weights.double().exp().numpy(), linear.mean.numpy().copy()
+    for where in task.rotations:
+        mean[..., where] = rotations.mean(states[..., where], weights)
+    deviation = task.difference(states, mean[..., None, :])
+    covariance = np.einsum("...m,...mi,...mj->...ij", weights, deviation, deviation)
+    return Gaussian(torch.from_numpy(mean).to(particles.dtype), torch.from_numpy(covariance).to(particles.dtype))
+
+
+def derived(values: Values, task: Task) -> Values:
     """Adds derived values: moments of the particles, and each measurement model's own posterior."""
     particles = values.get("particles")
     if particles is None:
@@ -293,7 +312,7 @@ def derived(values: Values) -> Values:
     for name in ("log_weights", "prior_log_weights"):
         if name in values:
             values[name] = torch.log_softmax(values[name], dim=-1)
-    posterior = moments(particles, values["log_weights"]) if one or "estimate_covariance" not in values else None
+    posterior = _moments(task, particles, values["log_weights"]) if one or "estimate_covariance" not in values else None
     if posterior is not None:
         values.setdefault("estimate_covariance", posterior.covariance)
     if posterior is not None and one:
@@ -301,7 +320,7 @@ def derived(values: Values) -> Values:
         values.setdefault("modality_covariance", posterior.covariance.unsqueeze(-3))
     elif has_likelihood and "modality_mean" not in values:
         log_weights = torch.log_softmax(values["prior_log_weights"].unsqueeze(-2) + values["log_likelihood"], dim=-1)
-        posterior = moments(particles.unsqueeze(-3), log_weights)
+        posterior = _moments(task, particles.unsqueeze(-3), log_weights)
         values["modality_mean"], values["modality_covariance"] = posterior.mean, posterior.covariance
     return values
 

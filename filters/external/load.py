@@ -133,7 +133,7 @@ class ExternalFilter(Checkpoint):
         n = len(self._task.components)
         with self._errors_at("initialize_beliefs"):
             belief = initialize(self.adapter.module, *NO_BELIEF)
-            values = {} if belief is None else named_values(belief, self.source)
+            values = {} if belief is None else named_values(belief, self.source, self._task)
             values = {name: value.expand(count, *value.shape[-len(SHAPES[name]) :]) for name, value in values.items()}
         values = self._units.to_si(check_values(values, (count,), {"n": n}, f"{self.source} at initialize_beliefs"))
         unknown = torch.full((count, n, n), torch.nan)
@@ -175,7 +175,7 @@ class ExternalFilter(Checkpoint):
         models = runs[0][1]
         common = [name for name in runs[0][0] if all(name in values for values, _ in runs)]
         values = {name: torch.cat([run[name] for run, _ in runs], dim=1) for name in common}
-        return derived(self._units.to_si(values)), self._names(values, models)
+        return derived(self._units.to_si(values), self._task), self._names(values, models)
 
     def _run(
         self, episodes: Sequence[Episode], seed: int, progress: Callable[[float], None], start: Gaussian
@@ -289,10 +289,10 @@ class ExternalFilter(Checkpoint):
     def _call(self, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device) -> Values:
         """The filter's output by name, with the axis N, for inputs whose axis N is the last but one of the controls."""
         if self.adapter.batched:
-            return named_values(call(self.adapter, observations, controls, device), self.source)
+            return named_values(call(self.adapter, observations, controls, device), self.source, self._task)
         axis = controls.ndim - 2
         single = {key: value.select(axis, 0) for key, value in observations.items()}
-        values = named_values(call(self.adapter, single, controls.select(axis, 0), device), self.source)
+        values = named_values(call(self.adapter, single, controls.select(axis, 0), device), self.source, self._task)
         return {name: value.unsqueeze(axis) for name, value in values.items()}
 
     def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:

@@ -19,7 +19,6 @@ from beliefscope.inspect.statistics.measures import (
     layer_label,
     main_error,
     means,
-    wrapped,
 )
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.replay import Edit
@@ -133,7 +132,7 @@ class Counterfactual(Diagnostic):
         """Component -> largest difference in display units, step, unit."""
         task = self.task
         units, factors = display_units(task)
-        difference = np.abs(wrapped(task, self.edited - self.original)) * factors
+        difference = np.abs(task.difference(self.edited, self.original)) * factors
         steps = difference.argmax(0)
         return {
             component.label: (float(difference[steps[i], i]), int(steps[i]), units[i])
@@ -212,7 +211,7 @@ def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
     if len(original) != len(edited):
         raise BadInput(f"traces of {len(original)} and {len(edited)} steps are not from one episode")
     task = original.task
-    difference = wrapped(task, means(edited) - means(original))
+    difference = task.difference(means(edited), means(original))
     on_map = task.main_error.norm(difference)
     fused = difference[:, -1]
     weights = [

@@ -28,7 +28,6 @@ from beliefscope.inspect.statistics.measures import (
     means,
     nees,
     phases,
-    wrapped,
 )
 from beliefscope.inspect.trace import Trace
 
@@ -231,7 +230,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         else tuple(name for name in this.modalities_with_posterior if name in other.modalities_with_posterior)
     )
     layers = np.stack([_layers(run, shared) for run in runs], axis=-1)  # (T, K + 1, n, 2)
-    distance = task.main_error.norm(wrapped(task, layers[..., 1] - layers[..., 0]))
+    distance = task.main_error.norm(task.difference(layers[..., 1], layers[..., 0]))
     error = np.stack([errors(run)[:, -1] for run in runs], axis=-1)
     on_map = np.stack([main_error(run)[:, -1] for run in runs], axis=-1)
     nees_at = np.stack([nees(run)[:, -1] for run in runs], axis=-1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beliefscope.inspect.statistics.measures import counted, wrapped
+from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag
 from beliefscope.inspect.trace import Trace
 
@@ -30,7 +30,7 @@ def label_statistics(trace: Trace) -> dict[str, float]:
     keep = counted(trace)
     if not trace.modalities or keep.sum() < MIN_STEPS or not np.isfinite(labels).all():
         return {}
-    difference = wrapped(task, labels[:, None] - measured)  # (T, K, n)
+    difference = task.difference(labels[:, None], measured)  # (T, K, n)
     offset = np.median(difference[keep], axis=0)  # (K, n)
     lags = np.array([_lag(labels, labels - difference[:, k], keep) for k in range(len(trace.modalities))])
     values = {f"lag/labels {name}/all": float(steps) for name, steps in zip(trace.modalities, lags, strict=True)}

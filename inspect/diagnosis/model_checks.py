@@ -96,7 +96,7 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
         return {}
     task = trace.task
     truth = trace.episode.states[steps].astype(np.float64)
-    residual = measures.wrapped(task, observed - truth[:, None])
+    residual = task.difference(observed, truth[:, None])
     black = measures.blackout(trace)[steps]
     values: dict[str, float] = {}
     for k, model in enumerate(trace.modalities):

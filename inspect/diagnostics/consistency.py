@@ -280,7 +280,7 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
     else:
         assert trace.particles is not None
         level, crps = np.empty(nees.shape), np.empty(error.shape)
-        deviation = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
+        deviation = task.difference(trace.particles, trace.episode.states[:, None])
         weights = np.exp(measures.particle_log_weights(trace))
         for k in range(error.shape[1]):  # one layer at a time limits memory to (T, M, n)
             from_mean = measures.wrapped(task, deviation - error[:, k, None])

@@ -181,7 +181,7 @@ def _steps(trace: Trace) -> tuple[Array, Array, Array]:
     """Error of the ensemble mean, spread and rank of the true value, (T, n) each; NaN where the truth is unknown."""
     assert trace.particles is not None
     task, truth = trace.task, trace.episode.states[:, None].astype(np.float64)
-    deviation = measures.wrapped(task, trace.particles.astype(np.float64) - truth)
+    deviation = task.difference(trace.particles.astype(np.float64), truth)
     centre = deviation.mean(1, keepdims=True)
     members = trace.particles.shape[1]
     spread = np.sqrt(np.square(deviation - centre).sum(1) / (members - 1) * (members + 1) / members)

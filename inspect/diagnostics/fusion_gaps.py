@@ -85,7 +85,7 @@ def _sensor_errors(trace: Trace) -> tuple[Array, Array]:
     """Errors (T, K, n) of the virtual sensors, and the inverses of R (T, K, n, n), at counted steps."""
     assert trace.observation_mean is not None
     assert trace.observation_covariance is not None
-    error = measures.wrapped(trace.task, trace.observation_mean - trace.episode.states[:, None])
+    error = trace.task.difference(trace.observation_mean, trace.episode.states[:, None])
     keep = measures.counted(trace)
     return error[keep], np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
 
@@ -234,7 +234,7 @@ def _weighted_sums(trace: Trace, of_sensors: bool) -> tuple[Array, Array]:
     where = list(task.main_error.indices)
     estimates = trace.observation_mean if of_sensors else trace.modality_mean
     assert estimates is not None
-    error = measures.wrapped(task, estimates - trace.episode.states[:, None])[..., where]  # (T, K, 2)
+    error = task.difference(estimates, trace.episode.states[:, None])[..., where]  # (T, K, 2)
     weights = trace.effective_weights.astype(np.float64)
     scalar = weights.shape[-1] == 1
     weights = np.broadcast_to(weights, error.shape) if scalar else weights[..., where]

@@ -322,7 +322,7 @@ def _farther(trace: Trace, weights: Array) -> Array:
     """(T,) share of the predicted weight (T, M) that is farther from the mean than the true state."""
     assert trace.particles is not None
     task = trace.task
-    deviation = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
+    deviation = task.difference(trace.particles, trace.episode.states[:, None])
     error = (weights[..., None] * deviation).sum(1)
     from_mean = measures.wrapped(task, deviation - error[:, None])
     covariance = np.einsum("tm,tmi,tmj->tij", weights, from_mean, from_mean)

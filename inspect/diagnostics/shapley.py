@@ -287,7 +287,7 @@ def shapley(
                 progress((i + done) / len(traces))
 
         estimates = run_subsets(checkpoint, trace, offset, share)
-        errors.append(measures.wrapped(task, estimates - trace.episode.states[:, None]))
+        errors.append(task.difference(estimates, trace.episode.states[:, None]))
     position = [task.main_error.norm(error) for error in errors]
     keep = len(first) if len(traces) == 1 else 0
     return Shapley(

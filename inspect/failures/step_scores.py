@@ -191,7 +191,7 @@ def disagreement(trace: Trace) -> Array:
     """
     mean, covariance = measures.means(trace)[:, :-1], measures.covariances(trace)[:, :-1]
     i, j = np.array(list(combinations(range(len(trace.modalities)), 2))).T
-    difference = measures.wrapped(trace.task, mean[:, i] - mean[:, j])
+    difference = trace.task.difference(mean[:, i], mean[:, j])
     white = np.linalg.solve(covariance[:, i] + covariance[:, j], difference[..., None])[..., 0]
     return np.sqrt((difference * white).sum(-1) / difference.shape[-1]).max(axis=1)
 
@@ -273,7 +273,8 @@ def _recently(events: Mask, steps: int) -> Mask:
 
 def _speeds(trace: Trace, task: Task) -> Array:
     """(T, Q) speeds: object position, object rotation, and observed end effector."""
-    motion = measures.wrapped(task, np.diff(trace.episode.states, axis=0, prepend=trace.episode.states[:1]))
+    states = trace.episode.states
+    motion = task.difference(states, np.concatenate([states[:1], states[:-1]]))
     changes = [motion[:, list(task.map_indices)]]
     changes += [motion[:, [i]] for i, c in enumerate(task.components) if c.unit == "rad"]
     effector = trace.episode.observations.get("effector_position")

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
-from beliefscope.inspect.statistics.measures import wrapped
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -100,7 +99,7 @@ def _half_width(trace: Trace, index: int) -> float:
     task = trace.task
     if index in task.main_error.indices:
         return task.map_half_width
-    error = np.abs(wrapped(task, trace.estimate_mean - trace.anchors)[:, index])
+    error = np.abs(task.difference(trace.estimate_mean, trace.anchors)[:, index])
     deviation = np.sqrt(np.maximum(trace.estimate_covariance[:, index, index].astype(np.float64), 0.0))
     reach = MARGIN * float(np.quantile(error + DEVIATIONS * np.nan_to_num(deviation), 0.95))
     _, factor = task.components[index].shown

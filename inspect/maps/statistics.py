@@ -169,6 +169,6 @@ def particle_cloud(
     """
     if trace.particles is None or not has_layer_weights(trace):
         return None
-    points = trace.particles[step][:, list(components)]
+    points = trace.task.near(trace.particles[step], trace.episode.states[step])[:, list(components)]
     points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))  # a curve has no second one
     return points, layer_weights(trace, step)

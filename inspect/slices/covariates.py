@@ -93,7 +93,7 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
             yield display_name(name), "", groups[covariate.group_index(values)]
     yield "blackout", "", outage
     yield "outage length", "s", _duration(outage) * dt
-    change = measures.wrapped(task, np.diff(episode.states, axis=0, prepend=episode.states[:1]))
+    change = task.difference(episode.states, np.concatenate([episode.states[:1], episode.states[:-1]]))
     main = task.main_error
     if main.name == "position":
         yield "object speed", f"{task.components[main.indices[0]].unit}/s", main.norm(change) / dt

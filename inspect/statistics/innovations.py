@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import jackknife
-from beliefscope.inspect.statistics.measures import Array, counted, wrapped
+from beliefscope.inspect.statistics.measures import Array, counted
 from beliefscope.inspect.traces.data import Trace
 
 
@@ -72,7 +72,7 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
     if any(part is None for part in parts):
         return None
     z, predicted, r, p = (np.asarray(part, dtype=np.float64) for part in parts)
-    return wrapped(trace.task, z - predicted), p + r
+    return trace.task.difference(z, predicted), p + r
 
 
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:

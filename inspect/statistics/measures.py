@@ -39,7 +39,7 @@ def layer_label(layer: str) -> str:
 
 
 def wrapped(task: Task, difference: NDArray[Any]) -> Array:
-    """Differences of states (..., n), angles wrapped to -pi..pi."""
+    """Sums of differences of states (..., n), angles wrapped to -pi..pi; for states, see ``Task.difference``."""
     return wrap_angles(difference, [i for i, component in enumerate(task.components) if component.unit == "rad"])
 
 
@@ -63,13 +63,13 @@ def covariances(trace: Trace) -> Array:
 
 
 def errors(trace: Trace) -> Array:
-    """(T, L, n) m, rad: estimate minus true state, angles wrapped."""
-    return wrapped(trace.task, means(trace) - trace.episode.states[:, None])
+    """(T, L, n) m, rad: ``Task.difference`` of estimate and true state."""
+    return trace.task.difference(means(trace), trace.episode.states[:, None])
 
 
 def starts_at_truth(trace: Trace) -> bool:
     """Whether the mean of the first belief is the true state of step 0, to float32 precision."""
-    return bool(np.allclose(wrapped(trace.task, trace.start_mean - trace.episode.states[0]), 0.0, atol=1e-5))
+    return bool(np.allclose(trace.task.difference(trace.start_mean, trace.episode.states[0]), 0.0, atol=1e-5))
 
 
 def main_error(trace: Trace) -> Array:

@@ -97,7 +97,7 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
     values = {name: torch.from_numpy(array[at]) for name, array in estimate.items()}
     weights = mapping.estimate.get("weights", {})
     check_values(values, (len(at),), {"n": n}, source)
-    arrays: dict[str, Any] = {name: value.float().numpy() for name, value in derived(values).items()}
+    arrays: dict[str, Any] = {name: value.float().numpy() for name, value in derived(values, episode.task).items()}
     settings = {"source": source} | ({"particles": arrays["particles"].shape[1]} if "particles" in arrays else {})
     return Trace(
         episode=episode,

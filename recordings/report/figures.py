@@ -109,7 +109,7 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
     where = list(task.map_indices)
     titles, factors = zip(*axis_titles(task, where), strict=True)
     half = np.array(plane_of(trace).half_widths) * factors
-    offsets = measures.wrapped(task, measures.means(trace)[step] - trace.anchors[step])[:, where] * factors
+    offsets = task.difference(measures.means(trace)[step], trace.anchors[step])[:, where] * factors
     positions = dict(zip(measures.layers(trace), offsets, strict=True))
     if len(where) == 1:
         _draw_curve(axes, trace, positions, map_, layer, factors[0])

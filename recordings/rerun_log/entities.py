@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Component, Outline, Task, with_unit
 from beliefscope.inspect.palette import colour
-from beliefscope.inspect.statistics.measures import contours, layer_label, wrapped
+from beliefscope.inspect.statistics.measures import contours, layer_label
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
 
@@ -190,7 +190,8 @@ def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
     for i, component in enumerate(task.components):
         scale = component.shown[1]
         yield f"states/{component.name}/truth", series(trace.episode.states[steps, i] * scale)
-        for source, mean, covariance in _estimates(trace, steps):
+        for source, raw, covariance in _estimates(trace, steps):
+            mean = task.near(raw, trace.episode.states[steps])
             yield f"states/{component.name}/{source}", series(mean[:, i] * scale)
             if source == "fused" and trace.has_covariance:
                 sigma = SIGMAS * np.sqrt(covariance[:, i, i])
@@ -201,7 +202,7 @@ def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
 def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
     main = task.main_error
     for source, mean, _ in _estimates(trace, steps):
-        error = wrapped(task, mean - trace.episode.states[steps])
+        error = task.difference(mean, trace.episode.states[steps])
         yield f"errors/position/{source}", series(main.norm(error) * main.factor)
         for component in angles(task):
             angle = np.abs(error[:, task.index(component.name)])

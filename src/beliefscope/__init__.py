@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
     from beliefscope.datasets.errors import BadInput
     from beliefscope.datasets.faults.injection import Faults
-    from beliefscope.datasets.task import Component, Task
+    from beliefscope.datasets.task import Component, Task, rotation
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.evaluate import Metrics
     from beliefscope.filters.external.adapter import Adapter
@@ -58,7 +58,7 @@ _SOURCES = {
     "datasets.episode": ("Episode",),
     "datasets.errors": ("BadInput",),
     "datasets.faults.injection": ("Faults",),
-    "datasets.task": ("Component", "Task"),
+    "datasets.task": ("Component", "Task", "rotation"),
     "filters.checkpoint": ("Checkpoint",),
     "filters.evaluate": ("Metrics",),
     "filters.external.adapter": ("Adapter",),
@@ -108,6 +108,7 @@ __all__ = [
     "maps",
     "open_dataset",
     "record",
+    "rotation",
     "save_dataset",
     "save_trace",
     "serve",
