@@ -37,11 +37,12 @@ class Episode:
         observations: observation key -> (T, ...) sensor readings, uint8 images and float32 (``Task.dtype``).
         contact: (T,) bool, ground truth of contact between robot and object; default: False.
         qpos: (T, nq) joint positions for replay, float32; default: no replay (nq is 0).
-        dt: seconds per step; default: that of the task.
+        dt: seconds per step; default: that of the task. With ``time``, the typical one.
         seed: seed of the simulation, or -1 for recorded data.
         split: ``train``, ``val`` or ``test``.
         covariates: name -> (T,) float32, values of the task's covariates except contact; NaN where unknown.
         provenance: JSON values: origin and replay parameters (hinge position, policy, versions).
+        time: (T,) float64 s since the first step, ascending; None: steps times ``dt``.
     """
 
     task: Task
@@ -55,6 +56,7 @@ class Episode:
     split: str = "train"
     provenance: Mapping[str, Any] = field(default_factory=dict)
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    time: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         """Fill in the defaults, and convert floating-point arrays to float32."""
@@ -78,6 +80,18 @@ class Episode:
             return self.contact.astype(np.float32)
         return self.covariates.get(name, np.full(len(self), np.nan, np.float32))
 
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(T,) s since the first step."""
+        return np.arange(len(self), dtype=np.float64) * self.dt if self.time is None else self.time
+
+    @property
+    def durations(self) -> NDArray[np.float64]:
+        """(T,) s since the previous step; of the first step, ``dt``."""
+        if self.time is None:
+            return np.full(len(self), self.dt, np.float64)
+        return np.concatenate([[self.dt], np.diff(self.time)])[: len(self)]
+
     def __len__(self) -> int:
         return len(self.states)
 
@@ -86,12 +100,24 @@ class Episode:
         arrays = {"states": self.states, "controls": self.controls, "contact": self.contact, "qpos": self.qpos}
         arrays |= {f"observations/{key}": value for key, value in self.observations.items()}
         arrays |= {f"covariates/{key}": value for key, value in self.covariates.items()}
+        arrays |= {} if self.time is None else {"time": self.time}
         digest = hashlib.sha256(f"{self.task.name} {self.dt} {self.seed} {self.split}".encode())
         for name in sorted(arrays):
             array = np.ascontiguousarray(arrays[name])
             digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
             digest.update(array.tobytes())
         return digest.hexdigest()
+
+
+def time_error(time: NDArray[Any]) -> str:
+    """Why the times (T,) of the steps are invalid, such as ``is 0.1 at step 3, after 0.2``; empty if they are valid."""
+    if not np.isfinite(time).all():
+        at = int(np.flatnonzero(~np.isfinite(time))[0])
+        return f"is {time[at]} at step {at}, expected finite numbers"
+    if (wrong := np.flatnonzero(np.diff(time) <= 0.0)).size:
+        at = int(wrong[0]) + 1
+        return f"is {time[at]:.9g} s at step {at}, after {time[at - 1]:.9g} s; expected ascending times"
+    return ""
 
 
 def is_image(readings: NDArray[Any]) -> bool:

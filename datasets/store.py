@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import TASKS, find_task, stored_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, time_error
 from beliefscope.datasets.episode_index import read_index, write_index
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
@@ -255,7 +255,10 @@ class EpisodeFile(Dataset):
                 for name in task.covariates
                 if f"covariates/{name}" in group
             },
+            time=self._array(group, "time", (steps,), np.float64) if "time" in group else None,
         )
+        if episode.time is not None and (error := time_error(episode.time)):
+            raise BadInput(f"{self._place(group, 'time')} {error}.")
         if episode.digest() != self._attribute(group, "digest", str):
             raise BadInput(f"{self.path}: the arrays of {group.name[1:]} do not match its digest: they were modified.")
         return episode
@@ -378,10 +381,11 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
     group.attrs["contact_fraction"] = float(episode.contact.mean())
     group.attrs["provenance"] = json.dumps(dict(episode.provenance), sort_keys=True)
     group.attrs["digest"] = episode.digest()
-    arrays = {"states": episode.states, "controls": episode.controls, "qpos": episode.qpos}
+    arrays: dict[str, NDArray[Any]] = {"states": episode.states, "controls": episode.controls, "qpos": episode.qpos}
     arrays["contact"] = episode.contact.astype(np.uint8)
     arrays |= {f"observations/{key}": value for key, value in episode.observations.items()}
     arrays |= {f"covariates/{key}": value for key, value in episode.covariates.items()}
+    arrays |= {} if episode.time is None else {"time": episode.time}
     for key, array in arrays.items():
         # One HDF5 element per step: the shuffle filter then orders the bytes of each pixel or component by time,
         # which makes the images a fifth smaller.

@@ -192,6 +192,8 @@ class Task:
             values of ``contact`` are in ``Episode.contact``, others in ``Episode.covariates``.
         arrays: observation keys with several axes that are arrays of numbers instead of images, such as depth, tactile
             grids, spectrograms and point clouds.
+        periods: observation key -> s between the readings of a sensor that is slower than the steps and repeats its
+            last reading, so that these repetitions are no fault.
         warmup: first steps that are excluded from metrics, because runs start at the truth.
     """
 
@@ -214,6 +216,7 @@ class Task:
     warmup: int = 30
     covariates: Mapping[str, Covariate] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
+    periods: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Fill in the default map."""
@@ -235,6 +238,10 @@ class Task:
     def dtype(self, key: str) -> type[np.uint8] | type[np.float32]:
         """Type of an observation's values: uint8 for images, else float32."""
         return np.uint8 if len(self.observations[key]) > 1 and key not in self.arrays else np.float32
+
+    def held_steps(self, key: str) -> int:
+        """Consecutive repetitions of an observation that its period explains: one missed reading included."""
+        return math.ceil(2.0 * self.periods.get(key, 0.0) / self.dt)
 
     def index(self, component: str) -> int:
         """Index of a component in the state vector. Raises BadInput for an unknown name."""

@@ -51,6 +51,7 @@ def task_from_json(values: Any) -> Task:
             start_distance=_tuples(values["start_distance"]),
             warmup=values["warmup"],
             arrays=tuple(values.get("arrays", ())),  # definitions of earlier versions lack it
+            periods=dict(values.get("periods", {})),
             **_covariates(values),
         )
         if not values["map_components"]:  # ``Task`` has chosen them; a stored definition names them
@@ -151,6 +152,11 @@ def check_definition(task: Task, where: str = "") -> None:
             )
     if unknown := [key for key in task.arrays if key not in task.observations]:
         raise BadInput(f"{place}: arrays has {unknown[0]!r:.200}, which is not an observation.")
+    for key, period in task.periods.items():
+        if key not in task.observations or not _positive(period):
+            raise BadInput(
+                f"{place}: period of {key!r:.200} is {period!r:.200}, expected an observation and s above 0."
+            )
     for modality, keys in task.modalities.items():
         missing = [key for key in keys if key not in task.observations]
         if missing:

@@ -64,7 +64,7 @@ def as_parquet(trace: Trace) -> bytes:
     """One row per step; one column per number by component and modality, and list columns for larger arrays."""
     steps = np.arange(len(trace))
     fields = [pa.field("step", pa.int64()), pa.field("time", pa.float64(), metadata={"unit": "s"})]
-    arrays = [pa.array(steps), pa.array(steps * trace.episode.dt)]
+    arrays = [pa.array(steps), pa.array(trace.episode.times)]
     for column in columns(trace):
         values = pa.array(np.ascontiguousarray(column.values).ravel())
         if column.values.ndim > 1:
@@ -92,7 +92,7 @@ def as_mcap(trace: Trace) -> bytes:
         id = writer.register_schema(schema["title"], encoding="jsonschema", data=json.dumps(schema).encode())
         channels[topic] = writer.register_channel(topic, "json", id)
     for step in range(len(trace)):
-        time = round(step * trace.episode.dt * 1e9)
+        time = round(trace.episode.times[step] * 1e9)
         for topic, (_, message) in topics.items():
             data = json.dumps(message(step), allow_nan=False).encode()
             writer.add_message(channels[topic], log_time=time, data=data, publish_time=time, sequence=step)
@@ -221,7 +221,7 @@ def _object(properties: dict[str, Any]) -> dict[str, Any]:
 
 
 def _time(step: int, trace: Trace) -> dict[str, int]:
-    sec, nsec = divmod(round(step * trace.episode.dt * 1e9), 1_000_000_000)
+    sec, nsec = divmod(round(trace.episode.times[step] * 1e9), 1_000_000_000)
     return {"sec": sec, "nsec": nsec}
 
 

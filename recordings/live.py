@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from beliefscope.datasets.catalog import load_task
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, time_error
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import check_shapes
@@ -67,6 +67,7 @@ class _Row:
     covariates: dict[str, float]
     qpos: NDArray[Any]
     evidence: Evidence | None
+    time: float | None
 
 
 class LiveRecorder:
@@ -145,6 +146,8 @@ class LiveRecorder:
         self._writer: LiveFileWriter | None = None
         self._sizes = {"n": len(self._task.components)}
         self._channels = 0  # of innovations
+        self._held: dict[str, NDArray[Any]] = {}  # last readings of slow sensors
+        self._times: tuple[float, float] | None = None  # of the first and the last written step
 
     def step(
         self,
@@ -157,13 +160,15 @@ class LiveRecorder:
         covariates: Mapping[str, float | bool | str | None] = MappingProxyType({}),
         qpos: ArrayLike = (),
         evidence: Evidence | None = None,
+        time: float | None = None,
     ) -> None:
         """Queue one step. Arrays are copied, except those in a StepTrace and its evidence.
 
         Args:
             values: StepTrace returned by the filter's ``step``; for an external filter the mean, (mean, covariance), or
                 a dictionary. The batch axis N = 1 may be missing.
-            observations: by the task's keys; some may be missing.
+            observations: by the task's keys; some may be missing, at all steps. Those with a period (``Task.periods``)
+                may be missing at later steps, which repeat the last reading.
             control: (c,).
             truth: (n,) true state, if measured, or with quaternions (``Task.states``). Default: NaN.
             contact: whether the robot truly touches the object. Default: the observation ``contact``, if any.
@@ -171,10 +176,12 @@ class LiveRecorder:
                 unknown.
             qpos: (nq,) joint positions for the replay of the task's simulation.
             evidence: input of the filter's ``step`` that returned the StepTrace.
+            time: of the step, s of any clock; at all steps or none. Default: steps times the task's ``dt``.
 
         Raises BadInput at the first step only, for invalid values and if the files cannot be created.
         """
-        arrays = {key: np.array(value) for key, value in observations.items()}
+        arrays = self._held | {key: np.array(value) for key, value in observations.items()}
+        self._held = {key: arrays[key] for key in self._task.periods if key in arrays}
         row = _Row(
             values
             if isinstance(values, StepTrace)
@@ -186,6 +193,7 @@ class LiveRecorder:
             self._covariates(covariates),
             np.array(qpos, np.float32),
             evidence,
+            time,
         )
         self.steps += 1
         if self._writer is None:
@@ -304,6 +312,7 @@ class LiveRecorder:
             covariates={
                 name: np.array([row.covariates[name] for row in rows], np.float32) for name in rows[0].covariates
             },
+            time=self._since_start([row.time for row in rows]),
             **self._origin,
         )
         n = self._sizes["n"]
@@ -317,6 +326,19 @@ class LiveRecorder:
         return self._external_part(
             [row.values for row in rows if not isinstance(row.values, StepTrace)], episode, start
         )
+
+    def _since_start(self, given: Sequence[float | None]) -> NDArray[np.float64] | None:
+        """(T,) s since the run's first step; None if no step has a time."""
+        times = np.array([time for time in given if time is not None], np.float64)
+        if not len(times) and self._times is None:
+            return None
+        if len(times) < len(given):
+            raise BadInput("a step has no time; give it to all steps or to none")
+        start, *last = (times[0],) if self._times is None else self._times
+        if error := time_error(np.array([*last, *times])):
+            raise BadInput(f"time {error}, counted from the last written step")
+        self._times = start, times[-1]
+        return times - start
 
     def _external_part(self, steps: Sequence[Values], episode: Episode, start: Gaussian) -> Trace:
         """Steps of an external filter as a trace, without values that some of the steps lack."""

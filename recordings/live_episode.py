@@ -50,9 +50,10 @@ def record_steps(
         options |= {"faults": faults, "episode_index": index, "seed": seed}
         options |= {"settings": {"torch": torch.__version__, "source": checkpoint.source}}
         faulty = faults.apply(episode, seed)
+        start = checkpoint.start([faulty])  # before the first step, because it may initialise the filter
         outputs = checkpoint.live(faulty, seed)
         first = next(outputs)  # has the names of the measurement models
-        options |= {"task": checkpoint.task, "modalities": first[1], "start": checkpoint.start([faulty])}
+        options |= {"task": checkpoint.task, "modalities": first[1], "start": start}
         recorder = LiveRecorder(name, **options)
 
         def external_steps() -> Iterator[None]:
@@ -110,5 +111,7 @@ def _rows(episode: Episode) -> Iterator[dict[str, Any]]:
             "control": episode.controls[t],
             "truth": episode.states[t],
             "contact": bool(episode.contact[t]),
+            "covariates": {name: values[t] for name, values in episode.covariates.items()},
             "qpos": episode.qpos[t],
+            "time": None if episode.time is None else episode.time[t],
         }

@@ -20,7 +20,7 @@ HEADER = "__properties/beliefscope"
 """Entity in which Rerun stores the recording property ``beliefscope``."""
 
 STEP, TIME = "step", "time"
-"""The two timelines: step index t, and t * dt as a duration."""
+"""The two timelines: step index t, and the time since step 0 as a duration: t * dt, or that of the episode."""
 
 Needs = Literal[
     "always",
@@ -30,6 +30,7 @@ Needs = Literal[
     "effective_weights",
     "covariates",
     "contact",
+    "time",
     "ekf",
     "sensors",
     "pf",
@@ -57,7 +58,8 @@ class Entity:
             W weights per modality, B bounds.
         unit: of the stored numbers.
         needs: property of the trace that the path requires; ``ekf`` includes UKFs; ``sensors`` are virtual ones;
-            ``sample``: only some particles are kept; ``measurements`` and ``extra`` come from external filters.
+            ``time``: the steps have their own times; ``sample``: only some particles are kept; ``measurements`` and
+            ``extra`` come from external filters.
         meaning: one-line description for the documentation.
     """
 
@@ -82,6 +84,7 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/states", "Trace", "(n,)", "m, rad", "always", "true state"),
     Entity("trace/controls", "Trace", "(c,)", "task's", "always", "control before this step"),
     Entity("trace/contact", "Trace", "()", "bool", "always", "whether the robot touches the object"),
+    Entity("trace/time", "Trace", "()", "s", "time", "time since step 0; absent: steps times dt"),
     Entity("trace/qpos", "Trace", "(nq,)", "m, rad", "replay", "joint positions of the simulation"),
     Entity("trace/estimate_mean", "Trace", "(n,)", "m, rad", "always", "fused posterior mean"),
     Entity(

@@ -251,7 +251,7 @@ def send_steps(
         offset: step of the run at which the trace begins, if it is only a part of the run. Such a part must include
             the step before ``steps``, to detect changes of contact.
     """
-    times = entities.time_columns(np.arange(steps.start, steps.stop) + offset, trace.episode.dt)
+    times = entities.time_columns(trace.episode, np.arange(steps.start, steps.stop), offset)
     for path, static, array in stored_arrays(trace):
         if not static:
             rows = array[steps]
@@ -273,7 +273,7 @@ def send_steps(
         stream.send_columns(path, times, columns)
     changes, states = entities.contact_changes(trace, steps)
     if len(changes):
-        stream.send_columns("contact", entities.time_columns(changes + offset, trace.episode.dt), states)
+        stream.send_columns("contact", entities.time_columns(trace.episode, changes, offset), states)
 
 
 def _send_maps(
@@ -284,7 +284,7 @@ def _send_maps(
             raise BadInput(f"map of step {map_.step}: the trace has steps 0 to {len(trace) - 1}.")
         if map_.layers != layers or map_.log_likelihood.shape != maps[0].log_likelihood.shape:
             raise BadInput(f"map of step {map_.step}: all maps of a recording must have the same size and layers.")
-    times = entities.time_columns(np.array([map_.step for map_ in maps]), trace.episode.dt)
+    times = entities.time_columns(trace.episode, np.array([map_.step for map_ in maps]))
     for path, columns in map_columns(maps, trace, task):
         stream.send_columns(path, times, columns)
 

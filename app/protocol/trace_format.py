@@ -30,6 +30,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     innovation, groups = virtual_innovations(trace), measures.shaded_groups(trace)
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {
+        "time": trace.episode.time,
         "truth": trace.episode.states,
         "estimate_mean": trace.task.near(trace.estimate_mean, trace.episode.states),
         "estimate_sigma": _sigma(trace.estimate_covariance) if trace.has_covariance else None,

@@ -20,6 +20,9 @@ from beliefscope.filters.external.adapter import Adapter
 
 CPU = torch.device("cpu")
 
+DT = "dt"
+"""Key under which a filter receives the durations of irregular steps."""
+
 
 def is_stepwise(filter_: Any) -> bool:
     """Whether the filter is called for one step at a time."""
@@ -85,13 +88,18 @@ def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:
 
 
 def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
-    """Observations (T, N, ...) by key, images as uint8; controls (T, N, c)."""
+    """Observations (T, N, ...) by key, images as uint8; controls (T, N, c).
+
+    Of episodes with their own times, observations also have ``dt`` (T, N): s since the previous step.
+    """
     for number, episode in enumerate(episodes):
         check_shapes(task, episode, f"episode {number}")
     observations = {
         key: torch.from_numpy(np.stack([episode.observations[key] for episode in episodes], axis=1))
         for key in task.observations
     }
+    if any(episode.time is not None for episode in episodes):
+        observations[DT] = torch.from_numpy(np.stack([episode.durations for episode in episodes], axis=1))
     controls = torch.from_numpy(np.stack([episode.controls for episode in episodes], axis=1)).to(dtype)
     return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
@@ -190,5 +198,7 @@ def step_inputs(
     """Observations (1, ...) by key and controls (1, c) of a step; without the axis N if the filter takes none."""
     index = slice(step, step + 1) if adapter.batched else step
     observations = {key: torch.as_tensor(episode.observations[key][index]) for key in task.observations}
+    if episode.time is not None:
+        observations[DT] = torch.as_tensor(episode.durations[index])
     typed = {key: v if v.dtype == torch.uint8 else v.to(dtype) for key, v in observations.items()}
     return typed, torch.as_tensor(episode.controls[index]).to(dtype)

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from beliefscope.filters.external.calls import DT
+
 Array = NDArray[np.float64]
 Update = Callable[[Any, Array], None]
 
@@ -88,7 +90,7 @@ class FilterPy:
 
     def _readings(self, observations: Mapping[str, Array]) -> list[tuple[Update, Array]]:
         if self._updates is None:
-            joined = np.concatenate([np.ravel(reading) for reading in observations.values()])
+            joined = np.concatenate([np.ravel(reading) for key, reading in observations.items() if key != DT])
             return [(lambda filter_, z: filter_.update(z), joined)]
         return [(update, observations[key]) for key, update in self._updates.items()]
 

@@ -21,9 +21,9 @@ MOTION_FLOOR = 1e-4
 """m per step added to the hand's speed, and gray levels to the image's, before the logarithm."""
 
 
-def frozen_images(images: Gray) -> Mask:
-    """(T,): whether an image repeats the previous one; lost images do not count."""
-    return repeats(images) & ~lost_images(images)
+def frozen_images(images: Gray, held: int = 0) -> Mask:
+    """(T,): whether an image repeats the previous one; lost images do not count. held: as in ``repeats``."""
+    return repeats(images, held) & ~lost_images(images)
 
 
 def image_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
@@ -33,7 +33,7 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     middle = median_image(images)
     values = {
         f"black/{key}/all": float(lost.mean()),
-        f"frozen/{key}/all": float(frozen_images(images).mean()),
+        f"frozen/{key}/all": float(frozen_images(images, episode.task.held_steps(key)).mean()),
         f"noise/{key}/all": _noise(images[~lost & ~frozen_images(images)]),
         f"sharpness/{key}/all": _sharpness(middle),
     }

@@ -48,7 +48,7 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
 
 def stuck(episode: Episode, key: str, axis: int) -> Mask:
     """(T,): whether an axis repeats its reading while the hand moves."""
-    same = repeats(episode.observations[key][:, axis])
+    same = repeats(episode.observations[key][:, axis], episode.task.held_steps(key))
     return same & _moving(episode) if key != HAND else same
 
 
@@ -164,7 +164,7 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
     if HAND in episode.observations:
         noise = noise_level(episode.observations[HAND].astype(np.float64))
         values[f"position noise/{HAND}/all"] = float(np.sqrt(np.square(noise).mean()))
-        values[f"stuck/{HAND}/all"] = float(repeats(episode.observations[HAND]).mean())
+        values[f"stuck/{HAND}/all"] = float(repeats(episode.observations[HAND], episode.task.held_steps(HAND)).mean())
     return values | contact_statistics(episode) | wrench_statistics(episode) | control_statistics(episode)
 
 

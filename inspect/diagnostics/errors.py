@@ -265,9 +265,9 @@ def _outages(name: str, traces: Sequence[Trace], distance: Sequence[Array], miss
     limit = RECOVERED * float(np.median(outside))
     before, end, recoveries, lengths, unrecovered = [], [], [], [], 0
     for trace, d, m in zip(traces, distance, missing, strict=True):
-        runs = measures.intervals(m)
+        runs, durations = measures.intervals(m), trace.episode.durations
         for number, (a, b) in enumerate(runs):
-            lengths.append((b - a) * trace.episode.dt)
+            lengths.append(float(durations[a:b].sum()))
             end.append(d[b - 1])
             before += [d[a - 1]] if a else []
             after = d[b : runs[number + 1][0] if number + 1 < len(runs) else len(d)]
@@ -275,7 +275,7 @@ def _outages(name: str, traces: Sequence[Trace], distance: Sequence[Array], miss
                 continue
             reached = np.flatnonzero(after <= limit)
             if len(reached):
-                recoveries.append(float(reached[0]) * trace.episode.dt)
+                recoveries.append(float(durations[b : b + reached[0]].sum()))
             else:
                 unrecovered += 1
     total = float(np.square(np.concatenate([during, outside])).sum())

@@ -280,7 +280,7 @@ def _speeds(trace: Trace, task: Task) -> Array:
     effector = trace.episode.observations.get("effector_position")
     if effector is not None:
         changes.append(np.diff(effector, axis=0, prepend=effector[:1]))
-    return np.stack([np.linalg.norm(change, axis=-1) for change in changes], axis=-1) / trace.episode.dt
+    return np.stack([np.linalg.norm(change, axis=-1) for change in changes], axis=-1) / trace.episode.durations[:, None]
 
 
 def _phases(columns: dict[str, NDArray[Any]], task: Task) -> dict[str, Mask]:

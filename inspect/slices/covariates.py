@@ -78,12 +78,12 @@ def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:
 
 def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[Any]]]:
     """Name, unit and values (T,) of the covariates that vary within an episode, and of the truth."""
-    episode, dt, steps = trace.episode, trace.episode.dt, np.arange(len(trace))
+    episode, times, durations = trace.episode, trace.episode.times, trace.episode.durations
     contact, outage = episode.contact.astype(bool), measures.blackout(trace)
-    yield "time since start", "s", steps * dt
+    yield "time since start", "s", times
     if "contact" in task.covariates:
         yield "contact", "", contact
-        yield "contact duration", "s", _duration(contact) * dt
+        yield "contact duration", "s", _duration(contact, durations)
     for name, covariate in task.covariates.items():
         values = episode.covariate(name)
         if name != "contact" and covariate.kind == "continuous":
@@ -92,15 +92,15 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
             groups = np.array([*covariate.group_names(name), ""], dtype=object)  # the last one: unknown
             yield display_name(name), "", groups[covariate.group_index(values)]
     yield "blackout", "", outage
-    yield "outage length", "s", _duration(outage) * dt
+    yield "outage length", "s", _duration(outage, durations)
     change = task.difference(episode.states, np.concatenate([episode.states[:1], episode.states[:-1]]))
     main = task.main_error
     if main.name == "position":
-        yield "object speed", f"{task.components[main.indices[0]].unit}/s", main.norm(change) / dt
+        yield "object speed", f"{task.components[main.indices[0]].unit}/s", main.norm(change) / durations
     for i, component in enumerate(task.components):
         yield f"true {component.label}", component.unit, episode.states[:, i]
         if component.unit == "rad":
-            yield f"{component.label} speed", "rad/s", np.abs(change[:, i]) / dt
+            yield f"{component.label} speed", "rad/s", np.abs(change[:, i]) / durations
     for key, array in episode.observations.items():
         if is_image(array):
             pixels = array.reshape(len(array), -1)
@@ -113,10 +113,10 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
     yield "control magnitude", "", np.linalg.norm(episode.controls, axis=1)
 
 
-def _duration(mask: Mask) -> Array:
-    """(T,) steps since the mask (T,) was last False; NaN where it is False."""
-    steps = np.arange(1, len(mask) + 1)
-    return np.where(mask, steps - np.maximum.accumulate(np.where(mask, 0, steps)), np.nan)
+def _duration(mask: Mask, durations: Array) -> Array:
+    """(T,) s since the mask (T,) was last False, for steps of these durations (T,); NaN where it is False."""
+    times = np.cumsum(durations)
+    return np.where(mask, times - np.maximum.accumulate(np.where(mask, 0.0, times)), np.nan)
 
 
 def _provenance(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -48,17 +48,20 @@ def noise_level(values: Array) -> Array:
     return result
 
 
-def repeats(values: NDArray[np.generic]) -> Mask:
+def repeats(values: NDArray[np.generic], held: int = 0) -> Mask:
     """(T,): whether a reading (T, ...) equals the previous one.
 
     At the start of an episode, up to ``MAX_LAG`` repetitions do not count: a delayed sensor repeats its first reading.
+
+    Args:
+        held: consecutive repetitions that are no fault, of a slow sensor (``Task.held_steps``).
     """
     same = np.zeros(len(values), dtype=bool)
     same[1:] = (values[1:] == values[:-1]).reshape(len(values) - 1, -1).all(1)
     leading = int(np.argmin(same[1:])) if not same[1:].all() else len(values)
     if leading <= MAX_LAG:
         same[: leading + 1] = False
-    return same
+    return long_runs(same, held + 1) if held else same
 
 
 def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, float]:

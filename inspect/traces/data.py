@@ -164,5 +164,6 @@ def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
     }
     arrays |= {f"extra/{name}": value for name, value in trace.extra.items()}
     arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
+    arrays |= {} if episode.time is None else {"episode/time": episode.time}
     arrays |= {f"episode/covariates/{key}": value for key, value in episode.covariates.items()}
     return arrays | {f"episode/observations/{key}": value for key, value in episode.observations.items()}

@@ -100,6 +100,7 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any], give
         **{name: episode_arrays[name] for name in ("states", "controls", "contact", "qpos")},
         observations=group("observations/"),
         covariates=group("covariates/"),
+        time=episode_arrays.get("time"),
     )
     values = {name: value for name, value in header.items() if name not in ("format", "episode", "recipe")}
     values |= {

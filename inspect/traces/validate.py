@@ -9,6 +9,7 @@ from typing import Any, get_args
 import numpy as np
 
 from beliefscope.datasets.dataset import SPLITS
+from beliefscope.datasets.episode import time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.external.adapter import SHAPES
 from beliefscope.filters.filter import Kind
@@ -46,6 +47,9 @@ def validate_trace(trace: Trace) -> None:
     for name, letters, kinds in (("states", "Tn", "f"), ("controls", "Tc", "f"), ("contact", "T", "b")):
         _check_array(name, getattr(episode, name), letters, sizes, kinds)
     _check_array("qpos", episode.qpos, "Tq", sizes, "f")
+    _check_array("time", episode.time, "T", sizes, "f")
+    if episode.time is not None and (error := time_error(episode.time)):
+        raise BadInput(f"time {error}")
     for name, values in episode.covariates.items():
         _check_array(f"covariate {name!r}", values, "T", sizes, "f")
     for name, values in episode.observations.items():

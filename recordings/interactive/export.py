@@ -74,6 +74,7 @@ def run_document(
     return {
         "title": _title(trace),
         "dt": trace.episode.dt,
+        "times": None if trace.episode.time is None else trace.episode.time.round(4).tolist(),
         "steps": len(trace),
         "layers": [_layer(trace, name) for name in measures.layers(trace)],
         "truth": colour("truth", trace.modalities),

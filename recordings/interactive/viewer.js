@@ -23,6 +23,7 @@
  * @property {string} data
  * @typedef {object} Run
  * @property {number} dt
+ * @property {number[] | null} times of the steps in s; null: steps times dt
  * @property {number} steps
  * @property {Layer[]} layers
  * @property {string} truth colour
@@ -228,7 +229,7 @@ export class Viewer {
     for (const paint of this.cursorPainters) paint(this.step);
     this.showValues(this.step);
     this.cursor.value = String(this.step);
-    const time = (this.step * this.run.dt).toFixed(2);
+    const time = (this.run.times?.[this.step] ?? this.step * this.run.dt).toFixed(2);
     this.html('#place').textContent = `step ${this.step} of ${this.run.steps - 1}, ${time} s`;
   }
 

@@ -26,7 +26,7 @@ UNITS = {"mm": ("m", 1e-3), QUATERNION: ("rad", 1.0)} | {
 ELEMENTS = re.compile(r"(.*)\[(\d{1,9}(?:,\d{1,9})*)\]")
 """``NAME[I]`` or ``NAME[I,J,...]``: elements of the rows of an array."""
 
-KEYS = ("task", "dt", "time", "episode", "control", "contact", "state", "sensors", "covariates", "estimate")
+KEYS = ("task", "dt", "time", "clock", "episode", "control", "contact", "state", "sensors", "covariates", "estimate")
 VALUES = ("mean", "std", "covariance", "particles")
 ESTIMATE = ("filter", *VALUES, "weights")
 
@@ -70,7 +70,8 @@ class ColumnMap:
 
     Attributes:
         task: name of the new task.
-        dt: seconds per row, or per step of logs of messages; None if ``time``, a column in s, is given.
+        dt: seconds per row, or per step of logs of messages; None if ``time``, a column in s, or ``clock`` is given.
+        clock: topic of logs of messages whose messages are the steps.
         time: column in s, or timeline of a Rerun recording.
         episode: column that numbers or names the episodes; empty for a single one.
         state: component -> its column. control: columns. contact: column that is not zero in contact.
@@ -83,6 +84,7 @@ class ColumnMap:
     state: Mapping[str, StateColumn]
     dt: float | None = None
     time: str = ""
+    clock: str = ""
     episode: str = ""
     control: References = field(default_factory=list)
     contact: str = ""
@@ -127,12 +129,15 @@ def read_map(path: Path) -> ColumnMap:
     for key in estimate:
         check_name("key of [estimate]", key, ESTIMATE)
     dt = values.get("dt")
-    if (dt is None and "time" not in values) or not (dt is None or (type(dt) in (int, float) and 0 < dt < math.inf)):
+    known = dt is not None or "time" in values or "clock" in values
+    if not known or not (dt is None or (type(dt) in (int, float) and 0 < dt < math.inf)):
         raise BadInput(f"{path.name} needs either dt, in s and more than 0, or time, the name of a column in s")
+    if "clock" in values and dt is not None:
+        raise BadInput(f"{path.name} has dt and clock, expected dt or the topic whose messages are the steps")
     state = {name: _component(name, value) for name, value in _table(values, "state", path).items()}
     if not state:
         raise BadInput(f'[state] of {path.name} has no components, expected one or more: name = "column"')
-    names = {key: values.get(key, "") for key in ("time", "episode", "contact")}
+    names = {key: values.get(key, "") for key in ("time", "clock", "episode", "contact")}
     control = values.get("control", [])
     lists = [("control", control), *sensors.items(), *((key, estimate[key]) for key in VALUES if key in estimate)]
     for key, value in (*names.items(), *lists, *_table(estimate, "weights", path).items()):

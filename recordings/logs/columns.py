@@ -56,6 +56,8 @@ def _read(path: Path, mapping: ColumnMap | None) -> Preview:
                 result = preview(log) if mapping is None else Preview(on_clock(log, mapping))
         elif mapping and mapping.dt is not None and mapping.time:
             raise BadInput("the map needs either dt or time, not both")
+        elif mapping and mapping.clock:
+            raise BadInput(f"clock is {mapping.clock!r}, but the log has no topics: the map needs dt or time")
         else:
             references = mapping.references if mapping else set()
             used = references | {base_name(reference) for reference in references}
@@ -111,6 +113,8 @@ def column(columns: Columns, reference: str, purpose: str) -> NDArray[np.float64
     if name not in columns:
         raise unknown_name(f"column of {purpose}", name, columns)
     values = columns[name]
+    if values.dtype.kind == "M":  # dates as s since 1970
+        values = np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) / 1e9)
     if values.dtype.kind not in "fiub":
         raise BadInput(f"column {name!r} of {purpose} has text, such as {str(values.flat[0])!r:.50}, expected numbers")
     if not elements:

@@ -1,11 +1,12 @@
 """Logs of messages: topics with their own rates, resampled on one clock.
 
-The ticks of the clock are the whole multiples of the map's ``dt``. At each tick, a column has the value of the topic's
-last message at or before it (zero-order hold).
+The ticks of the clock are the whole multiples of the map's ``dt``, or the messages of its topic ``clock``. At each
+tick, a column has the value of the topic's last message at or before it (zero-order hold).
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -25,6 +26,9 @@ SAMPLE = 100
 """Messages per topic in a preview. The first ``DECODED`` are decoded."""
 
 DECODED = 3
+
+CLOCK = "clock"
+"""Column of the times of the steps."""
 
 AGE = "age"
 """Field of every topic: s since its last message."""
@@ -111,47 +115,80 @@ def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
 
     The first tick is the first at which every topic of state, sensors, control, estimate and episode has a message;
     covariates are missing (NaN, empty text) before their first. The last tick is the first after the last message of
-    the state's topics, or of all topics if the state is unknown.
+    the state's topics, or of all topics if the state is unknown. The column ``CLOCK`` has the times of the ticks, s
+    since the first one.
 
     Raises BadInput for unknown topics and fields, topics without messages or whose times do not overlap, more than
     ``LONGEST`` ticks, and values of different shapes.
     """
-    if mapping.dt is None:
-        raise BadInput("the topics have their own rates: the map needs dt, s per step of the common clock")
+    if mapping.dt is None and not (mapping.clock and log.second):
+        raise BadInput(
+            "the topics have their own rates: the map needs dt, s per step of the common clock, or clock, a topic with "
+            "one message per step"
+        )
     series = {topic: Series(topic, paths) for topic, paths in _paths(log.topics, mapping.references).items()}
-    step = max(round(mapping.dt * log.second), 1) if log.second else 1
+    clock = _Clock(log, mapping)
     for topic, time, decode in log.messages([*series]):
-        series[topic].add(-(-time // step), time, decode)
+        series[topic].add(clock.tick(time), time, decode)
     ticks = {}
     for topic, entry in series.items():
         entry.flush()
         if not entry.times:
             raise BadInput(f"topic {topic!r} has no message")
-        ticks[topic] = -(-np.array(entry.times, np.int64) // step)
-    clock = _clock(ticks, _topics(log.topics, mapping.required), _topics(log.topics, mapping.truth), mapping.dt)
-    columns: dict[str, NDArray[Any]] = {}
+        ticks[topic] = np.array([clock.tick(time) for time in entry.times], np.int64)
+    first, last = _ends(ticks, _topics(log.topics, mapping.required), _topics(log.topics, mapping.truth))
+    steps = clock.between(first, last)
+    columns: dict[str, NDArray[Any]] = {CLOCK: (clock.times(steps) - clock.times(steps[:1])) / (log.second or 1.0)}
     for topic, entry in series.items():
         order = np.argsort(entry.times, kind="stable")
-        index = np.searchsorted(ticks[topic][order], clock, side="right") - 1
+        index = np.searchsorted(ticks[topic][order], steps, side="right") - 1
         for name in entry.paths:
             if name not in entry.values:  # the age
                 times = np.array(entry.times, np.int64)[order]
-                values = (clock * step - times[index]) / (log.second or 1.0)
+                values = (clock.times(steps) - times[index]) / (log.second or 1.0)
                 columns[name] = np.where(index < 0, np.nan, values)
             else:
                 columns[name] = _held(_stacked(name, entry.values[name]), order, index, name)
     return columns
 
 
-def _clock(ticks: Mapping[str, NDArray[np.int64]], required: set[str], truth: set[str], dt: float) -> NDArray[np.int64]:
-    """(T,) ticks of the clock."""
+class _Clock:
+    """Ticks: whole multiples of ``dt``, or the messages of the map's ``clock``, by their number."""
+
+    def __init__(self, log: MessageLog, mapping: ColumnMap) -> None:
+        self._dt = mapping.dt or 0.0
+        self._step = max(round(self._dt * log.second), 1) if log.second else 1
+        self._own: list[int] = []
+        if mapping.clock:
+            topic = _topic(log.topics, mapping.clock)
+            self._own = sorted({time for _, time, _ in log.messages([topic])})
+            if not self._own:
+                raise BadInput(f"clock {topic!r} has no message")
+
+    def tick(self, time: int) -> int:
+        """The first tick that is not before a time; the number of ticks if there is none."""
+        return bisect_left(self._own, time) if self._own else -(-time // self._step)
+
+    def times(self, ticks: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.array(self._own, np.int64)[ticks] if self._own else ticks * self._step
+
+    def between(self, first: int, last: int) -> NDArray[np.int64]:
+        """(T,) ticks from the first to the last. Raises BadInput for none and for too many."""
+        last = min(last, len(self._own) - 1) if self._own else last
+        if last < first:
+            raise BadInput("clock has no message while the topics of state and sensors have some")
+        if last - first >= LONGEST:
+            raise BadInput(f"the log has {last - first + 1} steps of {self._dt:g} s, more than {LONGEST}: increase dt")
+        return np.arange(first, last + 1)
+
+
+def _ends(ticks: Mapping[str, NDArray[np.int64]], required: set[str], truth: set[str]) -> tuple[int, int]:
+    """First and last tick of the steps."""
     first = max((int(ticks[topic].min()) for topic in required), default=min(int(t.min()) for t in ticks.values()))
     last = min((int(ticks[topic].max()) for topic in truth), default=max(int(t.max()) for t in ticks.values()))
     if last < first:
         raise BadInput(f"the topics of state and sensors do not overlap in time: {', '.join(sorted(required))}")
-    if last - first >= LONGEST:
-        raise BadInput(f"the log has {last - first + 1} steps of {dt:g} s, more than {LONGEST}: increase dt")
-    return np.arange(first, last + 1)
+    return first, last
 
 
 def _held(values: NDArray[Any], order: NDArray[np.intp], index: NDArray[np.intp], name: str) -> NDArray[Any]:

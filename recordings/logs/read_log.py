@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.covariate import CONTACT, Covariate
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Component, Task, display_name
 from beliefscope.datasets.task_json import check_definition
@@ -19,11 +19,12 @@ from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.recordings.logs.arrays import Columns
 from beliefscope.recordings.logs.column_map import QUATERNION, ColumnMap, CovariateColumn, References, StateColumn
 from beliefscope.recordings.logs.columns import column, joined
+from beliefscope.recordings.logs.messages import CLOCK
 
 Array = NDArray[np.float64]
 
-IRREGULAR = 0.1
-"""Largest deviation of a time step from their median, relative to it."""
+IRREGULAR = 0.01
+"""Deviation of a time from a constant step, relative to the step, above which the times are kept."""
 
 LARGE = 5.0
 """m, span of the positions above which they are displayed in m."""
@@ -35,7 +36,7 @@ MARGIN = 1.2
 def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]:
     """The episodes of a log, in the order of their first rows.
 
-    Raises BadInput for missing columns, columns of different lengths and irregular time.
+    Raises BadInput for missing columns, columns of different lengths and times that do not ascend.
     """
     states = _float32(_states(columns, mapping), "the state")
     sensors = {name: _sensor(columns, name, refs) for name, refs in mapping.sensors.items()}
@@ -49,9 +50,10 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
         if len(array) != len(states):
             raise BadInput(f"{name} has {len(array)} rows and the state {len(states)}")
     rows = _episodes(columns, mapping, len(states))
-    dt = _time_step(columns, mapping, rows)
+    dt, times = _times(columns, mapping, rows)
     declared = {name: covariate for name, (covariate, _) in covariates.items()}
-    task = _task(mapping, states, sensors, controls.shape[1], dt, declared)
+    periods = {name: period for name, array in sensors.items() if (period := _period(array, rows, dt))}
+    task = _task(mapping, states, sensors, controls.shape[1], dt, declared, periods)
     return [
         Episode(
             task=task,
@@ -65,8 +67,9 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
             split="test",
             provenance={"source": source, "episode": name},
             covariates={name: numbers[at] for name, numbers in values.items()},
+            time=time,
         )
-        for name, at in rows.items()
+        for (name, at), time in zip(rows.items(), times, strict=True)
     ]
 
 
@@ -224,20 +227,37 @@ def _episodes(columns: Columns, mapping: ColumnMap, count: int) -> dict[str, NDA
     return {str(names[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
 
 
-def _time_step(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp]]) -> float:
-    """s per row. Raises BadInput if it varies by more than ``IRREGULAR``."""
+def _times(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp]]) -> tuple[float, list[Array | None]]:
+    """s per row, and each episode's times (T,), s since its first row; None for steps of this length.
+
+    Raises BadInput for times that do not ascend within an episode.
+    """
     if mapping.dt is not None:
-        return float(mapping.dt)
-    time = column(columns, mapping.time, "time")
-    steps = np.concatenate([np.diff(time[at]) for at in rows.values()])
-    dt = float(np.median(steps)) if len(steps) else 0.0
-    worst = float(np.abs(steps - dt).max()) if len(steps) else 0.0
-    if not dt > 0.0 or worst > IRREGULAR * dt:
-        raise BadInput(
-            f"time {mapping.time!r} has steps of {steps.min() if len(steps) else 0.0:.4g} to "
-            f"{steps.max() if len(steps) else 0.0:.4g} s, expected a constant one: resample the log"
-        )
-    return dt
+        return float(mapping.dt), [None] * len(rows)
+    name = CLOCK if mapping.clock else mapping.time
+    column_times = column(columns, name, "time")
+    times = [column_times[at] - column_times[at[0]] for at in rows.values()]
+    for episode, time in zip(rows, times, strict=True):
+        if error := time_error(time):
+            raise BadInput(f"time {name!r} of episode {episode} {error}, counted from its first row")
+    steps = np.concatenate([np.diff(time) for time in times])
+    if not len(steps):
+        raise BadInput(f"time {name!r} has one row per episode, expected two or more")
+    dt = float(np.median(steps))
+    regular = [np.abs(time - dt * np.arange(len(time))).max() <= IRREGULAR * dt for time in times]
+    return dt, [None if same else time for same, time in zip(regular, times, strict=True)]
+
+
+def _period(readings: NDArray[Any], rows: dict[str, NDArray[np.intp]], dt: float) -> float:
+    """s between the readings of a sensor that is slower than the steps: the median between changes; 0 for others."""
+    gaps = [
+        np.diff(np.flatnonzero((np.diff(readings[at], axis=0) != 0).reshape(len(at) - 1, -1).any(1)))
+        for at in rows.values()
+        if len(at) > 1
+    ]
+    between = np.concatenate([*gaps, np.zeros(0)])
+    steps = float(np.median(between)) if len(between) else 0.0
+    return steps * dt if steps > 1.0 else 0.0
 
 
 def _covariate(columns: Columns, name: str, entry: CovariateColumn) -> tuple[Covariate, NDArray[np.float32]]:
@@ -262,6 +282,7 @@ def _task(
     controls: int,
     dt: float,
     covariates: dict[str, Covariate],
+    periods: dict[str, float],
 ) -> Task:
     names, units = list(mapping.state), [s.internal[0] for s in mapping.state.values()]
     spans = np.ptp(np.nan_to_num(states), axis=0)
@@ -278,6 +299,7 @@ def _task(
         map_components=tuple(names[:2]),
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
+        periods=periods,
         covariates=({"contact": CONTACT} if mapping.contact else {}) | covariates,
         arrays=tuple(name for name, array in sensors.items() if array.ndim > 2 and array.dtype != np.uint8),
     )

@@ -200,7 +200,7 @@ def event_summary(trace: Trace, step: int) -> str:
         for group, mask in covariate.masks(name, trace.episode.covariate(name))
         if mask[step]
     ]
-    parts = [", ".join([f"{step * trace.episode.dt:.1f} s after the start", *groups])]
+    parts = [", ".join([f"{trace.episode.times[step]:.1f} s after the start", *groups])]
     if measures.blackout(trace)[step]:
         parts.append("image blacked out")
     if trace.effective_sample_size is not None and trace.particles is not None:

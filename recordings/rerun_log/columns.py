@@ -47,6 +47,8 @@ def columns(trace: Trace) -> Iterator[Column]:
         if entity.archetype != "Trace" or entity.static:
             continue
         name = entity.path.removeprefix("trace/")
+        if name == "time":  # every format has its own
+            continue
         array = getattr(trace if hasattr(trace, name) else trace.episode, name)
         if array is not None and array.size:
             yield from _split(name, array, re.findall(r"\w+", entity.shape), entity.unit, trace, task)

@@ -46,7 +46,7 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
         static=True,
         recording=stream,
     )
-    times = time_columns(np.arange(len(trace)), trace.episode.dt)
+    times = time_columns(trace.episode, np.arange(len(trace)))
     for chart, curves in charts_of(diagnostic):
         layers = [curve.layer for curve in curves]
         for i, curve in enumerate(curves):
@@ -65,7 +65,7 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
             rr.log(path, line(NEUTRAL_COLOUR, 0.8, *["bounds"] * len(bounds)), static=True, recording=stream)
             rr.send_columns(
                 path,
-                time_columns(ends, trace.episode.dt),
+                time_columns(trace.episode, ends),
                 series(np.tile(np.array(bounds), (len(ends), 1))),
                 recording=stream,
             )
@@ -160,4 +160,4 @@ def _log_band(stream: rr.RecordingStream | None, path: str, kind: str, mask: NDA
     style = rr.StateConfiguration(values=["no", kind], colors=np.full(2, hue, np.uint32), visible=[False, True])
     rr.log(path, style, static=True, recording=stream)
     changes = rr.StateChange.columns(state=[kind if mask[step] else "no" for step in steps])
-    rr.send_columns(path, time_columns(steps, trace.episode.dt), changes, recording=stream)
+    rr.send_columns(path, time_columns(trace.episode, steps), changes, recording=stream)

@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Outline, Task, with_unit
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label
@@ -84,9 +85,10 @@ def series(values: Array) -> Any:
     return rr.Scalars.columns(scalars=rows.ravel()).partition([rows.shape[1]] * len(rows))
 
 
-def time_columns(steps: NDArray[np.int64], dt: float) -> list[rr.TimeColumn]:
-    """Both timelines at some steps; dt in s."""
-    nanoseconds = np.rint(steps * (dt * 1e9)).astype("timedelta64[ns]")
+def time_columns(episode: Episode, steps: NDArray[np.int64], offset: int = 0) -> list[rr.TimeColumn]:
+    """Both timelines at some steps of an episode, whose first step is step ``offset`` of the run."""
+    seconds = (steps + offset) * episode.dt if episode.time is None else episode.time[steps]
+    nanoseconds, steps = np.rint(seconds * 1e9).astype("timedelta64[ns]"), steps + offset
     return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
 
 

@@ -52,6 +52,15 @@ test('the timeline has weights, estimates and the selected chart', () => {
   assert.equal(error.unit, 'cm');
 });
 
+test('times of irregular steps', () => {
+  assert.equal(trace.seconds(2), 2 * trace.dt);
+  assert.equal(trace.stepText, '0.10 s');
+  const times = { shape: [4], values: [0, 0.25, 0.5, 1.5] };
+  const irregular = makeTrace({ ...FUSION, time: times });
+  assert.equal(irregular.seconds(3), 1.5);
+  assert.equal(irregular.stepText, '0.25 to 1.00 s');
+});
+
 test('missing quantities are explained', () => {
   const plain = makeTrace({ truth: FUSION.truth, estimate_mean: FUSION.estimate_mean });
   for (const track of Object.keys(TRACKS)) {

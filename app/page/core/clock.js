@@ -8,10 +8,10 @@ import { SPEEDS } from './state.js';
 export class Clock {
   /** @type {Store} */
   #store;
-  #steps = 0;
-  #dt = 1;
+  /** @type {Trace | null} */
+  #trace = null;
   #lastFrame = 0; // ms
-  #pending = 0; // steps, with a fraction
+  #pending = 0; // s of the episode
 
   /** @param {Store} store */
   constructor(store) {
@@ -26,12 +26,11 @@ export class Clock {
 
   /** @param {Trace | null} trace */
   show(trace) {
-    this.#steps = trace?.steps ?? 0;
-    this.#dt = trace?.dt ?? 1;
+    this.#trace = trace;
   }
 
   toggle() {
-    this.#store.set({ playing: !this.#store.state.playing && this.#steps > 1 });
+    this.#store.set({ playing: !this.#store.state.playing && this.#last > 0 });
   }
 
   /** @param {number} direction -1 slower, 1 faster */
@@ -40,9 +39,21 @@ export class Clock {
     if (speed) this.#store.set({ speed });
   }
 
+  /** The last step. */
+  get #last() {
+    return (this.#trace?.steps ?? 1) - 1;
+  }
+
+  /**
+   * Returns the s from a step to the next one.
+   * @param {number} step
+   */
+  #duration(step) {
+    return this.#trace ? this.#trace.seconds(step + 1) - this.#trace.seconds(step) : 1;
+  }
+
   #start() {
-    if (this.#store.state.step >= this.#steps - 1)
-      this.#store.set({ step: 0 }, { origin: 'clock' });
+    if (this.#store.state.step >= this.#last) this.#store.set({ step: 0 }, { origin: 'clock' });
     this.#lastFrame = performance.now();
     this.#pending = 0;
     requestAnimationFrame((now) => this.#tick(now));
@@ -52,13 +63,16 @@ export class Clock {
   #tick(now) {
     const { playing, step, speed } = this.#store.state;
     if (!playing) return;
-    this.#pending += ((now - this.#lastFrame) / 1000) * (speed / this.#dt);
+    this.#pending += ((now - this.#lastFrame) / 1000) * speed;
     this.#lastFrame = now;
-    const advance = Math.max(0, Math.floor(this.#pending));
-    this.#pending -= advance;
-    const next = Math.min(step + advance, this.#steps - 1);
+    let next = step;
+    for (; next < this.#last; next += 1) {
+      const duration = this.#duration(next);
+      if (this.#pending < duration) break;
+      this.#pending -= duration;
+    }
     this.#store.set(
-      { step: next, playing: next < this.#steps - 1 },
+      { step: next, playing: next < this.#last },
       { origin: 'clock', inputTime: null },
     );
     this.#store.flush();

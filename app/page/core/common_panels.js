@@ -101,9 +101,9 @@ export function showBlackouts(trace) {
  * @param {Trace} trace
  * @param {number} step
  */
-export function showCount({ steps, dt }, step) {
-  html('#readout b').textContent = `${step} / ${steps - 1}`;
-  html('#readout span').textContent = `${fixed(step * dt)} s`;
+export function showCount(trace, step) {
+  html('#readout b').textContent = `${step} / ${trace.steps - 1}`;
+  html('#readout span').textContent = `${fixed(trace.seconds(step))} s`;
 }
 
 /**

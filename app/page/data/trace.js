@@ -4,7 +4,7 @@
 /** @import { Column, Series } from './arrays.js' */
 /** @import { Block, LiveStream } from './live_stream.js' */
 
-import { displayUnit, mainUnit, wrapDegrees } from '../core/units.js';
+import { displayUnit, fixed, mainUnit, wrapDegrees } from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
@@ -87,6 +87,25 @@ export class Trace {
     this.#cache.clear();
     this.#update();
     return added.length > 0;
+  }
+
+  /**
+   * Returns the time since step 0 in s.
+   * @param {number} step
+   */
+  seconds(step) {
+    return this.#slice('time')?.[step] ?? step * this.dt;
+  }
+
+  /** Duration of the steps: `0.10 s`, or the shortest and the longest. */
+  get stepText() {
+    const times = this.#slice('time');
+    if (!times || times.length < 2) return `${fixed(this.dt, 2)} s`;
+    const steps = times
+      .subarray(1)
+      .map((time, i) => time - times[i])
+      .sort();
+    return `${fixed(steps[0], 2)} to ${fixed(steps[steps.length - 1], 2)} s`;
   }
 
   /** Columns of the filter's own scalars. */

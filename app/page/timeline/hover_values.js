@@ -60,7 +60,7 @@ export class HoverValues {
   move(trace, step, { x, y, width, height }) {
     const groups = trace.groups.filter((name) => trace.group(name)[step]);
     const states = [...groups, ...(trace.blackout[step] ? ['image blackout'] : [])];
-    const time = `step ${step} · ${fixed(step * trace.dt)} s`;
+    const time = `step ${step} · ${fixed(trace.seconds(step))} s`;
     this.#title.textContent = [time, ...states].join(' · ');
     for (const { text, track, index } of this.#cells)
       text.data = formatValue(track.series[index].values[step], track);

@@ -134,7 +134,7 @@ export class Timeline {
     this.#standalone.show(trace);
     this.#group.show(trace.groups);
     this.#menu.show(trace);
-    this.#stepLabel.textContent = `step, ${fixed(trace.dt, 2)} s each`;
+    this.#stepLabel.textContent = `step, ${trace.stepText} each`;
     this.redraw();
     this.#setWindow(this.#window);
   }
@@ -393,7 +393,7 @@ export class Timeline {
   #showValues(step) {
     if (!this.#trace) return;
     const name = this.#hover === null ? 'cursor' : 'pointer';
-    this.#readout.textContent = `${name} ${step} · ${fixed(step * this.#trace.dt)} s`;
+    this.#readout.textContent = `${name} ${step} · ${fixed(this.#trace.seconds(step))} s`;
     updateLegend(this.#cells, step);
   }
 
@@ -404,7 +404,7 @@ export class Timeline {
   #describe(step) {
     const trace = this.#trace;
     if (!trace) return '';
-    const parts = [`step ${step}`, `${fixed(step * trace.dt)} s`];
+    const parts = [`step ${step}`, `${fixed(trace.seconds(step))} s`];
     if (trace.hasTruth(step))
       parts.push(`error ${withUnit(fixed(trace.error('fused', 'main')?.[step]), trace.mainUnit)}`);
     const groups = trace.groups.filter((name) => trace.group(name)[step]);

@@ -157,13 +157,31 @@ def test_one_component_is_a_task(tmp_path: Path) -> None:
     assert trace.task.map_half_width == pytest.approx(1.2 * 5.0)
 
 
+def test_times_of_the_log_are_kept(tmp_path: Path) -> None:
+    """Of the episode whose steps vary; a sensor that repeats its readings has a period."""
+    columns = table()
+    columns["t"] = columns["t"] + 1.7e9
+    columns["t"][1::2] += 0.01 * np.random.default_rng(0).uniform(0.0, 1.0, 20)
+    columns["gps_x"] = np.repeat(columns["gps_x"][::8], 8)
+    columns["gps_y"] = np.repeat(columns["gps_y"][::8], 8)
+    mapping = read_map(map_file(tmp_path))
+    regular, irregular = read_log(columns, mapping, "log")
+    assert regular.time is None
+    expected = columns["t"][1::2] - columns["t"][1]
+    np.testing.assert_allclose(irregular.time, expected, atol=1e-6)
+    assert regular.dt == irregular.dt == pytest.approx(np.median(np.diff(expected)), abs=0.005)
+    assert regular.task.periods == {"gps": pytest.approx(4 * regular.dt)}
+    dates = columns | {"t": (columns["t"] * 1e9).astype("datetime64[ns]")}
+    np.testing.assert_allclose(read_log(dates, mapping, "log")[1].times, expected, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('"true_x"', '"truex"', "true_x"),
         ('unit = "deg"', "unit = 3", "unit of state 'yaw' is 3"),
         ('time = "t"', "", "needs either dt"),
-        ('time = "t"', 'time = "gps_x"', "constant"),
+        ('time = "t"', 'time = "gps_x"', "of episode b is -2.7.* after 0 s; expected ascending"),
         ('time = "t"', 'time = "run"', "has text"),
         ("[sensors]", "[sensor]", "sensor"),
         ('["est_x", "est_y", "est_yaw"]', '["est_x", "est_y"]', "2 columns, expected 3"),

@@ -87,6 +87,22 @@ def test_columns_have_the_last_message_at_each_tick(log: Path, tmp_path: Path) -
     assert not np.isnan(age[5:]).any()
 
 
+def test_steps_are_the_messages_of_a_clock(json_log: Path, tmp_path: Path) -> None:
+    """Those of the camera from 0.25 s on, when state and sensors have messages; the state's topic is faster."""
+    text = MAP.partition("[estimate]")[0].replace("dt = 0.05", 'clock = "/camera"')
+    mapping = read_map(map_file(tmp_path, text))
+    (episode,) = read_log(read_columns(json_log, mapping), mapping, json_log.name)
+    ticks = np.arange(0.25, 1.85 + 1e-9, 0.2)
+    assert (episode.dt, episode.time) == (pytest.approx(0.2), None)
+    np.testing.assert_allclose(episode.states, [logs.pose(t) for t in logs.held("/truth", ticks)], atol=1e-6)
+    np.testing.assert_allclose(episode.covariate("age"), ticks - logs.held("/odom", ticks), atol=1e-6)
+    with pytest.raises(BadInput, match=r"map.toml has dt and clock"):
+        read_map(map_file(tmp_path, f"dt = 1.0\n{text}"))
+    mapping = read_map(map_file(tmp_path, text.replace('"/camera"', '"/camra"')))
+    with pytest.raises(BadInput, match="camra"):
+        read_columns(json_log, mapping)
+
+
 def test_a_recorded_estimate_becomes_a_trace(log: Path, tmp_path: Path) -> None:
     """The clock starts with the first message of the estimate."""
     mapping = read_map(map_file(tmp_path))
