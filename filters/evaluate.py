@@ -20,6 +20,7 @@ from beliefscope.datasets.html import html_table
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
@@ -298,8 +299,7 @@ def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
     if covariance.isnan().all():
         return Metrics(rmse, math.nan, math.nan, math.nan)
     n = error.shape[-1]
-    # A floor of (0.1 mm, 0.1 mrad)^2: the covariance of a collapsed particle set has no inverse.
-    covariance = covariance + 1e-8 * torch.eye(n, dtype=torch.float64)
+    covariance = torch.from_numpy(with_floor(covariance.numpy()))
     squared = (error.unsqueeze(-2) @ torch.linalg.solve(covariance, error.unsqueeze(-1))).flatten()
     nll = 0.5 * (squared + torch.linalg.slogdet(covariance).logabsdet + n * math.log(2 * math.pi))
     return Metrics(

@@ -14,6 +14,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.covariance_floor import usual_variances, with_floor
 from beliefscope.filters.engine import one_thread
 from beliefscope.filters.external.likelihood import has_likelihood, log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
@@ -32,7 +33,6 @@ from beliefscope.inspect.maps.plane import (
     plane_of,
 )
 from beliefscope.inspect.maps.statistics import has_layer_weights, layer_weights
-from beliefscope.inspect.statistics.measures import FLOOR
 from beliefscope.inspect.trace import Trace
 
 Doubles = NDArray[np.float64]
@@ -330,8 +330,9 @@ class MapEngine:
             if trace.modalities_with_posterior:
                 mean = np.concatenate([trace.modality_mean[step], mean])
                 covariance = np.concatenate([trace.modality_covariance[step], covariance])
-            floor = 0.0 if trace.particles is None else FLOOR  # the weights may be concentrated on one particle
-            return mean.astype(np.float64), covariance.astype(np.float64) + floor * np.eye(mean.shape[-1])
+            if trace.particles is not None:  # the weights may be concentrated on one particle
+                covariance = with_floor(covariance, usual_variances(trace.estimate_covariance))
+            return mean.astype(np.float64), covariance.astype(np.float64)
         assert trace.observation_mean is not None
         assert trace.observation_covariance is not None
         sensors, noise = trace.observation_mean[step], trace.observation_covariance[step]

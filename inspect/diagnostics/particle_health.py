@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.ensemble import has_equal_weights
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
@@ -293,7 +294,7 @@ def modes(points: Array, weights: Array) -> NDArray[np.int64]:
     """
     steps = len(weights)
     deviation = points - (weights[..., None] * points).sum(1, keepdims=True)
-    covariance = np.einsum("tm,tmi,tmj->tij", weights, deviation, deviation) + measures.FLOOR * np.eye(2)
+    covariance = with_floor(np.einsum("tm,tmi,tmj->tij", weights, deviation, deviation))
     white = np.swapaxes(np.linalg.solve(np.linalg.cholesky(covariance), np.swapaxes(deviation, 1, 2)), 1, 2)
     cells = np.floor((white + EDGE) * (CELLS / (2.0 * EDGE))).astype(np.int64)
     inside = ((cells >= 0) & (cells < CELLS)).all(-1)
@@ -325,8 +326,8 @@ def _farther(trace: Trace, weights: Array) -> Array:
     deviation = task.difference(trace.particles, trace.episode.states[:, None])
     error = (weights[..., None] * deviation).sum(1)
     from_mean = measures.wrapped(task, deviation - error[:, None])
-    covariance = np.einsum("tm,tmi,tmj->tij", weights, from_mean, from_mean)
-    return 1.0 - particle_level(from_mean, weights, error, covariance + measures.FLOOR * np.eye(error.shape[-1]))
+    covariance = with_floor(np.einsum("tm,tmi,tmj->tij", weights, from_mean, from_mean))
+    return 1.0 - particle_level(from_mean, weights, error, covariance)
 
 
 def _summarise(phase: str, count: int, steps: dict[str, Array]) -> PhaseParticles:

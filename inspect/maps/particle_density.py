@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.statistics.measures import FLOOR, wrap_angles
+from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.inspect.statistics.measures import wrap_angles
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ class ParticleDensity:
         particles, n = states[:, self._components].astype(np.float64), len(self._components)
         mean = weights @ particles
         deviation = particles - mean
-        covariance = (deviation * weights[:, None]).T @ deviation + FLOOR * np.eye(n)
+        covariance = with_floor((deviation * weights[:, None]).T @ deviation, particles.var(axis=0))
         effective = min(1.0 / np.square(weights).sum(), MAX_KERNELS)
         h = min(1.0, float((4.0 / ((n + 2.0) * effective)) ** (1.0 / (n + 4.0))))
         if len(weights) > MAX_KERNELS:

@@ -13,11 +13,12 @@ from torch import Tensor
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
+from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.statistics.calibration import LEVELS, gaussian_level
-from beliefscope.inspect.statistics.measures import FLOOR, Array, wrapped
+from beliefscope.inspect.statistics.measures import Array, wrapped
 
 SMALLEST = 1e-9
 """m, rad: lower limit of errors before taking the logarithm."""
@@ -177,7 +178,7 @@ def sample_steps(episodes: Sequence[Episode], task: Task, count: int) -> Batch:
 def _columns(task: Task, error: Tensor, covariance: Tensor) -> Array:
     """(T, N, Q): columns that ``EpisodeSums.sums`` adds up. error: (T, N, n), covariance: (T, N, n, n); SI units."""
     e, n = wrapped(task, error.numpy()), len(task.components)
-    s = covariance.double().numpy() + FLOOR * np.eye(n)
+    s = with_floor(covariance.double().numpy())
     squared = (e * np.linalg.solve(s, e[..., None])[..., 0]).sum(-1)
     with np.errstate(invalid="ignore"):  # filter without a covariance
         nll = 0.5 * (squared + np.linalg.slogdet(s)[1] + n * math.log(2.0 * math.pi))

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import is_image, lost_images
 from beliefscope.datasets.task import Task, with_unit
+from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-FLOOR = 1e-8
-"""m^2 or rad^2 added to the diagonal of a covariance before inversion; a particle set may have collapsed."""
 
 MIN_STEPS = 10
 """Minimum number of steps of a phase for a verdict."""
@@ -57,9 +55,9 @@ def means(trace: Trace) -> Array:
 
 
 def covariances(trace: Trace) -> Array:
-    """(T, L, n, n): each layer's covariance plus ``FLOOR`` on its diagonal; NaN for filters without covariances."""
+    """(T, L, n, n): each layer's covariance, invertible (``with_floor``); NaN for filters without covariances."""
     both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
-    return both.astype(np.float64) + FLOOR * np.eye(both.shape[-1])
+    return with_floor(both)
 
 
 def errors(trace: Trace) -> Array:
@@ -69,7 +67,9 @@ def errors(trace: Trace) -> Array:
 
 def starts_at_truth(trace: Trace) -> bool:
     """Whether the mean of the first belief is the true state of step 0, to float32 precision."""
-    return bool(np.allclose(trace.task.difference(trace.start_mean, trace.episode.states[0]), 0.0, atol=1e-5))
+    difference = np.abs(trace.task.difference(trace.start_mean, trace.episode.states[0]))
+    size = np.abs(trace.episode.states).max(axis=0, initial=0.0) + np.abs(trace.start_mean)
+    return bool((difference <= 1e-5 * size).all())
 
 
 def main_error(trace: Trace) -> Array:

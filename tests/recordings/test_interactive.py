@@ -52,7 +52,7 @@ def test_numbers_equal_the_trace(run_: Trace, page: Path) -> None:
     for i, component in enumerate(document["components"]):
         np.testing.assert_allclose(component["truth"], factors[i] * run_.episode.states[:, i], **close)
         np.testing.assert_allclose(component["mean"][-1], factors[i] * run_.estimate_mean[:, i], **close)
-        std = np.sqrt(run_.estimate_covariance[:, i, i] + measures.FLOOR)
+        std = np.sqrt(run_.estimate_covariance[:, i, i])
         np.testing.assert_allclose(component["std"][-1], factors[i] * std, **close)
     worst = measures.main_error(run_)[:, -1]
     assert document["moments"][0]["step"] == int(worst.argmax())

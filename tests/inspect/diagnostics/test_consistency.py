@@ -69,8 +69,8 @@ def test_scaled_covariances_are_over_or_underconfident(exact: Consistency, scale
     assert compares_updates == (measures.UPDATES_NOTE in result.verdict)
     assert compares_updates or scale > 1.0
     for layer in result.layers:
-        # Same errors, other covariances; tolerance for the floor of 1e-8 relative to 2e-5.
-        assert result.entry(layer).nees == pytest.approx(exact.entry(layer).nees / scale, rel=2e-3)
+        # Same errors, other covariances.
+        assert result.entry(layer).nees == pytest.approx(exact.entry(layer).nees / scale, rel=1e-5)
         assert np.all(result.entry(layer).rmse == exact.entry(layer).rmse)
     assert result.entry("fused").nll > exact.entry("fused").nll + 0.3
     coverage = result.entry("fused").coverage95
