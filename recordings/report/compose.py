@@ -34,6 +34,7 @@ from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.figures.top_view import draw_step
 from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.slices.report import slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -61,6 +62,12 @@ MAP_CAPTION = (
     "Inputs of the filter, and maps over offsets from the true position, each relative to its maximum. "
     "Cross hairs: true position. Rings: estimate of each layer, which also depends on the prediction."
 )
+SLICES = ("Slices", "Under which conditions is the error larger?")
+"""Title of the section on data slices, and the question that it answers."""
+
+MIN_EPISODES = 8
+"""Minimum number of episodes in which slices are searched."""
+
 MAX_CHARTS = 8
 """Maximum number of error charts; shows the traces with the largest RMSE."""
 
@@ -94,7 +101,15 @@ def compose(
     first = traces[0]
     options = {name: {"quantity": quantity} if "quantity" in e.options else {} for name, e in DIAGNOSTICS.items()}
     diagnosis = report_diagnosis(traces, checkpoint, link, lambda share: progress(0.5 * share))
-    results, reasons = run_diagnostics(traces, checkpoint, options, slow, lambda share: progress(0.5 + 0.5 * share))
+    results, reasons = run_diagnostics(traces, checkpoint, options, slow, lambda share: progress(0.5 + 0.4 * share))
+    titles = {name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results}
+    reasons = {DIAGNOSTICS[name].title: reason for name, reason in reasons.items()}
+    try:
+        _check_slices(traces)
+        results["slices"] = slices_of(traces, progress=lambda share: progress(0.9 + 0.1 * share))
+        titles["slices"] = SLICES
+    except BadInput as error:
+        reasons[SLICES[0]] = str(error)
     events = [Event(index, step) for index, step in steps] or worst_events(traces)
     return Report(
         title=title or f"{first.filter} on {first.task.name}",
@@ -102,8 +117,8 @@ def compose(
         checkpoint=checkpoint,
         diagnosis=diagnosis,
         results=results,
-        titles={name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results},
-        reasons={DIAGNOSTICS[name].title: reason for name, reason in reasons.items()},
+        titles=titles,
+        reasons=reasons,
         events=tuple(replace(event, link=link(event.trace, event.step)) for event in events),
         events_note="Requested steps." if steps else "Steps with the largest position error, in descending order.",
         links_note=links_note,
@@ -118,6 +133,15 @@ def compose(
             "matplotlib": matplotlib.__version__,
         },
     )
+
+
+def _check_slices(traces: Sequence[Trace]) -> None:
+    """Raise BadInput with the reason if the traces are not suited to a search for slices."""
+    different = len({trace.episode_index for trace in traces})
+    if different < MIN_EPISODES:
+        raise BadInput(
+            f"{different} episode{'s' * (different != 1)}; a search for slices needs at least {MIN_EPISODES}"
+        )
 
 
 def parse_event(text: str, traces: Sequence[Trace]) -> tuple[int, int]:

@@ -25,8 +25,10 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.slices.report import slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.trace import Trace, save_trace, trace
+from beliefscope.inspect.traces.batch import trace_all
 from beliefscope.recordings.report.compose import compose, write_report
 from beliefscope.recordings.report.diagnosis import report_diagnosis
 from beliefscope.recordings.report.figures import zoom_of
@@ -291,3 +293,15 @@ def test_command_adds_permalinks(run: Any, run_: Trace, tmp_path: Path, monkeypa
     assert document["traces"][0]["sha256"] == hashlib.sha256((tmp_path / "run.trace").read_bytes()).hexdigest()
     assert "beliefscope trace door --filter crossmodal-ekf --episode 9 --seed 0 -o run.trace" in document["commands"]
     assert (tmp_path / "report" / "report.html").is_file()
+
+
+def test_slices_are_searched_in_enough_episodes() -> None:
+    filter_ = load_checkpoint(shipped("push-field", "information-ekf"))
+    with open_dataset(sample_path("push-field")) as data:
+        traces = list(trace_all(filter_, data, data.held_out()[:8]))
+    slices = compose(traces, filter_).results["slices"]
+    assert slices == slices_of(traces)
+    assert slices.tables()[0].rows
+    fewer = compose(traces[:1], filter_)
+    assert "slices" not in fewer.results
+    assert fewer.reasons["Slices"] == "1 episode; a search for slices needs at least 8"
