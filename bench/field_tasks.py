@@ -15,6 +15,7 @@ trained again. Errors are RMSE from step 0, in cm and degrees. Brackets: 95 % in
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -190,14 +191,15 @@ def report(filters: dict[str, Filter], episodes: Sequence[Episode]) -> dict[str,
     document: dict[str, Any] = {}
     for name, result in results.items():
         filter_, entry = filters[name], {}
-        assert isinstance(filter_, ExtendedKalmanFilter)
         document[name] = entry
-        entry["nees"] = nees(filter_, episodes)
+        if math.isfinite(result.nees):
+            entry["nees"] = nees(filter_, episodes)
         for key in ("position_cm", *(key for key in result.rmse if key.endswith("_deg"))):
             entry[key] = errors(result, alone, key)
         if result.standalone:
             entry["haptics dropped for 2 s from first contact"] = dropped_haptics(filter_, episodes)
-            entry["haptics share"] = haptics_share(filter_, episodes)
+            if isinstance(filter_, ExtendedKalmanFilter) and hasattr(filter_, "weight_model"):
+                entry["haptics share"] = haptics_share(filter_, episodes)
     return document
 
 

@@ -63,7 +63,7 @@ def test_front_page_answers_twelve_questions() -> None:
 
 
 def test_site_has_every_page() -> None:
-    listed = re.findall(r"([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    listed = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
     pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
     assert sorted(listed) == sorted(pages | {"changelog.md"})
 
