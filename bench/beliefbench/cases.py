@@ -24,10 +24,12 @@ from beliefscope.inspect.diagnostics.healthy_profile import find_profile
 FILTERS = {
     "tuning": (("door", "crossmodal-ekf"), ("door", "crossmodal-pf")),
     "test": (("push", "crossmodal-ekf"), ("push", "crossmodal-pf"), ("push", "unimodal-ekf"), ("push", "unimodal-pf")),
+    "field-tuning": (("push-field", "information-ekf"),),
+    "field-test": (("door-field", "information-ekf"),),
 }
 """Split -> tasks and filters."""
 
-EPISODES, STEPS, PARTICLES = 6, 100, 300
+EPISODES, STEPS, FIELD_STEPS, PARTICLES = 6, 100, 200, 300
 CLEAN, PAIRS = 10, 8
 """Number of clean controls and of pairs of causes per filter."""
 
@@ -70,19 +72,24 @@ class Spec:
 
     @property
     def split(self) -> str:
-        """``tuning`` or ``test`` if task, filter, levels and seed all belong to it, else ``unused``.
+        """Name of the split to which task, filter, levels and seed all belong, else ``unused``.
 
-        tuning: even levels and even seeds; test: odd ones.
+        Splits for tuning have even levels and even seeds, those for tests odd ones.
         """
-        for parity, (split, filters) in enumerate(FILTERS.items()):
+        for split, filters in FILTERS.items():
             numbers = [self.seed, *(p.level for p in self.planted)]
-            if (self.task, self.filter) in filters and all(number % 2 == parity for number in numbers):
+            if (self.task, self.filter) in filters and all(number % 2 == parity(split) for number in numbers):
                 return split
         return "unused"
 
     @property
     def rng(self) -> np.random.Generator:
         return np.random.default_rng([self.seed, zlib.crc32(self.label.encode())])
+
+
+def parity(split: str) -> int:
+    """Remainder of the levels and seeds of a split: 0 for tuning, 1 for a test."""
+    return int(split.endswith("test"))
 
 
 def magnitudes() -> dict[str, tuple[float | str, ...]]:
@@ -101,9 +108,10 @@ def planted(cause: str, level: int) -> Planted:
 
 
 def causes_of(task: str, filter_: str) -> list[str]:
-    """Causes that can be planted in a filter."""
+    """Causes that can be planted in a filter. The physics of field tasks vary between all episodes."""
     built = architecture(task, filter_)
-    return [cause for cause in magnitudes() if cause not in MODEL_CAUSES or MODEL_CAUSES[cause].applies(built)]
+    model = {cause: kind.applies(built) for cause, kind in MODEL_CAUSES.items()}
+    return [cause for cause in magnitudes() if model.get(cause, cause != "data.shift" or task in shifts.TASKS)]
 
 
 def plan(split: str, repeats: int = 1) -> list[Spec]:
@@ -111,22 +119,22 @@ def plan(split: str, repeats: int = 1) -> list[Spec]:
 
     The level alternates between the two of the split, from cause to cause, filter to filter and repeat to repeat.
     """
-    parity = list(FILTERS).index(split)
-    seeds: Iterator[int] = iter(range(1000 + parity, 10**6, 2))
+    odd = parity(split)
+    seeds: Iterator[int] = iter(range(1000 + odd, 10**6, 2))
     specs = []
     for repeat in range(repeats):
         for f, (task, name) in enumerate(FILTERS[split]):
             for c, cause in enumerate(causes_of(task, name)):
-                level = parity + 2 * ((f + c + repeat) % 2)
+                level = odd + 2 * ((f + c + repeat) % 2)
                 specs.append(Spec(task, name, (planted(cause, level),), next(seeds)))
             specs += [Spec(task, name, (), next(seeds)) for _ in range(CLEAN)]
             for pair in range(PAIRS):
                 first = SENSORS_OF_PAIRS[(pair + f) % len(SENSORS_OF_PAIRS)]
                 second = MODELS_OF_PAIRS[(pair + repeat) % len(MODELS_OF_PAIRS)]
-                both = tuple(planted(cause, parity + 2) for cause in (first, second))
+                both = tuple(planted(cause, odd + 2) for cause in (first, second))
                 specs.append(Spec(task, name, both, next(seeds)))
     assert all(spec.split == split for spec in specs)
-    return specs
+    return [replace(spec, steps=FIELD_STEPS) for spec in specs] if split.startswith("field") else specs
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from beliefbench import equations
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.filter import MAX_LOGIT, Architecture, Filter
+from beliefscope.filters.models.information import InformationFilter
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class ModelCause:
         kinds: kinds of filters that can have it. weighted: whether it needs a weight model.
         equations: subclass that replaces the filter's class; its weights are unchanged.
         feedback: whether the fused belief must be the next prior.
+        bank: whether the posteriors of a bank must be fused, which an information filter does not have.
     """
 
     magnitudes: tuple[float, ...]
@@ -32,11 +34,18 @@ class ModelCause:
     weighted: bool = False
     equations: type[Filter] | None = None
     feedback: bool = False
+    bank: bool = False
 
     def applies(self, architecture: Architecture) -> bool:
         feedback = architecture.kind == "pf" or architecture.feedback
-        weighted = architecture.fusion == "crossmodal"
-        return architecture.kind in self.kinds and self.weighted <= weighted and self.feedback <= feedback
+        weighted = architecture.fusion in ("crossmodal", "information")
+        bank = architecture.fusion != "information"
+        return (
+            architecture.kind in self.kinds
+            and self.weighted <= weighted
+            and self.feedback <= feedback
+            and self.bank <= bank
+        )
 
 
 KALMAN, PARTICLE = ("ekf", "ukf"), ("pf",)
@@ -61,8 +70,10 @@ MODEL_CAUSES: dict[str, ModelCause] = {
     "particles.deprived": ModelCause((30, 20, 2, 3), PARTICLE, equations=equations.FewAncestors),
     "resampling.off": ModelCause((1.0,), PARTICLE, equations=equations.NoResampling),
     "resampling.biased": ModelCause((0.7, 0.6, 0.0, 0.2), PARTICLE, equations=equations.BiasedResampling),
-    "fusion.shared_prior": ModelCause((1.0,), KALMAN, equations=equations.SharedPrior),
-    "fusion.miscalibrated": ModelCause((0.6, 0.5, 0.2, 0.15), equations=equations.MiscalibratedFusion, feedback=True),
+    "fusion.shared_prior": ModelCause((1.0,), KALMAN, equations=equations.SharedPrior, bank=True),
+    "fusion.miscalibrated": ModelCause(
+        (0.6, 0.5, 0.2, 0.15), equations=equations.MiscalibratedFusion, feedback=True, bank=True
+    ),
 }
 MODEL_CAUSES |= {
     name.replace("image", "haptics"): cause for name, cause in MODEL_CAUSES.items() if name.startswith("model.image")
@@ -79,6 +90,8 @@ def plant(filter_: Filter, cause: str, magnitude: float, episodes: Sequence[Epis
             _plant_dynamics(filter_, mechanism, magnitude, episodes, rng)
         elif part == "process_noise":
             filter_.dynamics.log_noise += math.log(magnitude)
+            if isinstance(filter_, InformationFilter):
+                filter_.log_motion += math.log(magnitude)
         elif part == "weights":
             _plant_weights(filter_, mechanism, magnitude)
         else:

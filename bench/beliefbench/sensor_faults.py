@@ -14,6 +14,9 @@ from beliefscope.datasets.faults.injection import Faults
 FORCE_SCALE = {"door": 20.0, "push": 1.2}
 """Standard deviation of the force of a task, N; magnitudes of additive force faults are its multiples."""
 
+TORQUE_SCALE = {"door": 2.0, "push": 0.1}
+"""Standard deviation of the torque of a task, N m."""
+
 ONSETS = (0, 0, 30)
 """First steps of lasting faults, drawn with equal probability."""
 
@@ -26,7 +29,8 @@ class SensorCause:
     """A cause planted with ``--faults``.
 
     Attributes:
-        templates: texts of faults, one is drawn; ``{m}`` is the magnitude, ``{f}`` the same times ``FORCE_SCALE``.
+        templates: texts of faults, one is drawn; ``{m}`` is the magnitude, ``{f}`` and ``{t}``
+            the same times ``FORCE_SCALE`` and ``TORQUE_SCALE``.
         magnitudes: four levels, from mild to severe.
         onset: whether the magnitude is the first step, instead of one drawn from ``ONSETS``.
     """
@@ -38,9 +42,11 @@ class SensorCause:
     def faults(self, task: str, magnitude: float | str, rng: np.random.Generator) -> Faults:
         template = self.templates[int(rng.integers(len(self.templates)))]
         first = magnitude if self.onset else ONSETS[int(rng.integers(len(ONSETS)))]
-        force = magnitude * FORCE_SCALE[task] if isinstance(magnitude, float | int) else ""
-        template = template.replace("{contact}", {"door": "0", "push": "1"}[task])
-        return Faults.parse(f"{template.format(m=magnitude, f=force)}:from={first}")
+        object_ = task.removesuffix("-field")
+        size = magnitude if isinstance(magnitude, float | int) else 0.0
+        force, torque = size * FORCE_SCALE[object_], size * TORQUE_SCALE[object_]
+        template = template.replace("{contact}", {"door": "0", "push": "1"}[object_])
+        return Faults.parse(f"{template.format(m=magnitude, f=force, t=torque)}:from={first}")
 
 
 def _axes(name: str, value: str, axes: str = "xyz") -> tuple[str, ...]:
@@ -68,6 +74,14 @@ SENSOR_CAUSES: dict[str, SensorCause] = {
     "haptics.delay": SensorCause(("delay=haptics:steps={m}",), (2, 3, 6, 8)),
     "control.delay": SensorCause(("control_delay={m}",), (2, 3, 6, 8)),
     "control.scale": SensorCause(("control_scale={m}",), (0.7, 1.4, 0.3, 2.5)),
+    "image.blur": SensorCause(("image_blur={m}",), (0.5, 0.7, 2.0, 1.5)),
+    "force.saturation": SensorCause(("force_saturation={f}",), (1.0, 0.8, 0.2, 0.15)),
+    "torque.bias": SensorCause(_axes("torque_bias", "{t}"), (0.25, 0.35, 1.5, 2.0)),
+    "torque.noise": SensorCause(("torque_noise={t}",), (0.25, 0.35, 1.0, 1.5)),
+    "effector.noise": SensorCause(("effector_noise={m}",), (0.002, 0.003, 0.01, 0.015)),
+    "contact.flipped": SensorCause(("contact_flipped={m}",), (0.1, 0.15, 1.0, 0.5)),
+    "contact.delay": SensorCause(("contact_delayed={m}",), (2, 3, 8, 6)),
+    "haptics.dropout": SensorCause(("drop=haptics",), (80, 70, 10, 20), onset=True),
 }
 
 LABEL_CAUSES: dict[str, tuple[float, ...]] = {

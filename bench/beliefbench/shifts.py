@@ -15,6 +15,8 @@ from beliefscope.datasets.simulation.door_policies import POLICIES
 from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 
+TASKS = ("door", "push")
+
 MAGNITUDES = (0.1, 0.15, 0.5, 0.4)
 """Four levels: relative change of the door's width and its bar's distance, or of the puck's radius and mass."""
 
