@@ -217,8 +217,9 @@ def focus(case: Case) -> Case:
     """The episodes with the largest alarm, if it does not concern the others; otherwise all of them."""
     alarm = case.alarms[0]
     hit = _affected(case, case.alarms)
-    others = [row.get(alarm.statistic, np.nan) for row, chosen in zip(case.rows, hit, strict=True) if not chosen]
-    if not others or not alarm.low <= np.nanmean(others) <= alarm.high:
+    values = [row.get(alarm.statistic, np.nan) for row, chosen in zip(case.rows, hit, strict=True) if not chosen]
+    others = [value for value in values if np.isfinite(value)]
+    if not others or not alarm.low <= np.mean(others) <= alarm.high:
         return case
     traces = [trace for trace, chosen in zip(case.traces, hit, strict=True) if chosen]
     rows = [row for row, chosen in zip(case.rows, hit, strict=True) if chosen]

@@ -16,6 +16,7 @@ from beliefscope.filters.belief import Gaussian, moments
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.fusion import product_of_experts, weighted_average
+from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -31,11 +32,11 @@ def equation_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     Particle filters also have ``particles``: number M; ``ancestors``: share of particles with offspring;
     ``offspring``: mean square of the difference between the number of offspring and its expectation M w; and
     ``prior ess``: relative effective sample size of the weights after resampling.
-    Information filters have none of them: their belief is larger than that of the trace. Neither have traces without
-    some of the particles.
+    Information filters have no fusion rule: of them only the ``reported variance`` is compared, in Kalman filters.
+    Traces without some of the particles have none of these statistics.
     """
     filter_ = checkpoint.filter
-    if filter_.architecture.fusion == "information" or trace.all_particles_ess is not None:
+    if trace.all_particles_ess is not None:
         return {}
     if isinstance(filter_, MixtureParticleFilter) and trace.particles is not None:
         return _particle_statistics(trace, filter_)
@@ -46,12 +47,15 @@ def equation_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
 
 def _kalman_statistics(trace: Trace, filter_: ExtendedKalmanFilter) -> dict[str, float]:
     mean, covariance = _tensor(trace.estimate_mean), _tensor(trace.estimate_covariance)
+    variance = covariance.diagonal(dim1=-2, dim2=-1).log()
+    if isinstance(filter_, InformationFilter):
+        return {"reported variance//all": float((variance[:-1] - _used_before(trace, filter_)).median())}
     rule = _fused(trace, filter_)
-    variance, by_rule = (matrix.diagonal(dim1=-2, dim2=-1).log() for matrix in (covariance, rule.covariance))
+    by_rule = rule.covariance.diagonal(dim1=-2, dim2=-1).log()
     distance = measures.wrapped(filter_.task, (mean - rule.mean).numpy()) / by_rule.exp().sqrt().numpy()
     values = {"fusion mean//all": float(np.sqrt(np.square(distance).mean()))}
     if filter_.architecture.feedback:
-        used = _belief_before(trace, filter_).diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).log()
+        used = _used_before(trace, filter_)
         values["fusion variance//all"] = float((used - by_rule[:-1]).median())
         values["reported variance//all"] = float((variance[:-1] - used).median())
     else:
@@ -71,17 +75,20 @@ def _fused(trace: Trace, filter_: ExtendedKalmanFilter) -> Gaussian:
     return weighted_average(bank, log_weights, architecture.covariance)
 
 
-def _belief_before(trace: Trace, filter_: ExtendedKalmanFilter) -> Tensor:
-    """(T - 1, n, n) covariances from which the next step's prediction started: ``A^-1 (P' - Q) A^-T``."""
+def _used_before(trace: Trace, filter_: ExtendedKalmanFilter) -> Tensor:
+    """(T - 1, n) log-variances of the beliefs that the next predictions started from: ``A^-1 (P' - Q) A^-T``."""
     si = filter_.statistics
     std = si.mean_std("state")[1].double()
     controls = si.standardise("control", torch.from_numpy(trace.episode.controls[1:]))
     states = si.standardise("state", torch.from_numpy(trace.estimate_mean[:-1]))
-    jacobian = filter_.dynamics.with_jacobian(states, filter_.dynamics.control_part(controls))[1].double()
+    mean, jacobian = filter_.dynamics.with_jacobian(states, filter_.dynamics.control_part(controls))
+    information = isinstance(filter_, InformationFilter)
+    noise = filter_.process_noise(mean - states) if information else filter_.dynamics.noise
     predicted = _tensor(trace.predicted_covariance)[1:, 0] / (std * std[:, None])
-    back = torch.linalg.inv(jacobian)
-    before = back @ (predicted - torch.diag_embed(filter_.dynamics.noise.double() ** 2)) @ back.transpose(-1, -2)
-    return before * std * std[:, None]
+    back = torch.linalg.inv(jacobian.double())
+    before = back @ (predicted - torch.diag_embed(noise.double() ** 2)) @ back.transpose(-1, -2)
+    variance = before.diagonal(dim1=-2, dim2=-1) * std.square()
+    return variance.clamp_min(1e-12).log()
 
 
 def _particle_statistics(trace: Trace, filter_: MixtureParticleFilter) -> dict[str, float]:

@@ -56,6 +56,22 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     return values
 
 
+def is_usable(images: Gray) -> bool:
+    """Whether at least half of the images of a window are seen and differ from the previous one."""
+    return bool((~lost_images(images) & ~frozen_images(images)).mean() >= 0.5)
+
+
+def occluded_share(images: Gray, key: str, reference: Reference | None) -> dict[str, float]:
+    """Share of the pixels of a window's median image that are outside of the range of all healthy images."""
+    middle = median_image(images)
+    if reference is None or reference.range is None or (reference.key, reference.image.shape) != (key, middle.shape):
+        return {}
+    low, high = reference.range.astype(np.float64)
+    corrected = middle / max(float(brightness_of(middle, reference)), 1e-3)
+    outside = (corrected < low - TOLERANCE) | (corrected > high + TOLERANCE)
+    return {f"occlusion/{key}/all": float(outside.mean())}
+
+
 def image_lag(images: Gray, hand: Array) -> float:
     """Steps by which images (T, H, W) follow the measured hand (T, d); NaN if unknown.
 

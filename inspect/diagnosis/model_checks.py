@@ -18,6 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import MAX_LOGIT
 from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.statistics import measures
@@ -177,7 +178,8 @@ def proposal(n: int) -> tuple[Tensor, Tensor]:
 def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, float]:
     """Of the dynamics model from the true previous state, by component, with residual r and process noise q.
 
-    ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2. ``dynamics slope``: slope of the
+    ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2, where the q of an information filter
+    grows with the motion. ``dynamics slope``: slope of the
     predicted on the true change, for components that move enough. ``dynamics bias`` and ``dynamics spread``: mean and
     standard deviation of r that the slope does not explain. ``process noise``: q. ``lag/dynamics``: steps by which the
     true changes follow the predicted ones.
@@ -192,6 +194,9 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     predicted = filter_.dynamics(before, filter_.dynamics.control_part(controls[1:]))
     std = si.mean_std("state")[1].double().numpy()
     noise = filter_.dynamics.noise.double().numpy() * std
+    used = (
+        filter_.process_noise(predicted - before) if isinstance(filter_, InformationFilter) else filter_.dynamics.noise
+    )
     residual = measures.wrapped(filter_.task, (predicted - after).double().numpy() * std)
     change = measures.wrapped(filter_.task, (after - before).double().numpy() * std)
     values: dict[str, float] = {}
@@ -201,7 +206,7 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     columns = {
         "dynamics bias": residual.mean(0) - excess * change.mean(0),
         "dynamics error": np.sqrt(np.square(residual).mean(0)),
-        "dynamics nis": (np.square(residual) / noise**2).mean(0),
+        "dynamics nis": (np.square(residual) / (used.double().numpy() * std) ** 2).mean(0),
         "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
         "dynamics spread": (centred - excess * around).std(0),
         "process noise": noise,

@@ -10,6 +10,13 @@ import numpy as np
 from beliefscope.datasets.episode import Episode, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
 from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, saturated, stuck, vector_statistics
+from beliefscope.inspect.diagnosis.window_checks import (
+    EXTREME,
+    RANGE,
+    deviating_windows,
+    window_statistics,
+    window_values,
+)
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys
 from beliefscope.inspect.statistics.signals import Array, Mask, deviating_interval, long_runs, repeats
 
@@ -19,16 +26,16 @@ def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference)
-    return values | vector_statistics(episode)
+    return values | vector_statistics(episode) | window_statistics(episode, reference)
 
 
 def localise(statistic: str, episode: Episode, reference: Reference | None) -> tuple[int, int] | None:
     """First and last step that a statistic of sensors is about; None if it has no steps, such as a lag.
 
     Lost, repeated and saturated readings are marked step by step; of noise, level and exposure it is the interval that
-    differs most from the rest of the episode.
+    differs most from the rest of the episode; of other statistics of windows, the most deviating windows.
     """
-    kind, subject, _ = statistic.split("/")
+    kind, subject, phase = statistic.split("/")
     key, _, axis = subject.partition(" ")
     if key not in episode.observations:
         return None
@@ -37,7 +44,13 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
         steps = np.flatnonzero(marked)
         return (int(steps[0]), int(steps[-1])) if len(steps) else None
     series = _series(kind, key, axis, episode, reference)
-    return None if series is None else deviating_interval(series)
+    if series is not None:
+        return deviating_interval(series)
+    if phase not in (EXTREME, RANGE):
+        return None
+    windows = window_values(episode, reference)
+    values = next((v for name, v in windows.items() if name.startswith(f"{kind}/{subject}/")), None)
+    return None if values is None or not np.isfinite(values).any() else deviating_windows(values)
 
 
 def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | None:

@@ -21,9 +21,16 @@ SENSOR_FAULTS = {
     "image.noise": "image_noise=40",
     "image.exposure": "image_underexposed=0.4",
     "image.occlusion": "image_occluded=12",
+    "image.blur": "image_blur=1.5",
     "force.bias": "force_bias=5",
     "force.drift": "force_drift=1",
     "force.noise": "force_noise=5",
+    "force.saturation": "force_saturation=2",
+    "torque.noise": "torque_noise=0.1",
+    "effector.noise": "effector_noise=0.005",
+    "contact.flipped": "contact_flipped=0.3",
+    "contact.delay": "contact_delayed=5",
+    "haptics.dropout": "drop=haptics:from=20",
     "haptics.delay": "delay=haptics:steps=5",
 }
 """Cause -> the sensor fault that a filter can learn to expect. Others, such as exchanged axes, must be repaired."""

@@ -23,6 +23,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import MAX_LOGIT, Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnosis.setting import Deviations, Setting, without_sensor
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
@@ -206,6 +207,8 @@ def rescale_process_noise(setting: Setting, deviations: Deviations) -> Setting |
     if ratio is None:
         return None
     filter_.dynamics.log_noise.sub_(ratio.log())
+    if isinstance(filter_, InformationFilter):
+        filter_.log_motion.sub_(ratio.log())
     return _with_filter(setting, filter_)
 
 
@@ -384,7 +387,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "shift dynamics": ("dynamics.",),
     "scale dynamics": ("dynamics.",),
     "restore dynamics": ("dynamics.",),
-    "rescale process noise": ("dynamics.log_noise",),
+    "rescale process noise": ("dynamics.log_noise", "log_motion"),
     "healthy beta": ("weight_model.",),
     "invert beta": ("weight_model.",),
 }

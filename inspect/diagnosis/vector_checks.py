@@ -53,7 +53,7 @@ def stuck(episode: Episode, key: str, axis: int) -> Mask:
 
 
 def contact_statistics(episode: Episode) -> dict[str, float]:
-    """The contact flag compared with the force: how often, how strongly related, and how late.
+    """The contact flag: how often it is set and changes; compared with the force, how strongly related and how late.
 
     The flag and the force's distance from its median in free motion are correlated in healthy episodes with and without
     contact. A bias or the sign of the force does not matter.
@@ -61,7 +61,8 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     if CONTACT not in episode.observations:
         return {}
     flag = episode.observations[CONTACT][:, 0] > 0.5
-    values = {f"share/{CONTACT}/all": float(flag.mean())}
+    changes = float(np.mean(flag[1:] != flag[:-1])) if len(flag) > 1 else np.nan
+    values = {f"share/{CONTACT}/all": float(flag.mean()), f"toggles/{CONTACT}/all": changes}
     if FORCE not in episode.observations:
         return values
     force = episode.observations[FORCE].astype(np.float64)
@@ -72,6 +73,7 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     related = float(np.corrcoef(flag, spread)[0, 1]) if both else np.nan
     return values | {
         f"agreement/{CONTACT}/all": related,
+        f"opposition/{CONTACT}/all": max(0.0, -related),
         f"lag/{CONTACT}/all": lag(flag[:, None].astype(np.float64), spread[:, None])[0] if both else np.nan,
         f"unflagged force/{CONTACT}/all": float(np.quantile(size[~flag], 0.9)) if (~flag).any() else np.nan,
     }
@@ -177,10 +179,13 @@ def _moving(episode: Episode) -> Mask:
 
 
 def saturated(values: Array) -> Mask:
-    """(T,): readings at the largest magnitude of the axis, if it occurs more than once; False for a constant axis."""
+    """(T,): readings at the largest magnitude of the axis, if it is reached more than once.
+
+    A single stretch of equal readings is a stuck axis.
+    """
     size = np.abs(values)
     at = size == size.max()
-    return at if at.sum() > 1 and np.ptp(values) > 0 else np.zeros(len(values), dtype=bool)
+    return at if np.diff(at, prepend=False).sum() > 2 else np.zeros(len(values), dtype=bool)
 
 
 def _axis(key: str, i: int, count: int) -> str:

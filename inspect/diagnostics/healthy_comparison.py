@@ -87,7 +87,9 @@ KINDS = {
     "stuck": ("share of repeated readings", False, 0.02),
     "saturation": ("share of saturated readings", False, 0.01),
     "share": ("share of steps with the flag", False, 0.02),
+    "toggles": ("share of steps at which the flag changes", False, 0.01),
     "agreement": ("correlation with the force", False, 0.05),
+    "opposition": ("negative correlation with the force", False, 0.05),
     "unflagged force": ("force in N without the flag", True, 0.2),
     "size": ("standard deviation (N, N m)", True, 0.1),
     "lever": ("lever in m of the torque", False, 0.01),
@@ -98,8 +100,14 @@ KINDS = {
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
 standard deviation between trajectories, below which differences are irrelevant."""
 
+LEVER = 0.1
+"""m: smallest standard deviation of a torque (N m) relative to that of a force (N)."""
+
+PHASES = {"all": "", "extreme": ", most extreme over 20 steps,", "range": ", range over windows of 20 steps,"}
+"""Phase of a statistic -> how its label ends; others are phases of the task."""
+
 RISING = frozenset(
-    {"error", "angle error", "regret", "outside", "black", "frozen", "occlusion", "change"}
+    {"error", "angle error", "regret", "outside", "black", "frozen", "occlusion", "change", "opposition"}
     | {"module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
@@ -133,7 +141,8 @@ class Deviation:
         kind, subject, phase = self.statistic.split("/")
         title = KINDS[kind][0] if kind in KINDS else kind
         subject = display_name(subject.replace(" ", ", "))  # modality, component
-        return f"{title}{f' of {subject}' if subject else ''}{'' if phase == 'all' else f' in {phase}'}"
+        where = PHASES.get(phase, f" in {phase}")
+        return f"{title}{f' of {subject}' if subject else ''}{where}"
 
     @property
     def text(self) -> str:
@@ -272,8 +281,9 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
 def _scaled(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
     """Values (N, S) on the scale of their kind, smallest standard deviations (S,), and whether ``RISING`` (S,)."""
     settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
-    logarithmic, floor = np.array([s[1] for s in settings]), np.array([s[2] for s in settings])
-    rising = np.array([name.split("/")[0] in RISING for name in names])
+    logarithmic = np.array([s[1] for s in settings])
+    floor = np.array([s[2] * (LEVER if "/torque " in n else 1.0) for n, s in zip(names, settings, strict=True)])
+    rising = np.array([name.split("/")[0] in RISING or name.endswith("/range") for name in names])
     return np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values), floor, rising
 
 

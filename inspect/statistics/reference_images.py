@@ -26,6 +26,9 @@ DIGITS = 3
 LEVELS = 127
 """Largest integer of stored expected images."""
 
+TAIL = 0.002
+"""Share of the images below and above the range of a pixel."""
+
 RIDGE = 100.0
 """Penalty of the weights, relative to images of unit variance."""
 
@@ -41,6 +44,8 @@ class Reference:
             variance; row 0 is the constant. Empty (0, 0) for data without hand positions.
         expected: (F, H, W) coefficients of the normalised image as a quadratic polynomial of the hand position.
         scale: (2, d) m: mean and standard deviation of the hand position.
+        range: (2, H, W) nearly smallest and largest gray level of the images, corrected for the exposure of their
+            episode; None in profiles of earlier versions.
     """
 
     key: str
@@ -49,6 +54,7 @@ class Reference:
     weights: Array
     expected: Array
     scale: Array
+    range: Gray | None = None
 
     def to_json(self) -> dict[str, Any]:
         """JSON values; weights rounded to ``DIGITS``."""
@@ -61,6 +67,7 @@ class Reference:
             "weights": _rounded(self.weights.T),
             "expected": {"size": size.tolist(), "levels": levels.reshape(len(levels), self.image.size).tolist()},
             "scale": self.scale.tolist(),
+            "range": None if self.range is None else self.range.tolist(),
         }
 
     @classmethod
@@ -71,9 +78,12 @@ class Reference:
         size = np.array(value["expected"]["size"], dtype=np.float64)
         levels = np.array(value["expected"]["levels"], dtype=np.float64).reshape(len(size), *image.shape)
         scale = np.array(value["scale"], dtype=np.float64)
+        range_ = None if value.get("range") is None else np.array(value["range"], dtype=np.uint8)
         if image.ndim != 2 or spread.shape != image.shape or len(weights) not in (0, 1 + image.size):
             raise ValueError(f"image {image.shape}, spread {spread.shape}, weights {weights.shape}")
-        return cls(str(value["key"]), image, spread, weights, levels * size[:, None, None], scale)
+        if range_ is not None and range_.shape != (2, *image.shape):
+            raise ValueError(f"image {image.shape}, range {range_.shape}")
+        return cls(str(value["key"]), image, spread, weights, levels * size[:, None, None], scale, range_)
 
     @property
     def has_hand(self) -> bool:
@@ -109,7 +119,20 @@ def measure_reference(episodes: Sequence[Episode]) -> Reference | None:
     image = np.nanmedian(medians, axis=0)
     spread = np.nanmax(np.abs(medians - image), axis=0)
     gray, spread = (np.rint(values).clip(0, 255).astype(np.uint8) for values in (image, np.ceil(spread)))
-    return Reference(key, gray, spread, *_hand_camera(episodes, key))
+    return Reference(key, gray, spread, *_hand_camera(episodes, key), _gray_range(episodes, key, medians, image))
+
+
+def _gray_range(episodes: Sequence[Episode], key: str, medians: Array, image: Array) -> Gray:
+    """``range`` of a reference. The exposure of an episode is the median ratio of its median image to ``image``."""
+    bright = image > 0
+    seen = []
+    for episode, middle in zip(episodes, medians, strict=True):
+        if np.isfinite(middle).all():
+            images = episode.observations[key]
+            ratio = max(float(np.median(middle[bright] / image[bright])), 1e-3)
+            seen.append(images[~lost_images(images)] / np.float32(ratio))
+    result = np.quantile(np.concatenate(seen), [TAIL, 1.0 - TAIL], axis=0)
+    return np.rint(result).clip(0, 255).astype(np.uint8)
 
 
 def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, Array]:

@@ -1,11 +1,11 @@
-"""Causes in the force sensor."""
+"""Causes in the force/torque sensor."""
 
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import HAPTICS
 
-CONTACT = "agreement/contact/*|unflagged force/contact/*|lag/contact/*"
+CONTACT = "agreement/contact/*|opposition/contact/*|unflagged force/contact/*|lag/contact/*"
 """Relations of the force and the contact flag."""
 
 CAUSES = (
@@ -59,11 +59,37 @@ CAUSES = (
         "drop haptics",
     ),
     Cause(
+        "force.saturation",
+        "Force saturated",
+        (Symptom("saturation/force*"),),
+        f"size/force/*|stuck/force*|lever/force*|axes/force/*|direction/force/*|noise/force*|change/force*|level/force*"
+        f"|drift/force*|{CONTACT}|{HAPTICS}",
+        "Extend the measuring range of the force sensor, or reduce the forces.",
+        "drop haptics",
+    ),
+    Cause(
         "force.stuck",
         "Force stuck",
         (Symptom("stuck/force*"),),
-        f"*/force*|{CONTACT}|{HAPTICS}",
+        f"level/force*|drift/force*|change/force*|noise/force*|size/force/*|lever/force*|axes/force/*|direction/force/*"
+        f"|{CONTACT}|{HAPTICS}",
         "Restart the force sensor.",
+        "drop haptics",
+    ),
+    Cause(
+        "torque.bias",
+        "Torque biased",
+        (Symptom("level/torque*", 0),),
+        f"drift/torque*|saturation/torque*|{HAPTICS}",
+        "Tare the torque sensor in free motion.",
+        "drop haptics",
+    ),
+    Cause(
+        "torque.noise",
+        "Torque noisy",
+        (Symptom("noise/torque*"),),
+        f"level/torque*|drift/torque*|change/torque*|size/torque/*|lever/force*|axes/force/*|{HAPTICS}",
+        "Check the cable and the filter of the torque sensor.",
         "drop haptics",
     ),
 )

@@ -8,13 +8,24 @@ from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, HAPTICS
 IN_PHASES = "|".join(f"{kind}/*" for kind in ("level", "drift", "change", "size", "lever", "axes", "direction"))
 """Statistics of force and torque in free motion or in contact."""
 
+LAGS = "lag/contact/*|lag/image/*|lag/dynamics/*"
+"""Delays that are measured with the contact flag or with controls that contain it."""
+
 CAUSES = (
     Cause(
         "effector.offset",
         "End-effector position offset",
-        (Symptom("offset/effector_position*", 0),),
+        (Symptom("offset/effector_position*", 0, otherwise=(Symptom("offset/control*", 0),)),),
         f"{HAPTICS}|{DYNAMICS}",
         "Calibrate the robot's kinematics against the camera.",
+        "drop haptics",
+    ),
+    Cause(
+        "effector.noise",
+        "End-effector position noisy",
+        (Symptom("position noise/effector_position*"),),
+        f"offset/effector_position*|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        "Check the joint encoders and the filter of the robot's kinematics.",
         "drop haptics",
     ),
     Cause(
@@ -24,15 +35,44 @@ CAUSES = (
             Symptom("agreement/contact/*|unflagged force/contact/*|share/contact/*", 0),
             Symptom("share/contact/*|change/force*", 0, 0.5),
         ),
-        f"{IN_PHASES}|lag/contact/*|lag/image/*|lag/dynamics/*|{HAPTICS}|{DYNAMICS}",
+        f"opposition/contact/extreme|{IN_PHASES}|{LAGS}|{HAPTICS}|{DYNAMICS}",
         "Check the contact sensor or its threshold.",
+        "drop haptics",
+        lowers="toggles/contact/*",
+    ),
+    Cause(
+        "contact.flipped",
+        "Contact flag inverted",
+        (
+            Symptom("agreement/contact/*", -1),
+            Symptom("toggles/contact/*|opposition/contact/*"),
+        ),
+        f"share/contact/*|unflagged force/contact/*|{IN_PHASES}|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        "Check the sign and the threshold of the contact sensor.",
+        "drop haptics",
+    ),
+    Cause(
+        "contact.delay",
+        "Contact flag delayed",
+        (Symptom("lag/contact/*"),),
+        f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*|direction/*|{LAGS}"
+        f"|{HAPTICS}|{DYNAMICS}",
+        "Synchronise the contact sensor with the force sensor.",
+        "drop haptics",
+    ),
+    Cause(
+        "haptics.dropout",
+        "Haptics lost: all readings repeat the last one",
+        (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
+        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|position noise/*|{HAPTICS}|{DYNAMICS}",
+        "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
     ),
     Cause(
         "haptics.delay",
         "Haptics delayed",
         (Symptom("lag/image/*", -1),),
-        f"lag/contact/*|offset/effector_position*|direction/force/*|{HAPTICS}|{DYNAMICS}",
+        f"lag/contact/*|lag/control/*|lag/dynamics/*|offset/effector_position*|level/*|direction/force/*|{HAPTICS}|{DYNAMICS}",
         "Synchronise the clocks of camera and robot.",
         "advance haptics",
     ),

@@ -23,11 +23,12 @@ from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 PAGE = Path(__file__).parents[3] / "docs" / "diagnose.md"
 
 REQUIRED = {
-    "image": ("blackout", "frozen", "delay", "shift", "noise", "exposure", "occlusion"),
-    "force": ("bias", "drift", "gain", "sign", "axes", "noise", "stuck"),
-    "effector": ("offset",),
-    "contact": ("stuck",),
-    "haptics": ("delay",),
+    "image": ("blackout", "frozen", "delay", "shift", "noise", "exposure", "occlusion", "blur"),
+    "force": ("bias", "drift", "gain", "sign", "axes", "noise", "stuck", "saturation"),
+    "torque": ("bias", "noise"),
+    "effector": ("offset", "noise"),
+    "contact": ("stuck", "flipped", "delay"),
+    "haptics": ("delay", "dropout"),
     "control": ("delay", "scale"),
     "labels": ("delay", "offset"),
     "model.image": ("bias", "overconfident", "underconfident", "broken"),

@@ -152,6 +152,17 @@ def test_a_scaled_report_and_fusion_are_measured(name: str) -> None:
     assert values["fusion variance//all"] == pytest.approx(0.0, abs=1e-3)
 
 
+def test_the_report_of_an_information_filter_is_compared_with_its_next_prediction() -> None:
+    """Its belief also has biases, but the prediction of the state depends on the state's covariance only."""
+    checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
+    with open_dataset(sample_path("push-field")) as data:
+        original = trace(checkpoint, data[0], 0)
+    assert equation_statistics(original, checkpoint) == {"reported variance//all": pytest.approx(0.0, abs=1e-3)}
+    scaled = replace(original, estimate_covariance=3.0 * original.estimate_covariance)
+    values = equation_statistics(scaled, checkpoint)
+    assert values["reported variance//all"] == pytest.approx(np.log(3.0), abs=1e-3)
+
+
 def test_the_power_of_the_likelihood_is_the_inverse_of_a_variance() -> None:
     checkpoint, original = run("crossmodal-pf")
     assert original.log_weights is not None

@@ -14,6 +14,8 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+from beliefscope.inspect.diagnosis.vector_checks import saturated
+from beliefscope.inspect.diagnosis.window_checks import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
 TASKS = ("door", "push")
@@ -65,6 +67,7 @@ def change(task: str, faults: str, statistic: str) -> float:
         ("force_noise=4", "noise/force z/all", 4.0, 0.7),
         ("force_stuck=x:from=20", "stuck/force x/all", 0.65, 0.25),
         ("contact_delayed=3", "lag/contact/all", 3.0, 0.3),
+        ("contact_flipped=0.3", "toggles/contact/all", 2 * 0.3 * 0.7, 0.06),
         ("effector_noise=0.004", "position noise/effector_position/all", 0.004, 4e-4),
         ("drop=haptics:from=50", "stuck/effector_position/all", 0.5, 0.01),
     ],
@@ -77,11 +80,37 @@ def test_the_statistic_changes_by_the_planted_amount(
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
+    ("faults", "statistic", "amount", "tolerance"),
+    [
+        ("image_noise=30", "noise/image/extreme", 30.0, 3.0),
+        ("image_underexposed=0.4", "brightness/image/range", 1.5, 0.15),
+        ("force_noise=4", "noise/force z/extreme", 4.0, 1.5),
+        ("effector_noise=0.004", "position noise/effector_position/extreme", 0.004, 1e-3),
+    ],
+)
+def test_a_fault_of_a_fifth_of_the_steps_shows_in_the_windows_only(
+    task: str, faults: str, statistic: str, amount: float, tolerance: float
+) -> None:
+    faults = f"{faults}:from=40:to=60"
+    assert change(task, faults, statistic) == pytest.approx(amount, abs=tolerance)
+    kind, subject, _ = statistic.split("/")
+    assert abs(change(task, faults, f"{kind}/{subject}/all")) < 0.2 * amount
+
+
+def test_windows_that_deviate_are_adjacent() -> None:
+    values = np.array([1.0, 1.0, 3.0, 4.0, 1.0, np.nan, 4.5, 1.0])
+    assert deviating_windows(values) == (6 * STRIDE, 6 * STRIDE + LENGTH - 1)
+    assert deviating_windows(values[:5]) == (2 * STRIDE, 3 * STRIDE + LENGTH - 1)
+    assert deviating_windows(np.ones(4)) is None
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
     ("faults", "own"),
     [
         ("force_bias=5:y=-3", "level/force direction"),
         ("torque_bias=0.3", "level/torque"),
-        ("force_drift=0.4", "drift/force stuck noise unflagged agreement lag/contact axes lever size direction"),
+        ("force_drift=0.4", "drift/force level/force stuck noise unflagged agreement lag/contact axes lever size direction"),
         ("delay=image:steps=4", "lag/image shift offset sharpness occlusion"),
         ("image_underexposed=0.5", "brightness occlusion sharpness shift offset frozen lag/image"),
         ("contact_delayed=3", "lag/contact agreement unflagged share level drift change size lever axes direction"),
@@ -94,6 +123,12 @@ def test_other_statistics_do_not_change(task: str, faults: str, own: str) -> Non
     for name, value in clean.items():
         if not name.startswith(allowed):
             assert faulty[name] == pytest.approx(value, rel=1e-3, abs=2e-2, nan_ok=True), name
+
+
+def test_a_single_stretch_of_equal_readings_is_not_saturated() -> None:
+    stuck, limited = np.array([0.0, 1.0, 2.0, 2.0, 2.0]), np.array([0.0, 2.0, 2.0, 1.0, -2.0, 0.0])
+    assert not saturated(stuck).any()
+    np.testing.assert_array_equal(np.flatnonzero(saturated(limited)), [1, 2, 4])
 
 
 def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[str, float]:
@@ -156,13 +191,15 @@ def test_image_shift_is_registered() -> None:
         ("image_noise=30:from=50:to=80", "noise/image/all", (50, 79)),
         ("image_underexposed=0.4:from=64", "brightness/image/all", (64, 99)),
         ("drop=haptics:from=25", "stuck/effector_position/all", (25, 99)),
+        ("contact_flipped:from=40:to=60", "opposition/contact/extreme", (40, 59)),
     ],
 )
 def test_faults_are_localised(faults: str, statistic: str, steps: tuple[int, int]) -> None:
     faulty = Faults.parse(faults).apply(episodes("push")[0])
     found = localise(statistic, faulty, reference("push"))
     assert found is not None
-    assert np.abs(np.subtract(found, steps)).max() <= 2
+    tolerance = STRIDE if statistic.endswith("extreme") else 2
+    assert np.abs(np.subtract(found, steps)).max() <= tolerance
     assert localise("lag/image/all", faulty, reference("push")) is None
 
 
