@@ -32,8 +32,8 @@ SAMPLE = "sample"
 PRETRAINED = frozenset(name for task in TASKS.values() for name in filters_of(task))
 """Names of the pretrained filters of all tasks."""
 
-DEFAULT_FILTER = "crossmodal-pf"
-"""The pretrained filter that is listed first."""
+DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
+"""The first of these that is pretrained for a task is listed first."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class TaskCatalog:
     @cached_property
     def filters(self) -> dict[str, Checkpoint]:
         filters = dict(self.user_filters)
-        for name in sorted(filters_of(self.task), key=lambda name: name != DEFAULT_FILTER):
+        for name in dict.fromkeys((*DEFAULT_FILTERS, *filters_of(self.task))):
             if name not in filters:
                 with suppress(BadInput):  # no pretrained checkpoint ships
                     self.paths[name] = shipped(self.task, name)
