@@ -55,8 +55,8 @@ CAUSES = (
         "contact.delay",
         "Contact flag delayed",
         (Symptom("lag/contact/*"),),
-        f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*|direction/*|{LAGS}"
-        f"|{HAPTICS}|{DYNAMICS}",
+        f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*"
+        f"|direction/*|{LAGS}|{HAPTICS}|{DYNAMICS}",
         "Synchronise the contact sensor with the force sensor.",
         "drop haptics",
     ),
@@ -64,7 +64,8 @@ CAUSES = (
         "haptics.dropout",
         "Haptics lost: all readings repeat the last one",
         (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
-        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|position noise/*|{HAPTICS}|{DYNAMICS}",
+        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|position noise/*|{HAPTICS}"
+        f"|{DYNAMICS}",
         "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
     ),

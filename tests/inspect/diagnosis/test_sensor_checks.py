@@ -110,7 +110,10 @@ def test_windows_that_deviate_are_adjacent() -> None:
     [
         ("force_bias=5:y=-3", "level/force direction"),
         ("torque_bias=0.3", "level/torque"),
-        ("force_drift=0.4", "drift/force level/force stuck noise unflagged agreement lag/contact axes lever size direction"),
+        (
+            "force_drift=0.4",
+            "drift/force level/force stuck noise unflagged agreement lag/contact axes lever size direction",
+        ),
         ("delay=image:steps=4", "lag/image shift offset sharpness occlusion"),
         ("image_underexposed=0.5", "brightness occlusion sharpness shift offset frozen lag/image"),
         ("contact_delayed=3", "lag/contact agreement unflagged share level drift change size lever axes direction"),
