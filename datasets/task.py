@@ -191,7 +191,11 @@ class Task:
         covariates: name -> what is known about each step besides state and sensors; metrics are grouped by it. The
             values of ``contact`` are in ``Episode.contact``, others in ``Episode.covariates``.
         arrays: observation keys with several axes that are arrays of numbers instead of images, such as depth, tactile
-            grids, spectrograms and point clouds.
+            grids and spectrograms.
+        scans: observation key -> angles of the first and the last of the ranges (d,) of a planar lidar, in rad and m;
+            beams are equally spaced, from x towards y of the sensor's frame.
+        clouds: observation keys of point clouds (P, 2) or (P, 3), in m, which may have more columns. Points at zero are
+            absent, as are ranges of scans that are not above 0.
         periods: observation key -> s between the readings of a sensor that is slower than the steps and repeats its
             last reading, so that these repetitions are no fault.
         warmup: first steps that are excluded from metrics, because runs start at the truth.
@@ -217,6 +221,8 @@ class Task:
     covariates: Mapping[str, Covariate] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
     periods: Mapping[str, float] = field(default_factory=dict)
+    scans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    clouds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Fill in the default map."""
@@ -237,7 +243,8 @@ class Task:
 
     def dtype(self, key: str) -> type[np.uint8] | type[np.float32]:
         """Type of an observation's values: uint8 for images, else float32."""
-        return np.uint8 if len(self.observations[key]) > 1 and key not in self.arrays else np.float32
+        is_array = len(self.observations[key]) == 1 or key in (*self.arrays, *self.clouds)
+        return np.float32 if is_array else np.uint8
 
     def held_steps(self, key: str) -> int:
         """Consecutive repetitions of an observation that its period explains: one missed reading included."""

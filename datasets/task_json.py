@@ -52,6 +52,8 @@ def task_from_json(values: Any) -> Task:
             warmup=values["warmup"],
             arrays=tuple(values.get("arrays", ())),  # definitions of earlier versions lack it
             periods=dict(values.get("periods", {})),
+            scans=_tuples(values.get("scans", {})),
+            clouds=tuple(values.get("clouds", ())),
             **_covariates(values),
         )
         if not values["map_components"]:  # ``Task`` has chosen them; a stored definition names them
@@ -145,13 +147,14 @@ def check_definition(task: Task, where: str = "") -> None:
     for key, shape in task.observations.items():
         if not shape or not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
-        if key not in task.arrays and len(shape) > 2 and (len(shape) > 3 or shape[2] != 3):
+        if key not in (*task.arrays, *task.clouds) and len(shape) > 2 and (len(shape) > 3 or shape[2] != 3):
             raise BadInput(
                 f"{place}: observation {key!r} has shape {shape!r:.200}, expected (d,), (H, W) or (H, W, 3), or "
                 f"its name in arrays."
             )
     if unknown := [key for key in task.arrays if key not in task.observations]:
         raise BadInput(f"{place}: arrays has {unknown[0]!r:.200}, which is not an observation.")
+    _check_points(task, place)
     for key, period in task.periods.items():
         if key not in task.observations or not _positive(period):
             raise BadInput(
@@ -179,6 +182,25 @@ def check_definition(task: Task, where: str = "") -> None:
     for unit, ends in task.start_distance.items():
         if unit not in {c.unit for c in task.components} or len(ends) != 2 or not all(_number(end) for end in ends):
             raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
+
+
+def _check_points(task: Task, place: str) -> None:
+    """Scans and point clouds."""
+    for key, angles in task.scans.items():
+        shape = task.observations.get(key, ())
+        if len(shape) != 1 or shape[0] < 2:
+            raise BadInput(f"{place}: scan {key!r:.200} has shape {shape!r:.200}, expected ranges (d,).")
+        valid = len(angles) == 2 and all(map(_number, angles))
+        if not valid or not 0.0 < angles[1] - angles[0] <= 2.0 * math.pi + 1e-6:
+            raise BadInput(
+                f"{place}: scan {key!r:.200} has angles {angles!r:.200}, expected two in rad, ascending, within a turn."
+            )
+    for key in task.clouds:
+        shape = task.observations.get(key, ())
+        if len(shape) != 2 or shape[1] < 2:
+            raise BadInput(
+                f"{place}: point cloud {key!r:.200} has shape {shape!r:.200}, expected (P, 2), (P, 3) or more columns."
+            )
 
 
 def _check_covariates(task: Task, place: str) -> None:

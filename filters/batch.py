@@ -176,7 +176,9 @@ def check_shapes(task: Task, episode: Episode, where: str) -> None:
 
 def _modality_array(episode: Episode, keys: Sequence[str]) -> np.ndarray:
     arrays = [episode.observations[key] for key in keys]
-    return arrays[0] if arrays[0].ndim == 3 else np.concatenate(arrays, axis=1).astype(np.float32)
+    if len(arrays) == 1:
+        return arrays[0] if arrays[0].ndim == 3 else arrays[0].astype(np.float32)
+    return np.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1).astype(np.float32)
 
 
 def _join(arrays: Sequence[np.ndarray], device: torch.device | str) -> Tensor:

@@ -28,6 +28,7 @@ Needs = Literal[
     "covariance",
     "weights",
     "effective_weights",
+    "points",
     "covariates",
     "contact",
     "time",
@@ -116,6 +117,7 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/accepted", "Trace", "(K,)", "1", "measurements", "whether the gate accepted the measurement"),
     Entity("extra/{name}", "Scalars", "()", "filter's", "extra", "scalar that only this filter has"),
     Entity("observations/{key}", "Image or Scalars", "task's", "task's", "always", "input of the filter"),
+    Entity("points/{key}", "Points3D", "(P, 3)", "m", "points", "scan or point cloud in the frame of the sensor"),
     Entity("covariates/{name}", "Scalars", "()", "task's", "covariates", "covariate except contact; NaN: unknown"),
     # The scene: metres, z up. The plane shows the belief over the task's two map components.
     Entity("world", "ViewCoordinates", "static", "m", "always", "right-handed, z up"),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
 from beliefscope.datasets.episode import is_image
+from beliefscope.datasets.points import point_sensors, points_of
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
@@ -65,14 +66,16 @@ def camera_images(trace: Trace) -> NDArray[np.uint8] | None:
 
 
 def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
-    """Sensors that the page draws as images: images first, then arrays of numbers with two axes.
+    """Sensors that the page draws: images first, then arrays of numbers with two axes, scans and point clouds.
 
     ``low`` and ``high`` are the range of an array's values in the run, from the first to the last colour; None for
-    images.
+    images. Of scans and point clouds, ``points`` is the number of points per step and ``high`` the extent in m: 99 % of
+    the points are in the square of twice this side around the sensor.
     """
     observations = trace.episode.observations
     images = [key for key, readings in observations.items() if is_image(readings)]
-    arrays = [key for key, readings in observations.items() if readings.ndim == 3 and key not in images]
+    clouds = [key for key in point_sensors(trace.task) if key in observations]
+    arrays = [key for key, values in observations.items() if values.ndim == 3 and key not in (*images, *clouds)]
     sensors = []
     for key in images + arrays:
         height, width, *channels = observations[key].shape[1:]
@@ -80,16 +83,27 @@ def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
         if key in arrays and len(trace):
             low, high = float(observations[key].min()), float(observations[key].max())
         sensor = {"name": key, "height": height, "width": width, "channels": channels[0] if channels else 1}
-        sensors.append(sensor | {"low": low, "high": high})
+        sensors.append(sensor | {"low": low, "high": high, "points": 0})
+    for key in clouds:
+        points = points_of(trace.task, key, observations[key])
+        side = np.abs(points[..., :2]).max(-1)
+        extent = float(np.percentile(side[np.isfinite(side)], 99.0)) if np.isfinite(side).any() else 1.0
+        size = {"height": 1, "width": 1, "channels": 1, "points": points.shape[1]}
+        sensors.append({"name": key, **size, "low": 0.0, "high": 1.05 * extent or 1.0})
     return sensors
 
 
-def sensor_pixels(trace: Trace, key: str) -> NDArray[np.uint8]:
-    """(T, H, W) or (T, H, W, 3): a sensor of ``displayed_sensors``; arrays of numbers are scaled to 0..255."""
+def sensor_pixels(trace: Trace, key: str) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """A sensor of ``displayed_sensors``: (T, H, W) or (T, H, W, 3) uint8, arrays of numbers scaled to 0..255.
+
+    Of scans and point clouds, (T, P, 2) float32, in m: x and y in the frame of the sensor, NaN for absent points.
+    """
     sensor = next((s for s in displayed_sensors(trace) if s["name"] == key), None)
     if sensor is None:
         raise NotFound(f"Sensor {key!r} has no images. Available: {_names(trace)}.")
     readings = trace.episode.observations[key]
+    if sensor["points"]:
+        return points_of(trace.task, key, readings)[..., :2]
     if sensor["low"] is None:
         return np.asarray(readings, np.uint8)
     span = max(sensor["high"] - sensor["low"], 1e-12)

@@ -10,6 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from beliefscope.datasets.points import point_sensors
 from beliefscope.datasets.task import Component, Task, display_name, with_unit
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
@@ -40,6 +41,7 @@ def blueprint(
         growing: whether the run is in progress: the cursor and axes follow its end.
     """
     observed: list[rrb.View] = [_camera(key) for key in task.observations if task.dtype(key) is np.uint8]
+    observed += [_points(key) for key in point_sensors(task) if key in trace.episode.observations]
     if first is not None:
         observed += [_map(layer, first) for layer in first.layers]
     scene = rrb.Vertical(
@@ -100,6 +102,16 @@ def _eye(target: NDArray[np.float64], position: NDArray[np.float64], up: tuple[i
 
 def _camera(key: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
+
+
+def _points(key: str) -> rrb.Spatial3DView:
+    """A scan or point cloud from above, x upwards."""
+    return rrb.Spatial3DView(
+        origin=f"points/{key}",
+        name=display_name(key),
+        background=rrb.Background(kind="SolidColor", color=BACKGROUND),
+        eye_controls=_eye(np.zeros(3), np.array([0.0, 0.0, 10.0]), (1, 0, 0)),
+    )
 
 
 def _map(layer: str, first: LikelihoodMap) -> rrb.View:

@@ -10,6 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.points import point_sensors, points_of
 from beliefscope.datasets.task import Component, Outline, Task, with_unit
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label
@@ -75,6 +76,12 @@ def columns(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
         if values is not None:
             for k, modality in enumerate(trace.modalities):
                 yield f"{name}/{modality}", series(values[steps, k])
+    for key in point_sensors(task):
+        if key in trace.episode.observations:
+            points = points_of(task, key, trace.episode.observations[key][steps])
+            present = np.isfinite(points[..., 0])
+            columns_ = rr.Points3D.columns(positions=points[present])
+            yield f"points/{key}", columns_.partition(present.sum(1))
     if trace.effective_sample_size is not None:
         yield "diagnostics/effective_sample_size", series(trace.effective_sample_size[steps])
 
@@ -140,6 +147,9 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
             # Components of a modality share its colour and differ in opacity.
             opacity = np.linspace(1.0, 0.35, len(names))
             yield f"{name}/{modality}", line(_hex(modality, trace), 2.0, *names, opacity=opacity)
+    for key in point_sensors(task):
+        if key in trace.episode.observations:
+            yield f"points/{key}", _marker("#56b4e9", 2.0)
     if trace.log_weights is not None:
         yield "diagnostics/effective_sample_size", line(_hex("fused", trace), 1.5, "effective particles")
 

@@ -11,12 +11,14 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from rerun.chunk import RrdReader
 from torch import nn
 
 from beliefscope.app.protocol.trace_format import columns, displayed_sensors, header, sensor_pixels
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults, available_presets
+from beliefscope.datasets.points import MAX_POINTS, points_of
 from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.datasets.task import Component, Task
 from beliefscope.datasets.task_json import check_definition, task_from_json, task_to_json
@@ -38,8 +40,17 @@ T = 12
 TASK = Task(
     name="hand",
     components=(Component("x", "m"), Component("y", "m"), Component("z", "m"), Component("grip", "N")),
-    observations={"left": (24, 32, 3), "right": (16, 16), "depth": (12, 10), "tactile": (4, 4, 2), "scan": (90,)},
-    modalities={"cameras": ("left", "right"), "range": ("depth", "scan"), "touch": ("tactile",)},
+    observations={
+        "left": (24, 32, 3),
+        "right": (16, 16),
+        "depth": (12, 10),
+        "tactile": (4, 4, 2),
+        "scan": (90,),
+        "cloud": (7, 3),
+    },
+    modalities={"cameras": ("left", "right"), "range": ("depth", "scan", "cloud"), "touch": ("tactile",)},
+    scans={"scan": (-np.pi / 2, np.pi / 2)},
+    clouds=("cloud",),
     control_size=2,
     dt=0.05,
     map_components=("x", "y"),
@@ -111,6 +122,10 @@ def test_data_set_and_definition(tmp_path: Path) -> None:
         ({"arrays": ()}, r"'tactile' has shape \(4, 4, 2\), expected \(d,\), \(H, W\) or \(H, W, 3\), or its name"),
         ({"arrays": ("depth", "tactile", "heat")}, "arrays has 'heat', which is not an observation"),
         ({"observations": TASK.observations | {"scan": ()}}, r"observation 'scan' has shape \(\)"),
+        ({"scans": {"depth": (0.0, 1.0)}}, r"scan 'depth' has shape \(12, 10\), expected ranges \(d,\)"),
+        ({"scans": {"scan": (1.0, 0.0)}}, r"scan 'scan' has angles \(1.0, 0.0\), expected two in rad, ascending"),
+        ({"scans": {"lidar": (0.0, 1.0)}}, r"scan 'lidar' has shape \(\)"),
+        ({"clouds": ("scan", "cloud")}, r"point cloud 'scan' has shape \(90,\), expected \(P, 2\), \(P, 3\)"),
         ({"modalities": {"none": ()}}, "modality 'none' has no observations"),
     ],
 )
@@ -120,7 +135,9 @@ def test_invalid_sensors_are_rejected(change: dict[str, Any], message: str) -> N
 
 
 def test_definitions_without_arrays_are_read() -> None:
-    values = task_to_json(replace(TASK, observations={"scan": (90,)}, modalities={"range": ("scan",)}, arrays=()))
+    values = task_to_json(
+        replace(TASK, observations={"scan": (90,)}, modalities={"range": ("scan",)}, arrays=(), clouds=())
+    )
     del values["arrays"]
     assert task_from_json(json.loads(json.dumps(values))).arrays == ()
 
@@ -140,7 +157,13 @@ def test_every_reading_reaches_an_external_filter(run: Trace) -> None:
 
 def test_blackouts_and_displayed_sensors(run: Trace) -> None:
     assert measures.blackout(run).tolist() == [t == 5 for t in range(T)]
-    assert [(s["name"], s["channels"]) for s in displayed_sensors(run)] == [("left", 3), ("right", 1), ("depth", 1)]
+    assert [(s["name"], s["channels"], s["points"]) for s in displayed_sensors(run)] == [
+        ("left", 3, 0),
+        ("right", 1, 0),
+        ("depth", 1, 0),
+        ("scan", 1, 90),
+        ("cloud", 1, 7),
+    ]
     np.testing.assert_array_equal(sensor_pixels(run, "left"), run.episode.observations["left"])
     depth, low = run.episode.observations["depth"], displayed_sensors(run)[2]["low"]
     pixels = sensor_pixels(run, "depth")
@@ -148,6 +171,29 @@ def test_blackouts_and_displayed_sensors(run: Trace) -> None:
     span = displayed_sensors(run)[2]["high"] - low
     np.testing.assert_allclose(low + pixels / 255.0 * span, depth, atol=span / 255.0)
     assert header(run, columns(run)[0], TASK, None, {})["sensors"][0]["width"] == 32
+
+
+def test_points_of_scans_and_clouds(run: Trace, tmp_path: Path) -> None:
+    """Beams from right to left of the sensor, whose x axis is at 0 rad; ranges that are not above 0 are absent."""
+    ranges = run.episode.observations["scan"]
+    points = sensor_pixels(run, "scan")
+    present = ranges > 0.0
+    np.testing.assert_array_equal(np.isfinite(points[..., 0]), present)
+    np.testing.assert_allclose(np.hypot(*points[present].T), ranges[present], rtol=1e-5)
+    angle = np.broadcast_to(np.linspace(-np.pi / 2, np.pi / 2, 90), ranges.shape)
+    np.testing.assert_allclose(np.arctan2(points[..., 1], points[..., 0])[present], angle[present], atol=1e-5)
+    cloud = run.episode.observations["cloud"].copy()
+    cloud[3, 2] = 0.0
+    absent = replace(run, episode=replace(run.episode, observations={**run.episode.observations, "cloud": cloud}))
+    assert np.isnan(sensor_pixels(absent, "cloud")).any(-1).sum() == 1
+    many = points_of(TASK, "cloud", np.ones((2, 90_000, 4), np.float32))
+    assert many.shape == (2, MAX_POINTS, 3)
+    drawn = {"/points/cloud": 0, "/points/scan": 0}
+    for chunk in RrdReader(write_recording(absent, tmp_path / "run.rrd")).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path in drawn and "Points3D:positions" in batch.schema.names:
+            drawn[chunk.entity_path] += len(batch.column("Points3D:positions").flatten())
+    assert drawn == {"/points/cloud": 7 * T - 1, "/points/scan": int(present.sum())}
 
 
 def test_recording_live_file_export_and_report(run: Trace, tmp_path: Path) -> None:
@@ -190,6 +236,12 @@ def test_faults_of_any_sensor(key: str) -> None:
     assert (inject(f"sensor_frozen={key}:from=4")[4:] == readings[4]).all()
     noisy = inject(f"sensor_noise={key}:std=0.1")
     assert is_image or np.std(noisy - readings) == pytest.approx(0.1, rel=0.2)
+    modality = next(name for name, keys in TASK.modalities.items() if key in keys)
+    delayed = Faults.parse(f"delay={modality}:steps=2").apply(clean).observations[key]
+    np.testing.assert_array_equal(delayed[2:], clean.observations[key][:-2])
+    dropped = Faults.parse(f"drop={modality}:from=3").apply(clean).observations[key]
+    assert np.array_equal(dropped[:3], clean.observations[key][:3])
+    assert len(np.unique(dropped[3:].reshape(T - 3, -1), axis=0)) == 1
     if readings.ndim == 3:
         with pytest.raises(BadInput, match="channel that the sensor does not have"):
             inject(f"sensor_swapped={key}")
@@ -199,7 +251,9 @@ def test_faults_of_any_sensor(key: str) -> None:
 
 
 def test_image_faults_of_rgb_images_change_every_channel() -> None:
-    task = replace(TASK, observations={"image": (24, 32, 3)}, modalities={"image": ("image",)}, arrays=())
+    task = replace(
+        TASK, observations={"image": (24, 32, 3)}, modalities={"image": ("image",)}, arrays=(), scans={}, clouds=()
+    )
     clean = make_episode()
     clean = replace(clean, task=task, observations={"image": clean.observations["left"]})
     for text in ("image_blur=1", "image_shift=3", "image_occluded=8", "image_noise=20", "blackout"):

@@ -36,6 +36,7 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "covariance": trace.has_covariance,
         "weights": trace.weights is not None,
         "effective_weights": trace.effective_weights is not None,
+        "points": bool(task.scans or task.clouds),
         "time": trace.episode.time is not None,
         "covariates": bool(trace.episode.covariates),
         "contact": "contact" in task.covariates,

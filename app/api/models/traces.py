@@ -53,7 +53,12 @@ class Column(Reply):
 
 
 class DisplayedSensor(Reply):
-    """A sensor that is drawn as an image. channels: 1, or 3 for RGB. low, high: range of an array of numbers."""
+    """A sensor that is drawn.
+
+    Attributes:
+        channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point
+            cloud, whose extent is ``high`` in m; else 0.
+    """
 
     name: str
     height: int
@@ -61,6 +66,7 @@ class DisplayedSensor(Reply):
     channels: int
     low: float | None
     high: float | None
+    points: int
 
 
 class TraceHeader(Reply):
@@ -71,7 +77,7 @@ class TraceHeader(Reply):
         weight_width: 0 for a filter without weights. settings: of the run.
         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
-            reasons. sensors: those drawn as images.
+            reasons. sensors: drawn ones.
         no_diagnosis: why the filter has no diagnosis, or None.
         data_warning: how the data differ from the checkpoint's training data, or None.
         scene: layers of its 3D scene. live: present while the trace is of a live run.

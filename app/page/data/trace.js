@@ -401,12 +401,12 @@ export class Trace {
 }
 
 /**
- * Returns the bytes of one of the images of a sensor.
+ * Returns the bytes of one of the images of a sensor, or of its points: x and y as float32.
  * @param {Uint8Array} images
- * @param {{height: number, width: number, channels: number}} sensor
+ * @param {{height: number, width: number, channels: number, points: number}} sensor
  * @param {number} step
  */
-export function imageAt(images, { height, width, channels }, step) {
-  const size = height * width * channels;
+export function imageAt(images, { height, width, channels, points }, step) {
+  const size = points ? 8 * points : height * width * channels;
   return images.subarray(step * size, (step + 1) * size);
 }

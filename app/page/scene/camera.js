@@ -1,13 +1,18 @@
-/** The image of a sensor at a step, as the filter receives it: grey, RGB, or an array of numbers in colours. */
+/**
+ * A sensor at a step, as the filter receives it: an image, an array of numbers in colours, or the points of a scan or
+ * point cloud from above.
+ */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
 import { context2d, create, element, html } from '../core/dom.js';
-import { COLOUR_TABLES } from '../core/palette.js';
+import { COLOUR_TABLES, cssVariable } from '../core/palette.js';
 import { displayName, significant } from '../core/units.js';
 import { sensorImages } from '../data/api.js';
 import { imageAt } from '../data/trace.js';
+
+const TOP_VIEW = 480; // px, side of the view of points from above
 
 export class Camera {
   #figure;
@@ -41,14 +46,12 @@ export class Camera {
     this.#figure.hidden = !trace.images;
     const sensor = this.#sensor;
     if (!sensor) return;
-    const { name, height, width, low, high } = sensor;
+    const { name, points } = sensor;
+    const [width, height] = points ? [TOP_VIEW, TOP_VIEW] : [sensor.width, sensor.height];
     Object.assign(this.#context.canvas, { height, width });
+    this.#context.canvas.style.imageRendering = points ? 'auto' : '';
     html('div', this.#figure).style.aspectRatio = `${width} / ${height}`;
-    const range = low === null ? '' : `, ${significant(low)} to ${significant(high)}`;
-    html('figcaption', this.#figure).replaceChildren(
-      this.#picker(name),
-      `${width} × ${height}${range}`,
-    );
+    html('figcaption', this.#figure).replaceChildren(this.#picker(name), description(sensor));
     this.move(this.#store.state.step);
     if (name !== trace.header.sensors[0].name && !this.#images.has(name)) this.#load(trace, name);
   }
@@ -61,6 +64,10 @@ export class Camera {
     const isFirst = sensor === trace.header.sensors[0];
     const pixels = isFirst ? trace.image(step) : images && imageAt(images, sensor, step);
     if (!pixels?.length) return;
+    if (sensor.points) {
+      drawPoints(this.#context, pixels, sensor.high ?? 1);
+      return;
+    }
     const { width, height } = this.#context.canvas;
     const image = new ImageData(width, height);
     new Uint32Array(image.data.buffer).set(colours(pixels, sensor));
@@ -101,6 +108,61 @@ export class Camera {
     this.#images.set(name, new Uint8Array(buffer));
     this.move(this.#store.state.step);
   }
+}
+
+/**
+ * Returns the size of the images, or the number of points and the distance of the rings.
+ * @param {import('../types/server.js').DisplayedSensor} sensor
+ */
+function description({ width, height, low, high, points }) {
+  if (points) return `${points} points, rings ${significant(ringStep(high ?? 1))} m, x up`;
+  return `${width} × ${height}${low === null ? '' : `, ${significant(low)} to ${significant(high)}`}`;
+}
+
+/**
+ * Returns the distance of the rings around a sensor, at most three: 1, 2 or 5 times a power of ten.
+ * @param {number} extent m
+ */
+function ringStep(extent) {
+  const power = 10 ** Math.floor(Math.log10(extent / 3));
+  return power * ([1, 2, 5].find((step) => step * power >= extent / 3.5) ?? 10);
+}
+
+/**
+ * Draws points from above, around the sensor: x up, y to the left.
+ * @param {CanvasRenderingContext2D} context
+ * @param {Uint8Array} bytes x and y as float32
+ * @param {number} extent m, half the side of the view
+ */
+function drawPoints(context, bytes, extent) {
+  const { width } = context.canvas;
+  const [middle, scale] = [width / 2, width / 2 / extent];
+  const values = new Float32Array(bytes.slice().buffer);
+  context.clearRect(0, 0, width, width);
+  context.strokeStyle = cssVariable('--edge');
+  context.lineWidth = 1;
+  const step = ringStep(extent);
+  for (let radius = step; radius < extent; radius += step) {
+    context.beginPath();
+    context.arc(middle, middle, radius * scale, 0, 2 * Math.PI);
+    context.stroke();
+  }
+  context.fillStyle = cssVariable('--ink');
+  const size = values.length > 1000 ? 4 : 6;
+  for (let i = 0; i < values.length; i += 2)
+    if (Number.isFinite(values[i]))
+      context.fillRect(
+        middle - values[i + 1] * scale - size / 2,
+        middle - values[i] * scale - size / 2,
+        size,
+        size,
+      );
+  context.beginPath(); // the sensor, which faces up
+  context.moveTo(middle, middle - 10);
+  context.lineTo(middle - 6, middle + 6);
+  context.lineTo(middle + 6, middle + 6);
+  context.fillStyle = cssVariable('--accent');
+  context.fill();
 }
 
 /**

@@ -283,7 +283,11 @@ export interface components {
         };
         /**
          * DisplayedSensor
-         * @description A sensor that is drawn as an image. channels: 1, or 3 for RGB. low, high: range of an array of numbers.
+         * @description A sensor that is drawn.
+         *
+         *     Attributes:
+         *         channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point
+         *             cloud, whose extent is ``high`` in m; else 0.
          */
         DisplayedSensor: {
             /** Name */
@@ -298,6 +302,8 @@ export interface components {
             low: number | null;
             /** High */
             high: number | null;
+            /** Points */
+            points: number;
         };
         /**
          * EpisodeErrors
@@ -1812,7 +1818,7 @@ export interface components {
          *         weight_width: 0 for a filter without weights. settings: of the run.
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
-         *             reasons. sensors: those drawn as images.
+         *             reasons. sensors: drawn ones.
          *         no_diagnosis: why the filter has no diagnosis, or None.
          *         data_warning: how the data differ from the checkpoint's training data, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
