@@ -38,11 +38,16 @@ def open_filter(task: str | Task, text: str) -> Checkpoint:
 def open_filters(task: str | None, first: str, second: str) -> tuple[Checkpoint, Checkpoint]:
     """Two filters of one task. task: required for two names. Raises BadInput as ``open_filter``."""
     given = [load_task(task)] if task is not None and ":" in task else []
-    files = {text: load_checkpoint(Path(text), given) for text in (first, second) if is_path(text)}
-    if task is None and not files:
+    loaded: dict[str, Checkpoint] = {}
+    for text in (first, second):
+        if is_code(text):
+            loaded[text] = load_external(text, task or "")
+        elif is_path(text):
+            loaded[text] = load_checkpoint(Path(text), given)
+    if task is None and not loaded:
         raise BadInput(f"{first!r} and {second!r} are filter names and need a task, such as --task door")
-    target = task or next(iter(files.values())).task
-    before, after = (files.get(text) or open_filter(target, text) for text in (first, second))
+    target = task or next(iter(loaded.values())).task
+    before, after = (loaded.get(text) or open_filter(target, text) for text in (first, second))
     return before, after
 
 

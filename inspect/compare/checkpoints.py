@@ -1,4 +1,4 @@
-"""Comparison of two checkpoints over the same held-out episodes: improvements and regressions by slice."""
+"""Comparison of two filters over the same held-out episodes: improvements and regressions by slice."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice, standard_slices
 from beliefscope.inspect.compare.effects import LEVEL, Difference, Regression, differences, find_regressions
 from beliefscope.inspect.compare.lineage import base_of
@@ -135,26 +134,28 @@ class CheckpointComparison(Diagnostic):
                 tuple((*_numbers(d), *(_rounded(x) for x in (d.effect, d.low, d.high)), _outcome(d)) for d in beliefs),
             ),
             self.event_table(),
-            Table(
-                "Modules",
-                (
-                    "module",
-                    "class",
-                    "parameters",
-                    "gradient",
-                    "weights changed %",
-                    "output drift %",
-                    "frozen",
-                    "SHA-256",
-                ),
-                tuple(
-                    _module_row(m)
-                    for m in self.modules
-                    if m.name in self.frozen or (not m.unchanged and m.name.count(".") < DEPTH)
-                ),
-            ),
+            *([self.module_table()] if self.modules else []),
             slices,
         ]
+
+    def module_table(self) -> Table:
+        """One row per changed or outermost frozen module."""
+        columns = (
+            "module",
+            "class",
+            "parameters",
+            "gradient",
+            "weights changed %",
+            "output drift %",
+            "frozen",
+            "SHA-256",
+        )
+        rows = (
+            _module_row(m)
+            for m in self.modules
+            if m.name in self.frozen or (not m.unchanged and m.name.count(".") < DEPTH)
+        )
+        return Table("Modules", columns, tuple(rows))
 
     def event_table(self) -> Table:
         """One row per regressed event."""
@@ -212,9 +213,10 @@ def compare_checkpoints(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> CheckpointComparison:
-    """Compare two checkpoints of one task with equal modalities.
+    """Compare two filters of one task: checkpoints or external filters.
 
-    Both run with the same sensor faults and random numbers. Intervals are over episodes, paired between checkpoints.
+    Both run with the same sensor faults and random numbers. Intervals are over episodes, paired between filters.
+    An external filter uses only some modalities by ablation (``filters/external/ablation.py``).
 
     Args:
         episodes: indices in ``data``; by default the held-out episodes of a ``Dataset``, otherwise all.
@@ -223,12 +225,13 @@ def compare_checkpoints(
 
     Raises BadInput for checkpoints that cannot be compared, slices that do not fit, and as ``evaluate`` does.
     """
-    filters = _comparable(before, after)
-    task = before.task
+    if before.task.name != after.task.name:
+        raise BadInput(f"filters are of tasks {before.task.name!r} and {after.task.name!r}; give two of one task")
+    pair, task = (before, after), before.task
     for slice_ in slices:
-        for filter_ in filters:
-            slice_.check(task, filter_.names)
-    selected, left_out = _standard(filters, {slice_.name for slice_ in slices})
+        for filter_ in pair:
+            slice_.check(task, _models(filter_))
+    selected, left_out = _standard(pair, {slice_.name for slice_ in slices})
     selected += slices
     if episodes is None and isinstance(data, Dataset):
         episodes = data.held_out()
@@ -236,7 +239,7 @@ def compare_checkpoints(
         episodes = data if isinstance(data, Mapping) else range(len(data))
     indices = tuple(episodes)
     members = [data[index] for index in indices]
-    sums = sum_episodes(filters, selected, members, particles=particles, seed=seed, progress=progress)
+    sums = sum_episodes(pair, selected, members, particles=particles, seed=seed, progress=progress)
     counts = sums.sums[:, 0, :, 0]
     finetuned = base_of(after.record).get("hash") == before.hash
     return CheckpointComparison(
@@ -257,36 +260,34 @@ def compare_checkpoints(
         calibration=calibration(sums.sums.sum(0)).swapaxes(0, 1),
         error_shown=task.main_error.shown,
         events=find_regressions(sums, selected, indices, members, task),
-        modules=module_changes(
-            *filters, sample_steps(members, task, OUTPUT_STEPS), after.record.get("parts") if finetuned else None
+        modules=()
+        if any(isinstance(filter_, ExternalFilter) for filter_ in pair)
+        else module_changes(
+            before.filter,
+            after.filter,
+            sample_steps(members, task, OUTPUT_STEPS),
+            after.record.get("parts") if finetuned else None,
         ),
     )
 
 
-def _comparable(before: Checkpoint, after: Checkpoint) -> tuple[Filter, Filter]:
-    for checkpoint in (before, after):
-        if isinstance(checkpoint, ExternalFilter):
-            raise BadInput(f"{checkpoint.source} is an external filter; only checkpoints can be compared")
-    if before.task.name != after.task.name:
-        raise BadInput(f"checkpoints are of tasks {before.task.name!r} and {after.task.name!r}; give two of one task")
-    if set(before.filter.names) != set(after.filter.names):
-        a, b = (", ".join(checkpoint.filter.names) for checkpoint in (before, after))
-        raise BadInput(f"checkpoints have modalities {a} and {b}; give two of the same modalities")
-    return before.filter, after.filter
+def _models(checkpoint: Checkpoint) -> tuple[str, ...]:
+    """Measurement models that can be used alone."""
+    return tuple(checkpoint.task.modalities) if isinstance(checkpoint, ExternalFilter) else checkpoint.filter.names
 
 
-def _standard(filters: Sequence[Filter], without: set[str]) -> tuple[list[Slice], tuple[str, ...]]:
+def _standard(pair: Sequence[Checkpoint], without: set[str]) -> tuple[list[Slice], tuple[str, ...]]:
     """Standard slices that fit the filters except those named, and the reasons why others do not fit."""
     selected, left_out = list[Slice](), list[str]()
-    for slice_ in standard_slices(filters[0].task):
+    for slice_ in standard_slices(pair[0].task):
         try:
-            for filter_ in filters:
-                slice_.check(filter_.task, filter_.names)
+            for filter_ in pair:
+                slice_.check(filter_.task, _models(filter_))
         except BadInput as error:
             left_out.append(f"{slice_.name}: {error}")
             continue
         # For a filter of one modality, using only that modality changes nothing.
-        if slice_.name not in without and not (slice_.only and len(filters[0].names) == 1):
+        if slice_.name not in without and not (slice_.only and len(_models(pair[0])) == 1):
             selected.append(slice_)
     return selected, tuple(left_out)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,12 +14,18 @@ from torch import Tensor
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
+from beliefscope.filters.belief import Evidence
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.filters.external.ablation import without
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.statistics.calibration import LEVELS, gaussian_level
-from beliefscope.inspect.statistics.measures import Array, wrapped
+from beliefscope.inspect.statistics.measures import Array
+
+Progress = Callable[[float], None] | None
 
 SMALLEST = 1e-9
 """m, rad: lower limit of errors before taking the logarithm."""
@@ -116,7 +123,7 @@ def _mean(sums: Array, column: int) -> Array:
 
 @torch.no_grad()
 def sum_episodes(
-    filters: Sequence[Filter],
+    filters: Sequence[Checkpoint],
     slices: Sequence[Slice],
     episodes: Sequence[Episode],
     *,
@@ -141,26 +148,16 @@ def sum_episodes(
         by_length.setdefault(len(episode), []).append(number)
     total, done = len(distance) * len(filters) * len(episodes), 0
     for faults, fault_slices in by_faults.items():
-        steps = Steps.from_episodes(task, slices[fault_slices[0]].apply_faults(episodes, seed))
+        faulty = slices[fault_slices[0]].apply_faults(episodes, seed)
+        steps = Steps.from_episodes(task, faulty)
         for length, members in sorted(by_length.items()):
             batch, first = steps.windows(steps.first[members], length), task.first_counted(length)
             for f, filter_ in enumerate(filters):
-                evidence = filter_.encode(batch)
+                run = _runner(filter_, [faulty[number] for number in members], batch, particles, seed)
                 for only in dict.fromkeys(slices[s].only for s in fault_slices):
                     run_slices = [s for s in fault_slices if slices[s].only == only]
-                    estimate = rollout(
-                        filter_,
-                        slices[run_slices[0]].select_evidence(evidence, filter_.names),
-                        first_belief(filter_, batch),
-                        torch.Generator().manual_seed(seed),
-                        particles,
-                        progress=_scaled_progress(progress, done, len(members), total),
-                    ).estimate
-                    columns = _columns(
-                        task,
-                        filter_.statistics.state_to_si(estimate.mean) - batch.states,
-                        filter_.statistics.covariance_to_si(estimate.covariance),
-                    )
+                    share = _scaled_progress(progress, done, len(members), total)
+                    columns = _columns(task, *run(slices[run_slices[0]], share))
                     for s in run_slices:
                         sums[members, f, s] = _sum_steps(columns[first:], slices[s].mask(batch)[first:])
                     for i, number in enumerate(members):
@@ -169,15 +166,65 @@ def sum_episodes(
     return EpisodeSums(sums, distance)
 
 
+def _runner(
+    checkpoint: Checkpoint, episodes: Sequence[Episode], batch: Batch, particles: int, seed: int
+) -> Callable[[Slice, Progress], tuple[Array, Tensor]]:
+    """Runs a filter with the modalities of a slice: errors (T, N, n) and covariances (T, N, n, n), SI units."""
+    if isinstance(checkpoint, ExternalFilter):
+        return partial(_run_external, checkpoint, episodes, batch, seed)
+    return partial(_run, checkpoint.filter, checkpoint.filter.encode(batch), batch, particles, seed)
+
+
+def _run(
+    filter_: Filter,
+    evidence: Evidence,
+    batch: Batch,
+    particles: int,
+    seed: int,
+    slice_: Slice,
+    progress: Progress,
+) -> tuple[Array, Tensor]:
+    estimate = rollout(
+        filter_,
+        slice_.select_evidence(evidence, filter_.names),
+        first_belief(filter_, batch),
+        torch.Generator().manual_seed(seed),
+        particles,
+        progress=progress,
+    ).estimate
+    mean = filter_.statistics.state_to_si(estimate.mean)
+    return _errors(filter_.task, mean, batch), filter_.statistics.covariance_to_si(estimate.covariance)
+
+
+def _run_external(
+    external: ExternalFilter,
+    episodes: Sequence[Episode],
+    batch: Batch,
+    seed: int,
+    slice_: Slice,
+    progress: Progress,
+) -> tuple[Array, Tensor]:
+    absent = [name for name in external.task.modalities if slice_.only and name not in slice_.only]
+    seen = [without(episode, absent, external.adapter.absent) for episode in episodes]
+    values, _ = external.run(seen, seed, progress)
+    mean = values["estimate_mean"]
+    covariance = values.get("estimate_covariance", torch.full((*mean.shape, mean.shape[-1]), torch.nan))
+    return _errors(external.task, mean, batch), covariance
+
+
+def _errors(task: Task, mean: Tensor, batch: Batch) -> Array:
+    return np.asarray(task.difference(mean.numpy(), batch.states.numpy()), dtype=np.float64)
+
+
 def sample_steps(episodes: Sequence[Episode], task: Task, count: int) -> Batch:
     """Up to ``count`` single steps (T = 1), evenly spaced over all episodes."""
     steps = Steps.from_episodes(task, episodes)
     return steps.windows(torch.linspace(0, len(steps.states) - 1, min(count, len(steps.states))).long().unique(), 1)
 
 
-def _columns(task: Task, error: Tensor, covariance: Tensor) -> Array:
-    """(T, N, Q): columns that ``EpisodeSums.sums`` adds up. error: (T, N, n), covariance: (T, N, n, n); SI units."""
-    e, n = wrapped(task, error.numpy()), len(task.components)
+def _columns(task: Task, e: Array, covariance: Tensor) -> Array:
+    """(T, N, Q): columns that ``EpisodeSums.sums`` adds up. e: errors (T, N, n), covariance: (T, N, n, n); SI units."""
+    n = len(task.components)
     s = with_floor(covariance.double().numpy())
     squared = (e * np.linalg.solve(s, e[..., None])[..., 0]).sum(-1)
     with np.errstate(invalid="ignore"):  # filter without a covariance
@@ -193,7 +240,5 @@ def _sum_steps(columns: Array, mask: Tensor) -> Array:
     return np.where(mask.numpy()[..., None], columns, 0.0).sum(0)
 
 
-def _scaled_progress(
-    progress: Callable[[float], None] | None, done: int, size: int, total: int
-) -> Callable[[float], None] | None:
+def _scaled_progress(progress: Progress, done: int, size: int, total: int) -> Progress:
     return None if progress is None else lambda share: progress((done + share * size) / total)

@@ -9,7 +9,10 @@ from beliefscope.recordings.report.command_lines import serve_command
 
 
 @opt.with_options(
-    before=opt.argument("BEFORE", "Path of a .safetensors file, or name of a built-in filter such as crossmodal-ekf."),
+    before=opt.argument(
+        "BEFORE",
+        "Path of a .safetensors file, name of a built-in filter such as crossmodal-ekf, or path/to/file.py:build.",
+    ),
     after=opt.argument("AFTER", "As BEFORE."),
     every=opt.flag("Compare on all episodes, not only the held-out ones.", "--all"),
     task=opt.option("TASK", "Task of both filters. Required for two names."),
@@ -27,18 +30,19 @@ def change(
     seed: int = 0,
     output: Path | None = None,
 ) -> console.Result:
-    """Report improvements and regressions between checkpoints.
+    """Report improvements and regressions between filters.
 
-    Runs both checkpoints over the held-out episodes with the same sensor faults and random numbers. Reports every
+    Runs both filters over the held-out episodes with the same sensor faults and random numbers. Reports every
     error and covariance measure before and after, by data slice: clean, contact, free motion, 80 % image blackout,
     each modality only, and the slices given; with 95 % intervals over episodes. A difference counts as
     improved or regressed if it is at least 2 % and its interval excludes zero. Also lists the events with the largest
-    increase in error, and the change of each module.
+    increase in error, and the change of each module of checkpoints.
 
     \b
     Examples:
       beliefscope change crossmodal-ekf finetuned.safetensors
       beliefscope change unimodal-ekf crossmodal-ekf --task push
+      beliefscope change crossmodal-ekf my_filter.py:build --task door
       beliefscope change base.safetensors finetuned.safetensors --data door.h5 -o report
       beliefscope change crossmodal-pf finetuned.safetensors --slice blackout-in-contact:faults=blackout=1:contact=yes
     """

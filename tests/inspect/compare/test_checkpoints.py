@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
+from beliefscope.filters.external.load import load_external
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
@@ -36,6 +38,7 @@ pytestmark = pytest.mark.slow
 EPISODES = (9, 19, 29, 39, 49, 109, 129, 141)
 """Held-out episodes: from step 30 to 40, five have steps with contact and five without, enough for intervals."""
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 EKF = load_checkpoint(shipped("door", "crossmodal-ekf"))
 PF = load_checkpoint(shipped("door", "crossmodal-pf"))
 
@@ -240,6 +243,27 @@ def test_filter_without_covariance_is_compared_by_errors(data: Dataset) -> None:
     assert {d.measure for d in result.differences} == {"position", "hinge_x", "hinge_y", "angle"}
     assert any("image only" in line for line in result.left_out)
     json.dumps(result.views(), allow_nan=False)
+
+
+def test_external_filters_are_compared(data: Dataset) -> None:
+    """The errors are those of ``evaluate``; a modality that is used alone replaces the readings of the others."""
+    own = load_external(f"{EXAMPLES / '04_own_filter.py'}:build", "door")
+    episodes = [episode_of(data, i, 60) for i in EPISODES]
+    result = compare_checkpoints(own, EKF, episodes)
+    by_slice = {(d.slice, d.measure): d for d in result.differences}
+    for i, checkpoint in enumerate((own, EKF.filter)):
+        metrics = evaluate(checkpoint, episodes)
+        assert by_slice["clean", "position"].display[i] == pytest.approx(metrics.rmse["position_cm"], rel=1e-4)
+        assert by_slice["clean", "angle"].display[i] == pytest.approx(metrics.rmse["angle_deg"], rel=1e-4)
+    # The example does not use the image.
+    haptics, clean = by_slice["haptics only", "position"], by_slice["clean", "position"]
+    assert haptics.display[0] == clean.display[0]
+    assert haptics.display[1] > clean.display[1]
+    assert by_slice["image only", "position"].display[0] > clean.display[0]
+    assert not result.modules
+    assert "Modules" not in {table.title for table in result.tables()}
+    itself = compare_checkpoints(own, own, episodes[:5])
+    assert "identical" in itself.verdict
 
 
 def test_incomparable_checkpoints_are_refused(data: Dataset) -> None:
