@@ -23,6 +23,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.external.load import load_external
 from beliefscope.filters.names import is_path
 from beliefscope.inspect.diagnostics.healthy_profile import has_profile
 
@@ -31,6 +32,9 @@ SAMPLE = "sample"
 
 PRETRAINED = frozenset(name for task in TASKS.values() for name in filters_of(task))
 """Names of the pretrained filters of all tasks."""
+
+EXTERNAL = {"door": {"hand-on-arc": "beliefscope.filters.external.hand_on_arc:build"}}
+"""Task -> included external filters: name -> source."""
 
 DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 """The first of these that is pretrained for a task is listed first."""
@@ -57,6 +61,8 @@ class TaskCatalog:
                 with suppress(BadInput):  # no pretrained checkpoint ships
                     self.paths[name] = shipped(self.task, name)
                     filters[name] = _included(self.paths[name])
+        for name, source in EXTERNAL.get(self.task.name, {}).items():
+            filters.setdefault(name, _external(source, self.task))
         return filters
 
     @cached_property
@@ -137,6 +143,7 @@ class TaskCatalog:
 # Included files do not change: the catalogs of a process share them.
 _included = cache(load_checkpoint)
 _sample = cache(open_dataset)
+_external = cache(load_external)
 
 
 def task_catalogs(

@@ -51,6 +51,11 @@ EXAMPLES = (
         "?task=push&filter=crossmodal-pf&step=40&faults=force_bias%3Ax%3D8&tab=diagnosis",
     ),
     Example(
+        "External filter",
+        "A Kalman filter in plain PyTorch from outside the project, without a camera, beside the included one.",
+        "?task=door&filter=hand-on-arc&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
+    ),
+    Example(
         "40 % image blackout",
         "Random single images are black, the fault of the paper.",
         "?task=door&filter=crossmodal-pf&step=25&faults=blackout%3D0.4&weights=effective",

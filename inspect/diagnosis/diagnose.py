@@ -176,7 +176,7 @@ def preliminary(checkpoint: Checkpoint, trace: Trace, particles: int = 300, alar
     """
     setting = Setting(checkpoint, {trace.episode_index: trace.episode}, particles, frozenset({trace.episode_index}))
     case = examine(setting, [trace], required_profile(checkpoint), alarm_rate)
-    return _conclude(case, case, explain_all(case), {}) if case.alarms else _healthy(case)
+    return _conclude(case, case, explain_all(case), None) if case.alarms else _healthy(case)
 
 
 def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
@@ -270,14 +270,15 @@ def _healthy(case: Case) -> Diagnosis:
 
 
 def _conclude(
-    case: Case, affected: Case, explanations: Mapping[str, Explanation], effects: Mapping[str, Effect]
+    case: Case, affected: Case, explanations: Mapping[str, Explanation], effects: Mapping[str, Effect] | None
 ) -> Diagnosis:
+    """effects: None before any cause is undone; whether the filter is affected is then unknown."""
     by_name = {cause.name: cause for cause in CAUSES}
     ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
-    candidates = tuple(_candidate(affected, by_name[name], p, effects.get(name)) for name, p in ranked)
+    candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    masked = not _visible(case, effects.get(candidates[0].cause.name) if sure else None)
+    masked = effects is not None and not _visible(case, effects.get(candidates[0].cause.name) if sure else None)
     headline = _headline(affected, candidates, masked, len(case.rows))
     return Diagnosis(state, masked, headline, candidates, _provenance(case))
 

@@ -125,6 +125,7 @@ export class Page {
       store.set({ step, playing: false }, { origin: 'rerun' }),
     );
     this.diagnosis = new Diagnosis(html('#diagnosis'), catalog, store, this.jobs, this.timeline);
+    this.diagnosis.confirmed = (trace, result) => this.finding.confirm(trace, result);
     this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
     this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new ComparisonTab(

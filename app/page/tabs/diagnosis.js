@@ -42,6 +42,8 @@ export class Diagnosis {
   #open = false;
   /** @type {Result | null | undefined} */
   #listed; // result whose causes are listed
+  /** Called with the confirmed diagnosis of the displayed episode. @type {(trace: Trace, result: Result) => void} */
+  confirmed = () => {};
 
   /**
    * @param {HTMLElement} host
@@ -115,6 +117,8 @@ export class Diagnosis {
     const set = (/** @type {string} */ value) => this.#store.set({ over: value });
     choice(html('.choice', this.#host), OVER, over, set);
     const result = entry.state === 'ready' ? entry.result : entry.preliminary;
+    if (this.#trace && entry.state === 'ready' && over === 'episode')
+      this.confirmed(this.#trace, entry.result);
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? (result.masked ? 'masked' : result.state) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');

@@ -75,7 +75,12 @@ export class FinetuneRuns {
    * @param {FineTuneDetails | null} current
    */
   #row(run, name, current) {
-    const { job, success, settings, saved_as: place } = run;
+    const {
+      job,
+      success,
+      settings,
+      saved_as: place,
+    } = run.run === current?.run ? { ...run, job: current.job } : run; // the list is older
     const link = create('button', { type: 'button', className: 'title', textContent: name });
     link.addEventListener('click', () => this.#store.set({ run: run.run }));
     const [target, ...others] = success?.slices ?? [];

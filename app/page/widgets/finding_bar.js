@@ -17,6 +17,8 @@ export class FindingBar {
   #loading = new AbortController();
   /** @type {number | null} */
   #step = null;
+  /** @type {Trace | null} */
+  #trace = null;
 
   /**
    * @param {HTMLElement} host
@@ -38,6 +40,7 @@ export class FindingBar {
   async show(trace) {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
+    this.#trace = trace;
     this.#host.classList.toggle('stale', !trace);
     if (!trace) return;
     this.#draw(trace, null);
@@ -47,6 +50,17 @@ export class FindingBar {
     const reply = await api.diagnosis(trace.selection, 'episode', signal).catch(() => null);
     const result = reply && 'job' in reply ? reply.preliminary : reply;
     if (result && !signal.aborted) this.#draw(trace, result);
+  }
+
+  /**
+   * Shows the confirmed diagnosis of the displayed run.
+   * @param {Trace} trace
+   * @param {Diagnosis} diagnosis
+   */
+  confirm(trace, diagnosis) {
+    if (trace !== this.#trace) return;
+    this.#loading.abort(); // the preliminary one
+    this.#draw(trace, diagnosis);
   }
 
   /**
