@@ -52,7 +52,7 @@ EXAMPLES = (
     ),
     Example(
         "External filter",
-        "A Kalman filter in plain PyTorch from outside the project, without a camera, beside the included one.",
+        "A Kalman filter in plain PyTorch that uses no camera, compared with an included filter.",
         "?task=door&filter=hand-on-arc&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
     ),
     Example(
