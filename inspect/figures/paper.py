@@ -51,7 +51,7 @@ def middle_of_longest(mask: NDArray[np.bool_]) -> int | None:
 
 
 def steps_by_contact(trace: Trace, selection: Sequence[int] = ()) -> dict[bool, int]:
-    """A step in free motion, if any, and a step in contact.
+    """A step in free motion, if any, and a step in contact; one step, as if in free motion, of a task without contact.
 
     Steps that are not in ``selection`` are the middle of the longest interval after the warm-up steps, or of the whole
     episode if there is none.
@@ -59,16 +59,18 @@ def steps_by_contact(trace: Trace, selection: Sequence[int] = ()) -> dict[bool, 
     Raises:
         BadInput: a selected step is not in the episode, two are in the same state, or the episode has no contact.
     """
-    contact = trace.episode.contact.astype(bool)
+    with_contact = "contact" in trace.task.covariates
+    contact = trace.episode.contact.astype(bool) & with_contact
     steps: dict[bool, int] = {}
     for step in selection:
         if not 0 <= step < len(trace):
             raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(trace) - 1}")
         state = bool(contact[step])
         if state in steps:
-            raise BadInput(f"steps {steps[state]} and {step} are both in {STATES[state]!r}: select one per state")
+            where = f"are both in {STATES[state]!r}: select one per state" if with_contact else "are two: select one"
+            raise BadInput(f"steps {steps[state]} and {step} {where}")
         steps[state] = step
-    if not contact.any():
+    if with_contact and not contact.any():
         raise BadInput(f"episode {trace.episode_index} has no contact: select another one with --episode")
     for state in STATES:
         mask = contact == state
@@ -80,12 +82,14 @@ def steps_by_contact(trace: Trace, selection: Sequence[int] = ()) -> dict[bool, 
 
 
 def panels(task: Task, modalities: Sequence[str], steps: dict[bool, int]) -> list[Panel]:
-    """Panels of the figure: images have one map, in contact; other modalities have one map per contact state."""
+    """Panels of the figure: images have one map, in contact if there is any; others have one per contact state."""
     layout = []
     for modality in modalities:
         keys = task.modalities.get(modality, ())
         is_image = bool(keys) and all(len(task.observations[key]) > 1 for key in keys)
-        layout += [Panel(modality, step, state) for state, step in steps.items() if state or not is_image]
+        layout += [
+            Panel(modality, step, state) for state, step in steps.items() if state or not is_image or True not in steps
+        ]
     return layout
 
 
@@ -96,7 +100,7 @@ def maps_figure(
     size: int = FINE,
     quantity: Quantity | None = None,
 ) -> Figure:
-    """Maps of each modality relative to their maxima, centred on the true position.
+    """Maps of each modality relative to their maxima, centred on the true position; of one component, curves.
 
     Haptics maps in contact show the direction of the ridge that the task expects, and the end effector. Raises BadInput
     if the filter has no maps, or not those of the quantity.
@@ -108,8 +112,6 @@ def maps_figure(
     engine = MapEngine(checkpoint, trace)
     quantity = quantity or engine.quantities[0]
     maps = {state: engine.map(step, size=size, quantity=quantity) for state, step in steps.items()}
-    if len(checkpoint.task.map_components) == 1:
-        raise BadInput(f"the maps of task {checkpoint.task.name!r} are curves over one component: see its reports")
     titles = [title for title, _ in axis_titles(checkpoint.task, checkpoint.task.map_indices)]
     layout = panels(checkpoint.task, trace.modalities, steps)
     if not layout:
@@ -124,22 +126,26 @@ def maps_figure(
         for i, (axes, panel) in enumerate(zip(grid.flat, layout, strict=False)):
             image = _draw_map(axes, checkpoint.task, trace, panel, maps[panel.contact])
             letter = f"({chr(ord('a') + i)}) " if len(layout) > 1 else ""
-            axes.set_title(
-                f"{letter}{panel.modality} {quantity}\n{STATES[panel.contact]}, step {panel.step}", fontsize=7.5
-            )
+            state = f"{STATES[panel.contact]}, " if "contact" in checkpoint.task.covariates else ""
+            axes.set_title(f"{letter}{panel.modality} {quantity}\n{state}step {panel.step}", fontsize=7.5)
             if i + columns >= len(layout):
                 axes.set_xlabel(titles[0])
                 axes.tick_params(labelbottom=True)
             if i % columns == 0:
-                axes.set_ylabel(titles[1])
+                axes.set_ylabel(f"{quantity} / maximum" if image is None else titles[1])
         for axes in grid.flat[len(layout) :]:
             axes.set_visible(False)
-        figure.colorbar(image, ax=list(grid.flat), label=f"{quantity} / maximum", shrink=0.8, aspect=25)
+        if image is not None:
+            figure.colorbar(image, ax=list(grid.flat), label=f"{quantity} / maximum", shrink=0.8, aspect=25)
     return figure
 
 
-def _draw_map(axes: Axes, task: Task, trace: Trace, panel: Panel, map_: LikelihoodMap) -> AxesImage:
+def _draw_map(axes: Axes, task: Task, trace: Trace, panel: Panel, map_: LikelihoodMap) -> AxesImage | None:
+    """Draw a map; None for a curve."""
     log = map_.log_likelihood[map_.layers.index(panel.modality)]
+    if len(task.map_components) == 1:
+        _draw_curve(axes, task, trace, map_, log[0], colour(panel.modality, trace.modalities))
+        return None
     half_x, half_y = (
         factor * half
         for (_, factor), half in zip(axis_titles(task, task.map_indices), plane_of(trace).half_widths, strict=True)
@@ -162,6 +168,15 @@ def _draw_map(axes: Axes, task: Task, trace: Trace, panel: Panel, map_: Likeliho
     _draw_crosshairs(axes, half_x, half_y)
     axes.set(xlim=(-half_x, half_x), ylim=(-half_y, half_y))
     return image
+
+
+def _draw_curve(axes: Axes, task: Task, trace: Trace, map_: LikelihoodMap, log: NDArray[Any], shade: str) -> None:
+    """Draw a map (S,) of one component, with a line at the true value."""
+    ((_, factor), *_) = axis_titles(task, task.map_indices)
+    half = factor * plane_of(trace).half_widths[0]
+    axes.plot(factor * map_.offsets_x, np.exp(log - log.max()), color=shade, lw=1.3)
+    axes.axvline(0.0, color=COLOURS["truth"], lw=0.9, ls="--")
+    axes.set(xlim=(-half, half), ylim=(0.0, 1.05))
 
 
 EDGE = [patheffects.withStroke(linewidth=2.0, foreground="black")]

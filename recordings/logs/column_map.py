@@ -13,14 +13,19 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.errors import BadInput, check_name
-from beliefscope.datasets.task import DISPLAY_UNITS
+from beliefscope.datasets.task import DISPLAY_UNITS, Component, rotation
 
 QUATERNION = "quaternion_yaw"
 """Unit of a component whose column is a quaternion (x, y, z, w): the angle about z, in rad."""
 
-UNITS = {"mm": ("m", 1e-3), QUATERNION: ("rad", 1.0)} | {
-    shown: (unit, 1.0 / factor) for unit, (shown, factor) in DISPLAY_UNITS.items()
-}
+ROTATIONS = {"quaternion": (3, 0, 1, 2), "quaternion_wxyz": (0, 1, 2, 3)}
+"""Unit of a rotation in space, whose column is a quaternion of any norm -> where its w, x, y and z are."""
+
+UNITS = (
+    {"mm": ("m", 1e-3)}
+    | dict.fromkeys((QUATERNION, *ROTATIONS), ("rad", 1.0))
+    | {shown: (unit, 1.0 / factor) for unit, (shown, factor) in DISPLAY_UNITS.items()}
+)
 """Unit of a column -> internal unit, and its factor. Others are internal units."""
 
 ELEMENTS = re.compile(r"(.*)\[(\d{1,9}(?:,\d{1,9})*)\]")
@@ -48,6 +53,11 @@ class StateColumn:
 
     column: References
     unit: str = "m"
+
+    @property
+    def size(self) -> int:
+        """Number of state components: 3 for a rotation."""
+        return 3 if self.unit in ROTATIONS else 1
 
     @property
     def internal(self) -> tuple[str, float]:
@@ -95,7 +105,16 @@ class ColumnMap:
     @property
     def factors(self) -> np.ndarray:
         """(n,) internal units per unit of each component's column."""
-        return np.array([component.internal[1] for component in self.state.values()])
+        return np.array([entry.internal[1] for entry in self.state.values() for _ in range(entry.size)])
+
+    @property
+    def components(self) -> tuple[Component, ...]:
+        """The n state components."""
+        parts = [
+            rotation(name) if entry.size > 1 else (Component(name, entry.internal[0]),)
+            for name, entry in self.state.items()
+        ]
+        return tuple(component for part in parts for component in part)
 
     @property
     def truth(self) -> set[str]:
@@ -164,8 +183,9 @@ def _component(name: str, value: Any) -> StateColumn:
     column, unit = settings["column"], settings.get("unit", "m")
     if not isinstance(unit, str):
         raise BadInput(f"unit of state {name!r} is {unit!r:.100}, expected a text such as m, cm, rad, deg or m/s")
-    if not isinstance(column, str) and not (unit == QUATERNION and _texts(column) and len(column) == 4):
-        raise BadInput(f"column of state {name!r} is {column!r:.100}, expected a name, or four of a {QUATERNION}")
+    quaternions = (QUATERNION, *ROTATIONS)
+    if not isinstance(column, str) and not (unit in quaternions and _texts(column) and len(column) == 4):
+        raise BadInput(f"column of state {name!r} is {column!r:.100}, expected a name, or four of a quaternion")
     return StateColumn(column, unit)
 
 

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.episode import Episode, time_error
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Component, Task, display_name
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.recordings.logs.arrays import Columns
-from beliefscope.recordings.logs.column_map import QUATERNION, ColumnMap, CovariateColumn, References, StateColumn
+from beliefscope.recordings.logs.column_map import (
+    QUATERNION,
+    ROTATIONS,
+    ColumnMap,
+    CovariateColumn,
+    References,
+    StateColumn,
+)
 from beliefscope.recordings.logs.columns import column, joined
 from beliefscope.recordings.logs.messages import CLOCK
 
@@ -91,7 +100,7 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
     """
     if not {"mean", "particles"} & set(mapping.estimate):
         raise BadInput("the map has no estimate: add [estimate] with mean or particles, or write a data set (.h5)")
-    rows, n, episode = sum(map(len, episodes)), len(mapping.state), episodes[index]
+    rows, n, episode = sum(map(len, episodes)), len(mapping.components), episodes[index]
     at = list(_episodes(columns, mapping, rows).values())[index]
     estimate = _estimate(columns, mapping)
     for name, array in estimate.items():
@@ -118,12 +127,12 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
 
 def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
     """(T, ...) values of the recorded estimate by the names of a trace, SI units."""
-    estimate, factors, n = mapping.estimate, mapping.factors, len(mapping.state)
+    estimate, factors, n = mapping.estimate, mapping.factors, len(mapping.components)
     values: dict[str, Array] = {}
     if "mean" in estimate:
         mean = _mean(columns, estimate["mean"], [*mapping.state.values()])
         if mean.shape[1] != n:
-            raise BadInput(f"mean of [estimate] has {mean.shape[1]} columns, expected {n}: {', '.join(mapping.state)}")
+            raise BadInput(f"mean of [estimate] has {mean.shape[1]} columns, expected {n}: {_names(mapping)}")
         values["estimate_mean"] = mean * factors
     if "covariance" in estimate:
         covariance = joined(columns, estimate["covariance"], "estimate")
@@ -133,7 +142,7 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
     elif "std" in estimate:
         std = joined(columns, estimate["std"], "estimate")
         if std.shape[1] != n:
-            raise BadInput(f"std of [estimate] has {std.shape[1]} columns, expected {n}: {', '.join(mapping.state)}")
+            raise BadInput(f"std of [estimate] has {std.shape[1]} columns, expected {n}: {_names(mapping)}")
         values["estimate_covariance"] = np.square(std * factors)[:, :, None] * np.eye(n)
     if "particles" in estimate:
         values["particles"] = _particles(columns, estimate["particles"], n) * factors
@@ -145,8 +154,13 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
     return values
 
 
+def _names(mapping: ColumnMap) -> str:
+    return ", ".join(component.name for component in mapping.components)
+
+
 def _mean(columns: Columns, references: References, state: list[StateColumn]) -> Array:
     """(T, d) means in the units of the state; quaternions as angles."""
+    references = [references] if isinstance(references, str) and len(state) == 1 else references
     if isinstance(references, str) or len(references) != len(state):
         return joined(columns, references, "estimate")
     pairs = zip(references, state, strict=True)
@@ -166,8 +180,15 @@ def _particles(columns: Columns, references: References, n: int) -> Array:
 
 
 def _scalar(columns: Columns, references: References, unit: str, purpose: str) -> Array:
-    """(T, d) values of columns; (T, 1) of a quaternion (x, y, z, w) of any norm: its angle about z, rad."""
+    """(T, d) values of columns; of a quaternion of any norm, its angle about z (T, 1) or its vector (T, 3), rad."""
     values = joined(columns, references, purpose)
+    if unit in ROTATIONS:
+        if values.shape[1] != 4:
+            raise BadInput(f"{purpose} has a quaternion of {values.shape[1]} columns, expected 4")
+        norm = np.linalg.norm(values, axis=1, keepdims=True)
+        if len(zero := np.flatnonzero(norm == 0.0)):
+            raise BadInput(f"{purpose} has a quaternion of norm 0 in row {zero[0]}")
+        return rotations.to_vector((values / norm)[:, ROTATIONS[unit]])
     if unit != QUATERNION or values.shape[1] != 4:
         return values
     x, y, z, w = values.T
@@ -185,11 +206,11 @@ def _states(columns: Columns, mapping: ColumnMap) -> Array:
     known = {name: _scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column}
     count = len(next(iter((known or columns).values())))
     for name, part in known.items():
-        if part.shape != (count, 1):
+        if part.shape != (expected := (count, mapping.state[name].size)):
             reference = mapping.state[name].column
-            raise BadInput(f"state {name!r} has column {reference!r} of shape {part.shape}, expected ({count}, 1)")
-    missing = np.full((count, 1), np.nan)
-    return np.concatenate([known.get(name, missing) for name in mapping.state], axis=1) * mapping.factors
+            raise BadInput(f"state {name!r} has column {reference!r} of shape {part.shape}, expected {expected}")
+    parts = [known.get(name, np.full((count, entry.size), np.nan)) for name, entry in mapping.state.items()]
+    return np.concatenate(parts, axis=1) * mapping.factors
 
 
 def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray[Any]:
@@ -284,19 +305,19 @@ def _task(
     covariates: dict[str, Covariate],
     periods: dict[str, float],
 ) -> Task:
-    names, units = list(mapping.state), [s.internal[0] for s in mapping.state.values()]
+    units = [component.unit for component in mapping.components]
     spans = np.ptp(np.nan_to_num(states), axis=0)
     large = max((span for span, unit in zip(spans, units, strict=True) if unit == "m"), default=0.0) > LARGE
-    shown = [("m", 1.0) if unit == "m" and large else None for unit in units]
+    shown = [replace(c, display=("m", 1.0)) if c.unit == "m" and large else c for c in mapping.components]
     extent = max(span for span, unit in zip(spans[:2], units, strict=False) if unit == units[0]) / 2.0
     task = Task(
         name=mapping.task,
-        components=tuple(Component(*c[:2], display=c[2]) for c in zip(names, units, shown, strict=True)),
+        components=tuple(shown),
         observations={name: array.shape[1:] for name, array in sensors.items()},
         modalities={name: (name,) for name in sensors},
         control_size=controls,
         dt=dt,
-        map_components=tuple(names[:2]),
+        map_components=tuple(component.name for component in shown[:2]),
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
         periods=periods,

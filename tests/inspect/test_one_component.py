@@ -24,6 +24,7 @@ from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.failures.events import find_failures
 from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of
+from beliefscope.inspect.figures.paper import maps_figure, steps_by_contact
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
@@ -115,6 +116,16 @@ def test_nees_and_covariance_are_those_of_the_riccati_equation(runs: list[Trace]
     nees = np.concatenate([measures.nees(run)[20:, -1] for run in runs])
     deviation = np.sqrt(2.0 / len(nees)) * 2.0  # of a chi-squared mean; 2 for its correlation over steps
     assert nees.mean() == pytest.approx(1.0, abs=4.0 * deviation)
+
+
+def test_the_figure_of_maps_has_curves(runs: list[Trace]) -> None:
+    figure = maps_figure(checkpoint(task()), runs[0], steps_by_contact(runs[0], [50]), size=101, quantity="posterior")
+    (axes,) = figure.axes
+    curve = axes.lines[0].get_xydata()
+    expected = runs[0].estimate_mean[50, 0] - runs[0].episode.states[50, 0]
+    assert curve[curve[:, 1].argmax(), 0] == pytest.approx(expected, abs=4.0 / 101)
+    assert axes.get_xlabel() == "temperature offset (K)"
+    assert axes.get_title() == "thermometer posterior\nstep 50"
 
 
 def test_the_map_is_the_density_over_the_component(runs: list[Trace]) -> None:

@@ -14,7 +14,7 @@ from beliefscope.datasets.errors import BadInput
     steps=opt.option(
         "T",
         "Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle of the "
-        "longest stretch of each.",
+        "longest stretch of each, or of the episode for a task without contact.",
         "--step",
         parser=opt.integer(0),
     ),
@@ -28,7 +28,8 @@ def figure(
 ) -> console.Result:
     """Draw a figure of the paper from a filter run.
 
-    maps: likelihood or posterior of each modality around the true position, in free motion and in contact.
+    maps: likelihood or posterior of each modality around the true position, in free motion and in contact; of tasks
+    without contact at one step, and of a state with one map component as curves.
     weights: estimates of each modality and of the fused filter over time, with the fusion weights below and contact
     shaded.
 
@@ -53,10 +54,11 @@ def figure(
         if reason := no_maps(checkpoint, trace, quantity):
             raise BadInput(reason)
         selection = paper.steps_by_contact(trace, steps or ())
-        if False not in selection:
+        with_contact = "contact" in trace.task.covariates
+        if with_contact and False not in selection:
             console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")
         write_figure(paper.maps_figure(checkpoint, trace, selection, quantity=quantity), output)
-        extra["shown"] = {paper.STATES[state]: step for state, step in selection.items()}
+        extra["shown"] = {paper.STATES[state] if with_contact else "all": step for state, step in selection.items()}
     else:
         write_figure(paper.weights_figure(trace), output)
     return opt.trace_result(trace, output, figure=kind, **extra)

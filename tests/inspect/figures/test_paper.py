@@ -69,6 +69,17 @@ def test_default_steps(pf: tuple[Checkpoint, Trace], spans: list[tuple[int, int]
     assert paper.steps_by_contact(planted(pf[1], *spans)) == steps
 
 
+def test_steps_of_a_task_without_contact(pf: tuple[Checkpoint, Trace]) -> None:
+    traced = planted(pf[1], (50, 61))
+    task = replace(traced.task, covariates={})
+    traced = replace(traced, episode=replace(traced.episode, task=task))
+    assert paper.steps_by_contact(traced) == {False: 64}
+    assert paper.steps_by_contact(traced, [51]) == {False: 51}
+    assert [panel.modality for panel in paper.panels(task, traced.modalities, {False: 51})] == ["image", "haptics"]
+    with pytest.raises(BadInput, match="steps 51 and 52 are two: select one"):
+        paper.steps_by_contact(traced, [51, 52])
+
+
 def test_selected_steps(pf: tuple[Checkpoint, Trace]) -> None:
     traced = planted(pf[1], (50, 61))
     assert paper.steps_by_contact(traced, [51]) == {False: 80, True: 51}

@@ -10,8 +10,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import csv, parquet
 
+from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.statistics.measures import nees
+from beliefscope.inspect.statistics.measures import errors, nees
 from beliefscope.inspect.trace import load_trace, save_trace
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import column, joined, read_columns
@@ -155,6 +156,38 @@ def test_one_component_is_a_task(tmp_path: Path) -> None:
     trace = recorded_trace(columns, mapping, episodes, 0, "tank")
     assert (trace.task.map_components, trace.task.main_error.label) == (("level",), "level (K)")
     assert trace.task.map_half_width == pytest.approx(1.2 * 5.0)
+
+
+@pytest.mark.parametrize("unit", ["quaternion", "quaternion_wxyz"])
+def test_quaternions_become_rotations(tmp_path: Path, unit: str) -> None:
+    """Of any norm, as (x, y, z, w) or (w, x, y, z); the estimate is 0.1 rad off about the body's z axis."""
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(30, 4))
+    turn = np.array([np.cos(0.05), 0.0, 0.0, np.sin(0.05)])
+    estimate = 2.0 * rotations.multiply(truth, np.broadcast_to(turn, truth.shape))
+    order = [1, 2, 3, 0] if unit == "quaternion" else [0, 1, 2, 3]
+    names = [f"q{i}" for i in range(4)]
+    columns = {"t": 0.1 * np.arange(30.0), "z": np.arange(30.0), "est": estimate[:, order], "est_z": np.arange(30.0)}
+    columns |= dict(zip(names, truth[:, order].T, strict=True))
+    text = f"""
+time = "t"
+[state]
+z = "z"
+attitude = {{column = {names}, unit = "{unit}"}}
+[estimate]
+mean = ["est_z", "est"]
+std = ["z", "z", "z", "z"]
+"""
+    mapping = read_map(map_file(tmp_path, text))
+    episodes = read_log(columns, mapping, "log")
+    trace = recorded_trace(columns, mapping, episodes, 0, "log")
+    assert [c.name for c in trace.task.components] == ["z", "attitude_x", "attitude_y", "attitude_z"]
+    np.testing.assert_allclose(errors(trace)[:, -1], np.broadcast_to([0.0, 0.0, 0.0, 0.1], (30, 4)), atol=1e-5)
+    columns["q1"][7] = columns["q0"][7] = columns["q2"][7] = columns["q3"][7] = 0.0
+    with pytest.raises(BadInput, match="state attitude has a quaternion of norm 0 in row 7"):
+        read_log(columns, mapping, "log")
+    with pytest.raises(BadInput, match="has a quaternion of 1 columns, expected 4"):
+        read_log(columns, read_map(map_file(tmp_path, text.replace(str(names), '"z"'))), "log")
 
 
 def test_times_of_the_log_are_kept(tmp_path: Path) -> None:

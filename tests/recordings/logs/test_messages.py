@@ -152,7 +152,7 @@ def test_a_guessed_map_imports_the_log(log: Path, tmp_path: Path) -> None:
         ("dt = 0.05", "dt = 1e-9", "increase dt"),
         ("dt = 0.05", "dt = inf", "needs either dt"),
         ('"quaternion_yaw"', '"rad"', r"shape \(34, 4\), expected \(34, 1\)"),
-        ('"/truth.pose.pose.orientation"', '["/truth.pose.pose.position.x"]', "four of a quaternion_yaw"),
+        ('"/truth.pose.pose.orientation"', '["/truth.pose.pose.position.x"]', "four of a quaternion"),
         ('"/truth.pose.pose.orientation"', '"/truth.header.frame_id"', "has text"),
     ],
 )
