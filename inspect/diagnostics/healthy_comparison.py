@@ -79,7 +79,7 @@ KINDS = {
     "shift": ("shift in pixels", False, 0.2),
     "lag": ("delay in steps", False, 0.5),
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
-    "level": ("reading (N, N m) at the start", False, 0.15),
+    "level": ("level (N, N m)", False, 0.15),
     "drift": ("drift (N/s, N m/s)", False, 0.01),
     "change": ("second difference (N, N m)", False, 0.05),
     "noise": ("noise (gray levels, N, N m)", False, 0.02),
@@ -103,8 +103,12 @@ standard deviation between trajectories, below which differences are irrelevant.
 LEVER = 0.1
 """m: smallest standard deviation of a torque (N m) relative to that of a force (N)."""
 
-PHASES = {"all": "", "extreme": ", most extreme over 20 steps,", "range": ", range over windows of 20 steps,"}
-"""Phase of a statistic -> how its label ends; others are phases of the task."""
+PHASES = {
+    "all": ("", ""),
+    "extreme": ("most extreme ", " over 20 steps"),
+    "range": ("range of the ", " over windows of 20 steps"),
+}
+"""Phase of a statistic -> how its label begins and ends; others are phases of the task."""
 
 RISING = frozenset(
     {"error", "angle error", "regret", "outside", "black", "frozen", "occlusion", "change", "opposition"}
@@ -141,8 +145,8 @@ class Deviation:
         kind, subject, phase = self.statistic.split("/")
         title = KINDS[kind][0] if kind in KINDS else kind
         subject = display_name(subject.replace(" ", ", "))  # modality, component
-        where = PHASES.get(phase, f" in {phase}")
-        return f"{title}{f' of {subject}' if subject else ''}{where}"
+        before, after = PHASES.get(phase, ("", f" in {phase}"))
+        return f"{before}{title}{f' of {subject}' if subject else ''}{after}"
 
     @property
     def text(self) -> str:
