@@ -32,7 +32,7 @@ from scipy.special import betaincinv, stdtrit
 
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.slices.covariates import Covariate, covariates_of
+from beliefscope.inspect.slices.covariates import StepCovariate, covariates_of
 from beliefscope.inspect.slices.search import Candidate, Index, find_candidates, random_pairings
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
@@ -53,7 +53,7 @@ class Table:
 
     error: Array
     episode: Index
-    covariates: list[Covariate]
+    covariates: list[StepCovariate]
 
 
 def table_of(task: str, field: Path) -> Table:
@@ -78,7 +78,7 @@ def random_slice(table: Table, rng: np.random.Generator) -> tuple[Mask, bool]:
             return steps, any(varies(part, table.episode) for part in parts)
 
 
-def random_range(covariate: Covariate, rng: np.random.Generator) -> Mask:
+def random_range(covariate: StepCovariate, rng: np.random.Generator) -> Mask:
     """A random category; or 10 to 60 % of the values, above a threshold, below one or between two."""
     if covariate.categories:
         return covariate.values == rng.integers(len(covariate.categories))
@@ -90,7 +90,7 @@ def random_range(covariate: Covariate, rng: np.random.Generator) -> Mask:
     return (covariate.values > low) & (covariate.values <= high)
 
 
-def varies(covariate: Covariate, episode: Index) -> bool:
+def varies(covariate: StepCovariate, episode: Index) -> bool:
     same = np.diff(episode) == 0
     return bool((np.diff(np.nan_to_num(covariate.values)) != 0)[same].any())
 

@@ -42,7 +42,7 @@ from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter
 from beliefscope.inspect.traces.run import assemble_trace, step_arrays
-from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live
+from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live_recording
 
 FOLDER = Path("workspace/live")
 QUEUE_SIZE = 1000
@@ -241,7 +241,7 @@ class LiveRecorder:
         self._views.close(write_rest=self._error is not None)
         if self._error is None:
             try:
-                write_live(self.path, self.path.with_suffix(".rrd"))
+                write_live_recording(self.path, self.path.with_suffix(".rrd"))
             except BadInput as error:
                 self._error = error
 

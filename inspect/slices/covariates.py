@@ -23,7 +23,7 @@ MAX_CATEGORIES = 12
 
 
 @dataclass(frozen=True)
-class Covariate:
+class StepCovariate:
     """A quantity of each of S steps.
 
     Attributes:
@@ -38,7 +38,7 @@ class Covariate:
     categories: tuple[str, ...] = ()
 
 
-def covariates_of(traces: Sequence[Trace]) -> list[Covariate]:
+def covariates_of(traces: Sequence[Trace]) -> list[StepCovariate]:
     """Covariates of the concatenated counted steps of traces of one task, without constant ones."""
     columns = [dict(_columns(trace)) for trace in traces]
     names = dict.fromkeys(name for column in columns for name in column)
@@ -53,18 +53,18 @@ def covariates_of(traces: Sequence[Trace]) -> list[Covariate]:
     return result
 
 
-def _covariate(name: str, unit: str, values: NDArray[Any]) -> Covariate | None:
+def _covariate(name: str, unit: str, values: NDArray[Any]) -> StepCovariate | None:
     """None if all values are equal or are names. Texts and booleans become categories."""
     if values.dtype == object or values.dtype.kind in "US":
         texts = np.array([value if isinstance(value, str) else "" for value in values.tolist()])
         categories = tuple(sorted(set(texts.tolist()) - {""}))
         index = np.where(texts == "", np.nan, np.searchsorted(categories, texts)) if categories else np.zeros(0)
-        return Covariate(name, unit, index, categories) if 1 < len(categories) <= MAX_CATEGORIES else None
+        return StepCovariate(name, unit, index, categories) if 1 < len(categories) <= MAX_CATEGORIES else None
     numbers = values.astype(np.float64)
     known = numbers[np.isfinite(numbers)]
     if not len(known) or (known.min() == known.max() and len(known) == len(numbers)):
         return None
-    return Covariate(name, unit, numbers, ("no", "yes") if values.dtype == bool else ())
+    return StepCovariate(name, unit, numbers, ("no", "yes") if values.dtype == bool else ())
 
 
 def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:

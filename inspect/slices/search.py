@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
-from beliefscope.inspect.slices.covariates import Covariate
+from beliefscope.inspect.slices.covariates import StepCovariate
 from beliefscope.inspect.statistics.measures import Array, Mask
 
 ALPHA = 0.05
@@ -92,7 +92,7 @@ class Candidate:
 def find_candidates(
     score: Array,
     episode: Index,
-    covariates: Sequence[Covariate],
+    covariates: Sequence[StepCovariate],
     *,
     alpha: float = ALPHA,
     pairings: int = PAIRINGS,
@@ -166,7 +166,7 @@ class _Family:
         return inside
 
 
-def _families(covariates: Sequence[Covariate], episode: Index) -> list[_Family]:
+def _families(covariates: Sequence[StepCovariate], episode: Index) -> list[_Family]:
     """Candidates of every covariate, and of every pair in which one has categories.
 
     The atoms of covariates that are constant in each episode are episodes, or the steps of a category in an episode.
@@ -199,7 +199,7 @@ def _families(covariates: Sequence[Covariate], episode: Index) -> list[_Family]:
     return [family for family in families if len(family.conditions)]
 
 
-def _bins(covariate: Covariate) -> tuple[Index, Array]:
+def _bins(covariate: StepCovariate) -> tuple[Index, Array]:
     """Bin of each step (S,), -1 for none; and edges between bins, which are values of the covariate."""
     values, known = covariate.values, np.isfinite(covariate.values)
     if covariate.categories:
@@ -209,7 +209,7 @@ def _bins(covariate: Covariate) -> tuple[Index, Array]:
     return np.where(known, np.searchsorted(edges, values, side="left"), -1), edges
 
 
-def _ranges(covariate: Covariate, edges: Array, coarse: bool = False) -> tuple[Array, list[tuple[Condition, ...]]]:
+def _ranges(covariate: StepCovariate, edges: Array, coarse: bool = False) -> tuple[Array, list[tuple[Condition, ...]]]:
     """Indicators (K, B) of the bins of each category or range, and their conditions; coarse: no range with two ends."""
     name, unit, count = covariate.name, covariate.unit, len(edges) + 1
     if names := covariate.categories:

@@ -86,7 +86,7 @@ class LiveViews:
             reader.close()
 
 
-def write_live(live: Path, path: Path) -> Path:
+def write_live_recording(live: Path, path: Path) -> Path:
     """A live run's file -> the recording that ``write_recording`` makes of its trace, in memory that does not grow.
 
     Raises BadInput as ``LiveFileReader`` and ``write_recording`` do, and for a run without a step.

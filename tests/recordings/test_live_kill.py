@@ -84,7 +84,7 @@ def test_kill_keeps_every_written_step(run: Run, tmp_path: Path) -> None:
     np.testing.assert_array_equal(recorded.estimate_mean[:, 0], np.arange(47))
     assert run(f"import {tmp_path}/run.live -o {tmp_path}/run.trace")[0] == 0
     assert len(load_trace(tmp_path / "run.trace")) == 47
-    live_views.write_live(tmp_path / "run.live", recording)
+    live_views.write_live_recording(tmp_path / "run.live", recording)
     assert len(read_recording(recording)) == 47, "the complete recording can be restored"
 
 

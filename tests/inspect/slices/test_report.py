@@ -12,7 +12,7 @@ import pytest
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.slices.covariates import Covariate, covariates_of
+from beliefscope.inspect.slices.covariates import StepCovariate, covariates_of
 from beliefscope.inspect.slices.report import find_slices, slices_of
 from beliefscope.inspect.slices.search import Condition
 from beliefscope.inspect.statistics import measures
@@ -29,7 +29,7 @@ def traces() -> list[Trace]:
         return list(trace_all(checkpoint, data, range(EPISODES)))
 
 
-def column(covariates: Sequence[Covariate], name: str) -> Covariate:
+def column(covariates: Sequence[StepCovariate], name: str) -> StepCovariate:
     (result,) = (covariate for covariate in covariates if covariate.name == name)
     return result
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beliefscope.inspect.slices.covariates import Covariate
+from beliefscope.inspect.slices.covariates import StepCovariate
 from beliefscope.inspect.slices.search import Candidate, Condition, find_candidates, random_pairings
 from beliefscope.inspect.statistics.measures import Array
 
@@ -24,19 +24,19 @@ def errors(rng: np.random.Generator) -> Array:
     return np.exp(0.3 * noise + 0.3 * rng.standard_normal((EPISODES, 1))).ravel()
 
 
-def covariates(rng: np.random.Generator) -> list[Covariate]:
+def covariates(rng: np.random.Generator) -> list[StepCovariate]:
     speed = np.abs(np.cumsum(rng.standard_normal((EPISODES, STEPS)), axis=1)).ravel()
     contact = (np.cumsum(rng.standard_normal((EPISODES, STEPS)), axis=1) > 0).ravel().astype(float)
     friction, policy = rng.random(EPISODES)[EPISODE], rng.integers(0, 3, EPISODES)[EPISODE].astype(float)
     return [
-        Covariate("speed", "m/s", speed),
-        Covariate("contact", "", contact, ("no", "yes")),
-        Covariate("friction", "", friction),
-        Covariate("policy", "", policy, ("pull", "push", "tap")),
+        StepCovariate("speed", "m/s", speed),
+        StepCovariate("contact", "", contact, ("no", "yes")),
+        StepCovariate("friction", "", friction),
+        StepCovariate("policy", "", policy, ("pull", "push", "tap")),
     ]
 
 
-def search(score: Array, columns: list[Covariate], **settings: float) -> list[Candidate]:
+def search(score: Array, columns: list[StepCovariate], **settings: float) -> list[Candidate]:
     return find_candidates(score, EPISODE, columns, pairings=99, **settings)  # type: ignore[arg-type]
 
 
@@ -133,4 +133,4 @@ def test_unknown_values_belong_to_no_slice() -> None:
 def test_nothing_to_search() -> None:
     rng = np.random.default_rng(6)
     assert search(errors(rng), []) == []
-    assert search(errors(rng), [Covariate("rare", "", (EPISODE < 2).astype(float), ("no", "yes"))]) == []
+    assert search(errors(rng), [StepCovariate("rare", "", (EPISODE < 2).astype(float), ("no", "yes"))]) == []
