@@ -5,9 +5,12 @@ Named ``KIND/SUBJECT/PHASE`` like all statistics of a profile; NaN where one is 
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from beliefscope.datasets.episode import Episode, lost_images
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
 from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, saturated, stuck, vector_statistics
 from beliefscope.inspect.diagnosis.window_checks import (
@@ -68,6 +71,15 @@ def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | No
     return None
 
 
+def _without_lost(series: Array, readings: NDArray[Any]) -> Array:
+    """A series (T,) interpolated at lost images and beside them, which have differences of their own."""
+    if not is_image(readings):
+        return series
+    lost = np.convolve(lost_images(readings), np.ones(3), mode="same") > 0.0
+    steps = np.arange(len(series))
+    return np.interp(steps, steps[~lost], series[~lost]) if not lost.all() else series
+
+
 def _series(kind: str, key: str, axis: str, episode: Episode, reference: Reference | None) -> Array | None:
     """(T,) sizes of the deviation that a statistic measures; None if it has none."""
     readings = episode.observations[key].astype(np.float64)
@@ -75,10 +87,10 @@ def _series(kind: str, key: str, axis: str, episode: Episode, reference: Referen
         case "noise" | "position noise":
             chosen = readings[:, [AXES.index(axis)]] if axis else readings.reshape(len(readings), -1)
             size = np.median(np.abs(np.diff(chosen, n=2, axis=0)), axis=1)
-            return np.log(np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12))
+            series = np.log(np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12))
+            return _without_lost(series, episode.observations[key])
         case "brightness" if reference is not None and reference.image.shape == readings.shape[1:]:
-            ratio, lost = brightness_of(readings, reference), lost_images(episode.observations[key])
-            return np.where(lost, 0.0, np.abs(ratio - 1.0))
+            return _without_lost(np.abs(brightness_of(readings, reference) - 1.0), episode.observations[key])
         case "level":
             return np.where(free_motion(episode), np.abs(readings[:, AXES.index(axis)]), 0.0)
     return None

@@ -193,6 +193,7 @@ def test_image_shift_is_registered() -> None:
         ("force_noise=6:from=35", "noise/force y/all", (35, 99)),
         ("image_noise=30:from=50:to=80", "noise/image/all", (50, 79)),
         ("image_underexposed=0.4:from=64", "brightness/image/all", (64, 99)),
+        ("image_outage=0.4:seconds=1,image_underexposed=0.4:from=64", "brightness/image/all", (64, 99)),
         ("drop=haptics:from=25", "stuck/effector_position/all", (25, 99)),
         ("contact_flipped:from=40:to=60", "opposition/contact/extreme", (40, 59)),
     ],
