@@ -1,7 +1,8 @@
-"""The page in headless Chromium: first paint, latency, diagnosis, and memory during playback.
+"""The page in headless Chromium: first paint, finding, layout shift, latency, diagnosis, scene, memory in playback.
 
 python bench/page.py                # all but the playback
 python bench/page.py --diagnosis    # only the diagnosis
+python bench/page.py --first        # only the first screen and the 3D scene
 """
 
 from __future__ import annotations
@@ -79,6 +80,38 @@ DRAG = """([seconds, from, to, y]) => new Promise((done) => {
 })"""
 """Moves the pointer more often than the frame rate; returns the times of frames with a moved cursor, ms."""
 
+WATCH = """() => {
+  window.layoutShift = 0;
+  window.findingTime = null;
+  new PerformanceObserver((list) => {
+    for (const { value, hadRecentInput } of list.getEntries()) if (!hadRecentInput) layoutShift += value;
+  }).observe({ type: 'layout-shift', buffered: true });
+  const look = () => {
+    if (document.querySelector('#finding')?.dataset.source) findingTime = performance.now();
+    else requestAnimationFrame(look);
+  };
+  addEventListener('DOMContentLoaded', look);
+}"""
+"""Sums the layout shifts of a page and notes when its finding is on the screen, ms."""
+
+RENDERINGS = """(seconds) => new Promise((done) => {
+  const { WebGL2RenderingContext, requestAnimationFrame } = document.querySelector('#scene iframe').contentWindow;
+  const { clear } = WebGL2RenderingContext.prototype;
+  let count = 0;
+  let inFrame = false;
+  WebGL2RenderingContext.prototype.clear = function (mask) {
+    if (!inFrame) count++;
+    inFrame = true;
+    requestAnimationFrame(() => (inFrame = false));
+    return clear.call(this, mask);
+  };
+  setTimeout(() => {
+    WebGL2RenderingContext.prototype.clear = clear;
+    done(count / seconds);
+  }, 1000 * seconds);
+})"""
+"""Counts the frames that the 3D scene renders, per second."""
+
 
 def measure() -> list[Row]:
     try:
@@ -88,7 +121,8 @@ def measure() -> list[Row]:
     if find_chromium() is None:
         return [("page", "skipped: no Chromium on the path", "")]
     with browsing() as page, serving() as served:
-        rows = [*paint(page, served.url), *diagnosis(page, served.url)]
+        url = served.url
+        rows = [*paint(page, url), *first_screen(page, url), *scene(page, url), *diagnosis(page, url)]
     with tempfile.TemporaryDirectory() as folder:
         long = Path(folder) / "long.h5"
         write_dataset(long, find_task("door"), [episode()])
@@ -112,6 +146,36 @@ def paint(page: Any, url: str) -> list[Row]:
     for case, times in (("a reload", reloads), ("a browser's first visit", visits)):
         rows.append((f"timeline and maps after {case}, median of {VISITS}", f"{np.median(times):.2f} s", "<= 1.5 s"))
     return rows
+
+
+def first_screen(page: Any, url: str) -> list[Row]:
+    """Time until the finding is on the screen and layout shift, for new browsers."""
+    times, shifts = [], []
+    for _ in range(VISITS):
+        with page.context.browser.new_context(viewport={"width": 1280, "height": 720}) as context:
+            other = context.new_page()
+            other.add_init_script(f"({WATCH})()")
+            other.goto(url, wait_until="commit")
+            usable(other)
+            other.wait_for_timeout(3000)  # the 3D scene and the diagnosis follow
+            times.append(other.evaluate("findingTime") / 1e3)
+            shifts.append(other.evaluate("layoutShift"))
+    return [
+        (f"finding on the screen at 1280 x 720, median of {VISITS}", f"{np.median(times):.2f} s", "<= 2.5 s"),
+        (f"layout shift of a first visit, maximum of {VISITS}", f"{max(shifts):.4f}", "<= 0.01"),
+    ]
+
+
+def scene(page: Any, url: str) -> list[Row]:
+    """Frames of the 3D scene during playback."""
+    page.goto(url)
+    usable(page)
+    page.evaluate("document.querySelector('#tab-scene').click()")
+    page.wait_for_function("() => beliefscope.stats.drawn", timeout=120_000)
+    page.wait_for_timeout(5000)
+    page.keyboard.press("Space")
+    page.wait_for_timeout(1000)
+    return [("3D scene during playback, rendered in software", f"{page.evaluate(RENDERINGS, 10):.1f} frames/s", ">= 5")]
 
 
 def keys(page: Any, url: str) -> list[Row]:
@@ -208,9 +272,13 @@ def play(minutes: float) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--play", type=float, metavar="MINUTES", help="only measure the memory during playback")
+    parser.add_argument("--first", action="store_true", help="only measure the first screen and the 3D scene")
     parser.add_argument("--diagnosis", action="store_true", help="only measure the diagnosis")
     args = parser.parse_args()
-    if args.diagnosis:
+    if args.first:
+        with browsing() as page, serving() as served:
+            rows = [*first_screen(page, served.url), *scene(page, served.url)]
+    elif args.diagnosis:
         with browsing() as page, serving() as served:
             rows = diagnosis(page, served.url)
     else:
