@@ -47,7 +47,7 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.trace_worker import TraceWorker
 from beliefscope.app.server.auth import LOOPBACK, OPEN, VARIABLE, Access, host_names
 from beliefscope.app.server.logs import is_relevant
-from beliefscope.app.server.plain_pages import not_found_page
+from beliefscope.app.server.plain_pages import POLICY, not_found_page
 from beliefscope.app.server.security import Guard
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.timeouts import MAX_HEAD, UNREAD_TIMEOUT, HTTPProtocol, WebSocketProtocol
@@ -270,7 +270,7 @@ def _validation_error(_: Request, error: Exception) -> JSONResponse:
 def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if error.status_code == 404 and "text/html" in request.headers.get("accept", ""):  # opened in a browser
-        return HTMLResponse(not_found_page(request.url.path), 404)
+        return HTMLResponse(not_found_page(request.url.path), 404, POLICY)
     return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
 
 

@@ -14,6 +14,13 @@ _PAGE = (
 )
 
 
+POLICY = {
+    "content-security-policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'none'"
+}
+"""Header of a page without forms."""
+
+
 def plain_page(body: str, head: str = "") -> str:
     """A small HTML page."""
     return _PAGE.format(head=head, body=body)

@@ -135,7 +135,7 @@ def test_unknown_address_is_a_page_for_browsers_and_json_for_programs(shared_cli
     assert 'href="/"' in shown.text
     assert "/door/&lt;script&gt;" in shown.text
     assert "<script" not in shown.text
-    assert "default-src" in shown.headers["content-security-policy"]
+    assert "style-src 'unsafe-inline'" in shown.headers["content-security-policy"]
     program = shared_client.get(path)
     assert program.status_code == 404
     assert set(program.json()) == {"error"}
