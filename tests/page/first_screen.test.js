@@ -62,6 +62,15 @@ test('no modality takes over whose weight stays low', () => {
   assert.match(result?.evidence ?? '', /rises from 25 % to 40 %/);
 });
 
+test('a weight that does not react to an outage stays, although the image is lost', () => {
+  const [low, high] = [0.5, 0.98].map((weight) => {
+    const constant = { ...run(14), weight: () => series(() => weight) };
+    return outageFinding(constant, 0)?.evidence ?? '';
+  });
+  assert.match(low, /weight of haptics stays at 50 %, although the image is lost;/);
+  assert.match(high, /weight of haptics stays at 98 %;/);
+});
+
 test('short outages and those in free motion are no finding', () => {
   assert.equal(outageFinding(run(11), 0), null);
   assert.equal(outageFinding(run(14, 9), 0), null);

@@ -8,6 +8,7 @@ import { intervals } from '../data/arrays.js';
 import { stepSummary } from './step_summary.js';
 
 const MIN_STEPS = 5; // of an outage
+const MIN_CHANGE = 0.05; // of a weight
 const BEFORE = 10; // steps that are compared with the outage
 
 /**
@@ -93,8 +94,7 @@ export function outageFinding(trace, component) {
   const end = last + 1 < trace.steps ? `until the image returns at step ${last + 1}` : 'to the end';
   const action = successor ? `; ${successor.name} takes over ${end}` : `, ${end}`;
   const evidence = weights.map(
-    ({ name, before, during }) =>
-      `the effective weight of ${name} ${during > before ? 'rises' : 'falls'} from ${percent(before)} to ${percent(during)}`,
+    ({ name, before, during }) => `the effective weight of ${name} ${change(before, during)}`,
   );
   const worst = Math.max(...(trace.error('fused', 'main')?.subarray(first, last + 1) ?? [NaN]));
   if (worst >= 0)
@@ -118,6 +118,17 @@ export function largest(values) {
   for (let i = 0; i < values.length; i++)
     if (Number.isFinite(values[i]) && !(result !== null && values[i] <= values[result])) result = i;
   return result;
+}
+
+/**
+ * Describes the change of a weight in an outage.
+ * @param {number} before
+ * @param {number} during
+ */
+function change(before, during) {
+  if (Math.abs(during - before) >= MIN_CHANGE)
+    return `${during > before ? 'rises' : 'falls'} from ${percent(before)} to ${percent(during)}`;
+  return `stays at ${percent(during)}${during < 1 - MIN_CHANGE ? ', although the image is lost' : ''}`;
 }
 
 /** @param {ArrayLike<number>} values */
