@@ -303,7 +303,12 @@ def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
 
 
 def derived(values: Values, task: Task) -> Values:
-    """Adds derived values: moments of the particles, and each measurement model's own posterior."""
+    """Adds derived values: moments of the particles, and each measurement model's own posterior.
+
+    The effective weight of a single measurement model is always one, and removed.
+    """
+    if "effective_weights" in values and values["effective_weights"].shape[-2] < 2:
+        values = {name: value for name, value in values.items() if name != "effective_weights"}
     particles = values.get("particles")
     if particles is None:
         return values

@@ -23,7 +23,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.failures.events import find_failures
-from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of
+from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of, scores_of
 from beliefscope.inspect.figures.paper import maps_figure, steps_by_contact
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.statistics import measures
@@ -76,6 +76,7 @@ class Kalman(nn.Module):
             "observation_covariance": noise[:, None],
             "modality_mean": self.mean[:, None],
             "modality_covariance": self.covariance[:, None],
+            "effective_weights": torch.ones_like(noise),
         }
 
 
@@ -116,6 +117,12 @@ def test_nees_and_covariance_are_those_of_the_riccati_equation(runs: list[Trace]
     nees = np.concatenate([measures.nees(run)[20:, -1] for run in runs])
     deviation = np.sqrt(2.0 / len(nees)) * 2.0  # of a chi-squared mean; 2 for its correlation over steps
     assert nees.mean() == pytest.approx(1.0, abs=4.0 * deviation)
+
+
+def test_a_single_model_has_no_weights(runs: list[Trace]) -> None:
+    """Its effective weight is always one; scores and audits of fusion do not apply."""
+    assert runs[0].effective_weights is None
+    assert scores_of(task())["disagreement"].why_not(runs[0]) is not None
 
 
 def test_the_figure_of_maps_has_curves(runs: list[Trace]) -> None:

@@ -7,7 +7,7 @@
 /** @import { Trace } from '../data/trace.js' */
 
 import { context2d, create, element, html } from '../core/dom.js';
-import { COLOUR_TABLES, cssVariable } from '../core/palette.js';
+import { COLOUR_TABLES, colour } from '../core/palette.js';
 import { displayName, significant } from '../core/units.js';
 import { sensorImages } from '../data/api.js';
 import { imageAt } from '../data/trace.js';
@@ -139,7 +139,7 @@ function drawPoints(context, bytes, extent) {
   const [middle, scale] = [width / 2, width / 2 / extent];
   const values = new Float32Array(bytes.slice().buffer);
   context.clearRect(0, 0, width, width);
-  context.strokeStyle = cssVariable('--edge');
+  context.strokeStyle = colour('muted');
   context.lineWidth = 1;
   const step = ringStep(extent);
   for (let radius = step; radius < extent; radius += step) {
@@ -147,7 +147,7 @@ function drawPoints(context, bytes, extent) {
     context.arc(middle, middle, radius * scale, 0, 2 * Math.PI);
     context.stroke();
   }
-  context.fillStyle = cssVariable('--ink');
+  context.fillStyle = colour('ink');
   const size = values.length > 1000 ? 4 : 6;
   for (let i = 0; i < values.length; i += 2)
     if (Number.isFinite(values[i]))
@@ -161,7 +161,7 @@ function drawPoints(context, bytes, extent) {
   context.moveTo(middle, middle - 10);
   context.lineTo(middle - 6, middle + 6);
   context.lineTo(middle + 6, middle + 6);
-  context.fillStyle = cssVariable('--accent');
+  context.fillStyle = colour('accent');
   context.fill();
 }
 

@@ -31,12 +31,12 @@ export class StepTable {
 
   /**
    * @param {Trace} trace
-   * @param {string} component whose weights are displayed if each component has its own
+   * @param {string} component whose weights are displayed if each component has its own, and of several angles its error
    */
   show(trace, component) {
     this.#trace = trace;
     const index = trace.components.findIndex((c) => c.name === component);
-    this.#columns = [...errorColumns(trace), ...weightColumns(trace, index)];
+    this.#columns = [...errorColumns(trace, index), ...weightColumns(trace, index)];
     const heads = this.#columns.map(({ title, unit, help }) =>
       create(
         'th',
@@ -49,7 +49,8 @@ export class StepTable {
       this.#columns.map(({ share }) => create('td', { className: share ? 'share' : '' })),
     );
     const rows = trace.sources.map((source, i) => {
-      const title = create('th', { scope: 'row' }, swatch(source), trace.label(source));
+      const label = trace.label(source);
+      const title = create('th', { scope: 'row', title: label }, swatch(source), label);
       const row = create('tr', { className: source }, title, ...this.#cells[i]);
       row.style.setProperty('--line', `var(${cssVariable(source)})`);
       return row;
@@ -73,10 +74,12 @@ export class StepTable {
 }
 
 /**
+ * Returns the columns of the main error and of one angle, for which there is room.
  * @param {Trace} trace
+ * @param {number} component selected one, of several angles
  * @returns {Column[]}
  */
-function errorColumns(trace) {
+function errorColumns(trace, component) {
   const { task, mainUnit: unit } = trace;
   const [{ name }, several] = [task.main, task.main.indices.length > 1];
   /** @type {Column[]} */
@@ -94,7 +97,8 @@ function errorColumns(trace) {
       text: (source, t) => fixed(trace.mainSigma(source)?.[t], 2),
     },
   ];
-  for (const angle of trace.angles.filter((i) => several || i !== task.main.indices[0])) {
+  const angles = trace.angles.filter((i) => several || i !== task.main.indices[0]);
+  for (const angle of angles.includes(component) ? [component] : angles.slice(0, 1)) {
     const angleName = displayName(trace.components[angle].name);
     columns.push(
       {

@@ -38,6 +38,17 @@ export const layoutKey = (tracks) =>
 export const isCompact = (height) => height < COMPACT_HEIGHT;
 
 /**
+ * Returns whether the legend of a track has two columns: all of its rows would not fit.
+ * @param {Track} track
+ * @param {number} height px
+ */
+export const isDense = ({ series }, height) =>
+  height < legendHeight(new Set(series.map(({ name }) => name)).size);
+
+/** @param {number} rows */
+const legendHeight = (rows) => 3 + LINE_HEIGHT * (1 + rows);
+
+/**
  * Returns the height of each track in px. Each has room for its legend, stacked ones get most of the rest, and in a low
  * timeline all shrink. The lowest track always has a chart, because of the axis.
  * @param {Track[]} tracks
@@ -51,7 +62,7 @@ export function trackHeights(tracks, height) {
     const names = new Set(series.map(({ name }) => name));
     if (series.some(({ stacked }) => stacked)) return STACKED_HEIGHT;
     const rows = compact ? Math.ceil(names.size / 2) : Math.max(names.size, 2);
-    return 3 + LINE_HEIGHT * (1 + rows);
+    return legendHeight(rows);
   });
   const sum = minimum.reduce((a, b) => a + b, 0);
   if (sum >= height) return minimum.map((value) => Math.floor((value / sum) * height));

@@ -26,7 +26,10 @@ export function legend(track, trace, compared, compact) {
   const list = create('dl');
   /** @type {ValueCell[]} */
   const cells = [];
-  for (const name of new Set(series.map((item) => item.name))) {
+  const names = [...new Set(series.map((item) => item.name))];
+  // The estimate first, because the last ones of many rows may be cut.
+  if (compact) names.sort((a, b) => Number(b === 'fused') - Number(a === 'fused'));
+  for (const name of names) {
     const index = series.findIndex((item) => item.name === name);
     const first = series[index];
     const { dash, width } = seriesStyle(first);
@@ -34,7 +37,7 @@ export function legend(track, trace, compared, compact) {
       ? areaSample(name, index)
       : lineSample(cssVariable(name), dash, width);
     const label = track.ofModalities ? name : trace.label(name);
-    list.append(create('dt', { title: label }, sample, compact ? name : label));
+    list.append(create('dt', { title: label }, sample, compact && trace.fuses ? name : label));
     for (const comparison of compared ? [false, true] : [false]) {
       const text = new Text();
       const index = series.findIndex(

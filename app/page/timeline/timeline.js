@@ -17,7 +17,7 @@ import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
 import { GroupPicker } from './group_picker.js';
 import { HoverValues } from './hover_values.js';
-import { isCompact, layoutKey, noteElement, trackHeights } from './layout.js';
+import { isCompact, isDense, layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
 import { Overview } from './overview.js';
 import { StandalonePicker } from './standalone_picker.js';
@@ -344,7 +344,13 @@ export class Timeline {
     const trace = this.#trace;
     if (!trace) return null;
     const compared = Boolean(this.#activeComparison);
-    const { element: legendElement, cells } = legend(track, trace, compared, compact);
+    const { element: legendElement, cells } = legend(
+      track,
+      trace,
+      compared,
+      compact || isDense(track, height),
+    );
+    legendElement.classList.toggle('dense', !compact && isDense(track, height));
     this.#cells.push(...cells);
     const row = create('div', { className: 'track' }, legendElement);
     this.#host.append(row);
