@@ -36,8 +36,17 @@ class Served:
     @property
     def cpu(self) -> float:
         """CPU time of the server without its jobs, s."""
+        return self._seconds(11)
+
+    @property
+    def jobs_cpu(self) -> float:
+        """CPU time of ended jobs and their processes, s."""
+        return self._seconds(13)
+
+    def _seconds(self, field: int) -> float:
+        """User and system time from two fields of ``stat``, counted after the name of the process."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return (int(fields[field]) + int(fields[field + 1])) / os.sysconf("SC_CLK_TCK")
 
     def _status(self, key: str) -> int:
         lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()

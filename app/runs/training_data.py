@@ -14,7 +14,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 
-EPISODES, SEED = 80, 1000
+EPISODES, SEED = 60, 1000
 """Number of simulated episodes, and the seed of their random numbers, which no sample set has."""
 
 
