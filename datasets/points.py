@@ -37,3 +37,10 @@ def points_of(task: Task, key: str, readings: NDArray[Any]) -> NDArray[np.float3
             points = np.concatenate([points, 0.0 * points[..., :1]], axis=-1)
     points = np.where(np.isfinite(points).all(-1, keepdims=True), points, np.nan)
     return points.astype(np.float32)
+
+
+def extent_of(points: NDArray[np.float32]) -> float:
+    """m: half the side of the square around the sensor that has 99 % of the points (T, P, 3), with a margin."""
+    sides = np.abs(points[..., :2]).max(-1)
+    sides = sides[np.isfinite(sides)]
+    return 1.05 * float(np.percentile(sides, 99.0)) or 1.0 if len(sides) else 1.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
 from beliefscope.datasets.episode import is_image
-from beliefscope.datasets.points import point_sensors, points_of
+from beliefscope.datasets.points import extent_of, point_sensors, points_of
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
@@ -86,10 +86,8 @@ def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
         sensors.append(sensor | {"low": low, "high": high, "points": 0})
     for key in clouds:
         points = points_of(trace.task, key, observations[key])
-        side = np.abs(points[..., :2]).max(-1)
-        extent = float(np.percentile(side[np.isfinite(side)], 99.0)) if np.isfinite(side).any() else 1.0
         size = {"height": 1, "width": 1, "channels": 1, "points": points.shape[1]}
-        sensors.append({"name": key, **size, "low": 0.0, "high": 1.05 * extent or 1.0})
+        sensors.append({"name": key, **size, "low": 0.0, "high": extent_of(points)})
     return sensors
 
 

@@ -56,9 +56,9 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     return values
 
 
-def is_usable(images: Gray) -> bool:
-    """Whether at least half of the images of a window are seen and differ from the previous one."""
-    return bool((~lost_images(images) & ~frozen_images(images)).mean() >= 0.5)
+def is_usable(images: Gray, held: int = 0) -> bool:
+    """Whether at least half of the images of a window are seen and not frozen. held: as in ``repeats``."""
+    return bool((~lost_images(images) & ~frozen_images(images, held)).mean() >= 0.5)
 
 
 def occluded_share(images: Gray, key: str, reference: Reference | None) -> dict[str, float]:

@@ -63,9 +63,11 @@ def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | No
         case "black":
             return lost_images(readings)
         case "frozen":
-            return long_runs(frozen_images(readings))
+            return long_runs(frozen_images(readings, episode.task.held_steps(key)))
         case "stuck":
-            return long_runs(stuck(episode, key, AXES.index(axis)) if axis else repeats(readings))
+            return long_runs(
+                stuck(episode, key, AXES.index(axis)) if axis else repeats(readings, episode.task.held_steps(key))
+            )
         case "saturation":
             return saturated(readings[:, AXES.index(axis)].astype(np.float64))
     return None

@@ -97,7 +97,7 @@ def _part(episode: Episode, first: int) -> Episode:
 def _statistics(part: Episode, reference: Reference | None) -> dict[str, float]:
     values = vector_statistics(part)
     for key in image_keys(part):
-        if is_usable(part.observations[key]):
+        if is_usable(part.observations[key], part.task.held_steps(key)):
             values |= image_statistics(part, key, reference)
             values |= occluded_share(part.observations[key], key, reference)
     return values

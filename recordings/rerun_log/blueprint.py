@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from beliefscope.datasets.points import point_sensors
+from beliefscope.datasets.points import extent_of, point_sensors, points_of
 from beliefscope.datasets.task import Component, Task, display_name, with_unit
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
@@ -22,6 +22,8 @@ from beliefscope.recordings.schema import STEP
 TRAIL_STEPS = 100
 VIEWING_DISTANCE = 1.2
 """m from the centre of the scene, so that the reach of the arm is in view."""
+EYE_HEIGHT = 2.2
+"""Height of the eye above a point cloud, in extents, so that all of it is in view."""
 BACKGROUND = [16, 17, 24]
 """RGB, dark in every theme of the viewer, so that empty cells of a map look empty."""
 
@@ -41,7 +43,7 @@ def blueprint(
         growing: whether the run is in progress: the cursor and axes follow its end.
     """
     observed: list[rrb.View] = [_camera(key) for key in task.observations if task.dtype(key) is np.uint8]
-    observed += [_points(key) for key in point_sensors(task) if key in trace.episode.observations]
+    observed += [_points(key, trace) for key in point_sensors(task) if key in trace.episode.observations]
     if first is not None:
         observed += [_map(layer, first) for layer in first.layers]
     scene = rrb.Vertical(
@@ -104,13 +106,14 @@ def _camera(key: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
 
 
-def _points(key: str) -> rrb.Spatial3DView:
+def _points(key: str, trace: Trace) -> rrb.Spatial3DView:
     """A scan or point cloud from above, x upwards."""
+    extent = extent_of(points_of(trace.task, key, trace.episode.observations[key]))
     return rrb.Spatial3DView(
         origin=f"points/{key}",
         name=display_name(key),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
-        eye_controls=_eye(np.zeros(3), np.array([0.0, 0.0, 10.0]), (1, 0, 0)),
+        eye_controls=_eye(np.zeros(3), np.array([0.0, 0.0, EYE_HEIGHT * extent]), (1, 0, 0)),
     )
 
 
