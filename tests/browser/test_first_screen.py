@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-EXAMPLES = 5
+EXAMPLES = 6
 
 VISIBLE = """(selectors) => selectors.filter((selector) => {
   const { left, top, right, bottom } = document.querySelector(selector).getBoundingClientRect();
