@@ -79,10 +79,10 @@ KINDS = {
     "shift": ("shift in pixels", False, 0.2),
     "lag": ("delay in steps", False, 0.5),
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
-    "level": ("level (N, N m)", False, 0.15),
-    "drift": ("drift (N/s, N m/s)", False, 0.01),
-    "change": ("second difference (N, N m)", False, 0.05),
-    "noise": ("noise (gray levels, N, N m)", False, 0.02),
+    "level": ("level", False, 0.15),
+    "drift": ("drift", False, 0.01),
+    "change": ("second difference", False, 0.05),
+    "noise": ("noise", False, 0.02),
     "position noise": ("noise in m", False, 5e-4),
     "stuck": ("share of repeated readings", False, 0.02),
     "saturation": ("share of saturated readings", False, 0.01),
@@ -91,7 +91,7 @@ KINDS = {
     "agreement": ("correlation with the force", False, 0.05),
     "opposition": ("negative correlation with the force", False, 0.05),
     "unflagged force": ("force in N without the flag", True, 0.2),
-    "size": ("standard deviation (N, N m)", True, 0.1),
+    "size": ("standard deviation", True, 0.1),
     "lever": ("lever in m of the torque", False, 0.01),
     "axes": ("evidence for the order of the axes", False, 0.3),
     "direction": ("cosine between force and motion of the hand", False, 0.05),
@@ -99,6 +99,12 @@ KINDS = {
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
 standard deviation between trajectories, below which differences are irrelevant."""
+
+UNITS = {"force": "N", "torque": "N m", "image": "gray levels"}
+"""Units of the readings of sensors that all simulated tasks have."""
+
+IN_UNITS = {"level": "", "drift": "/s", "change": "", "noise": "", "size": ""}
+"""Kinds of statistics in the units of the readings -> what follows these."""
 
 LEVER = 0.1
 """m: smallest standard deviation of a torque (N m) relative to that of a force (N)."""
@@ -144,6 +150,8 @@ class Deviation:
         """Display name, such as ``effective weight of image, hinge x in contact``."""
         kind, subject, phase = self.statistic.split("/")
         title = KINDS[kind][0] if kind in KINDS else kind
+        if kind in IN_UNITS and (unit := UNITS.get(subject.partition(" ")[0])):
+            title += f" in {unit}{IN_UNITS[kind]}"
         subject = display_name(subject.replace(" ", ", "))  # modality, component
         before, after = PHASES.get(phase, ("", f" in {phase}"))
         return f"{before}{title}{f' of {subject}' if subject else ''}{after}"
