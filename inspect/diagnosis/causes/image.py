@@ -39,7 +39,7 @@ CAUSES = (
     Cause(
         "image.shift",
         "Camera moved",
-        (Symptom("shift/image*", 0, otherwise=(Symptom(HAND, 0),)),),
+        (Symptom("shift/image*", 0),),
         f"occlusion/image/*|brightness/image/*|sharpness/image/*|{HAND}|{IMAGE}",
         "Calibrate the camera pose again.",
         "realign image",
