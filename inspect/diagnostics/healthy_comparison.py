@@ -34,6 +34,9 @@ TAIL = 0.99
 SMALLEST_T = 2.0
 """Lower limit of this quantile."""
 
+MIN_HEALTHY = 10
+"""Minimum number of healthy trajectories with a value of a statistic."""
+
 MIN_EFFECT = 0.5
 """Minimum difference of an alarm, in standard deviations between healthy trajectories."""
 
@@ -226,7 +229,7 @@ def compare(profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]]
     tested = np.array([[values.get(name, np.nan) for name in names] for values in trajectories]).reshape(count, -1)
     tested = tested[np.lexsort(np.nan_to_num(tested).T)]  # the random divisions must not depend on their order
     values = np.concatenate([tested, np.stack([profile.statistics[name] for name in names], axis=1)])
-    keep = (np.isfinite(values[:count]).any(0)) & (np.isfinite(values[count:]).sum(0) >= 10)
+    keep = (np.isfinite(values[:count]).any(0)) & (np.isfinite(values[count:]).sum(0) >= MIN_HEALTHY)
     names, values = [name for name, kept in zip(names, keep, strict=True) if kept], values[:, keep]
     if not names:
         return Comparison(count, profile.episodes, profile.data, ())
@@ -274,7 +277,7 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     if not names:
         raise BadInput(
             f"the healthy record of {profile.episodes} episodes has no statistic in common with the "
-            f"{comparison.trajectories} diagnosed ones; measure it from more healthy episodes"
+            f"{comparison.trajectories} diagnosed ones; measure it from at least {MIN_HEALTHY} healthy episodes"
         )
     values, floor, rising = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
     count = min(comparison.trajectories, profile.episodes // 2)
