@@ -192,7 +192,8 @@ def _scalar(columns: Columns, references: References, unit: str, purpose: str) -
     if unit != QUATERNION or values.shape[1] != 4:
         return values
     x, y, z, w = values.T
-    return np.arctan2(2.0 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):  # no rotation; NaN is reported with its place
+        return np.arctan2(2.0 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)[:, None]
 
 
 def _sample_covariance(ensemble: Array) -> Array:

@@ -87,7 +87,7 @@ def test_doctor_accepts_the_installation(installed: Path, tmp_path: Path) -> Non
 
 @pytest.mark.long
 def test_page_of_the_installation_shows_maps(address: str, open_page: Any) -> None:
-    page = open_page(url=address)
+    page = open_page(url=f"{address}?task=door&step=0")
     before = page.maps()
     assert len(before) == 3
     page.page.click("#forward")

@@ -149,7 +149,8 @@ def test_job_trains_unfinished_cells(
         assert client.get(f"/api/jobs/{job['id']}/result").json() == {"finished": [str(cells[1])]}
         assert all(cell.finished(folder) for cell in cells)
         study = find_study(client, "mine")
-        assert (study["unfinished"], [row["seeds"] for row in study["tasks"][0]["rows"]]) == (0, [2, 2, 2, 0])
+        *trained, trivial = (row["seeds"] for row in study["tasks"][0]["rows"])
+        assert (study["unfinished"], set(trained), trivial) == (0, {2}, 0)
         again = client.post("/api/studies/mine/cells")
         assert (again.status_code, again.json()["error"]) == (400, "all cells of study 'mine' are finished")
         cells[1].path(folder).unlink()
