@@ -21,7 +21,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.covariance_floor import with_floor
-from beliefscope.filters.external.ablation import without
+from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.sequence import SequenceModel
@@ -221,10 +221,10 @@ def _external_runs(
     used = {FILTER: only} | {STANDALONE.format(name): name for name in external.task.modalities if modalities}
     runs = {}
     for run_name, modality in used.items():
-        absent = [] if modality is None else [name for name in external.task.modalities if name != modality]
         if modality is not None:
             check_name(f"modality of task {external.task.name!r}", modality, external.task.modalities)
-        seen = [without(episode, absent, external.adapter.absent) for episode in episodes]
+        kept = None if modality is None else (modality,)
+        seen = [with_only(episode, kept, external.adapter.absent) for episode in episodes]
         values, names = external.run(seen, seed, start=start)
         runs[run_name] = _external_run(external.task, values, truth)
         if run_name == FILTER and modalities and "modality_mean" in values:

@@ -38,6 +38,12 @@ def without(
     return replace(episode, observations=observations)
 
 
+def with_only(episode: Episode, modalities: Collection[str] | None, absent: Literal["mean", "nan"]) -> Episode:
+    """The episode with the readings of some modalities only, or of all (None). absent: as in ``without``."""
+    others = [] if modalities is None else [name for name in episode.task.modalities if name not in modalities]
+    return without(episode, others, absent)
+
+
 def _neutral(readings: NDArray[Any], absent: Literal["mean", "nan"]) -> Any:
     """Reading (...) without information, of readings (T, ...)."""
     if absent == "nan":

@@ -17,7 +17,7 @@ from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import with_floor
-from beliefscope.filters.external.ablation import without
+from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
@@ -204,8 +204,7 @@ def _run_external(
     slice_: Slice,
     progress: Progress,
 ) -> tuple[Array, Tensor]:
-    absent = [name for name in external.task.modalities if slice_.only and name not in slice_.only]
-    seen = [without(episode, absent, external.adapter.absent) for episode in episodes]
+    seen = [with_only(episode, slice_.only or None, external.adapter.absent) for episode in episodes]
     values, _ = external.run(seen, seed, progress)
     mean = values["estimate_mean"]
     covariance = values.get("estimate_covariance", torch.full((*mean.shape, mean.shape[-1]), torch.nan))

@@ -14,7 +14,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.ablation import without
+from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import ARRAYS, Trace
 from beliefscope.inspect.traces.external import run_external
@@ -94,8 +94,7 @@ def run_with(
     external: ExternalFilter, trace: Trace, modalities: tuple[str, ...], start: Gaussian
 ) -> NDArray[np.float64]:
     """(T, n) estimates in SI units over the trace's episode with some modalities only, from a belief (1, n)."""
-    absent = [name for name in external.task.modalities if name not in modalities]
-    episode = without(trace.episode, absent, external.adapter.absent)
+    episode = with_only(trace.episode, modalities, external.adapter.absent)
     values, _ = external.run([episode], trace.seed, start=start)
     return np.asarray(values["estimate_mean"][:, 0].double().numpy())
 
@@ -117,6 +116,5 @@ def _run(
     only = provenance["settings"].get("standalone", "")
     if not only:
         return run_external(external, episode, progress, **provenance)
-    absent = [name for name in external.task.modalities if name != only]
-    seen = without(episode, absent, external.adapter.absent)
+    seen = with_only(episode, (only,), external.adapter.absent)
     return run_external(external, episode, progress, seen=seen, **provenance)

@@ -8,6 +8,11 @@ from beliefscope.inspect.diagnosis.causes.consequences import HAPTICS
 CONTACT = "agreement/contact/*|opposition/contact/*|unflagged force/contact/*|lag/contact/*"
 """Relations of the force and the contact flag."""
 
+READINGS = (
+    "level/force*|drift/force*|change/force*|noise/force*|size/force/*|lever/force*|axes/force/*|direction/force/*"
+)
+"""Statistics of the values of the force."""
+
 CAUSES = (
     Cause(
         "force.bias",
@@ -53,8 +58,7 @@ CAUSES = (
         "force.noise",
         "Force noisy",
         (Symptom("noise/force*"),),
-        f"level/force*|drift/force*|change/force*|direction/force/*|lever/force*|size/force/*|axes/force/*|{CONTACT}"
-        f"|{HAPTICS}",
+        f"{READINGS}|{CONTACT}|{HAPTICS}",
         "Check the cable and the filter of the force sensor.",
         "drop haptics",
     ),
@@ -62,8 +66,7 @@ CAUSES = (
         "force.saturation",
         "Force saturated",
         (Symptom("saturation/force*"),),
-        f"size/force/*|stuck/force*|lever/force*|axes/force/*|direction/force/*|noise/force*|change/force*|level/force*"
-        f"|drift/force*|{CONTACT}|{HAPTICS}",
+        f"stuck/force*|{READINGS}|{CONTACT}|{HAPTICS}",
         "Extend the measuring range of the force sensor, or reduce the forces.",
         "drop haptics",
     ),
@@ -71,8 +74,7 @@ CAUSES = (
         "force.stuck",
         "Force stuck",
         (Symptom("stuck/force*"),),
-        f"level/force*|drift/force*|change/force*|noise/force*|size/force/*|lever/force*|axes/force/*|direction/force/*"
-        f"|{CONTACT}|{HAPTICS}",
+        f"{READINGS}|{CONTACT}|{HAPTICS}",
         "Restart the force sensor.",
         "drop haptics",
     ),
