@@ -4,6 +4,7 @@ import test from 'node:test';
 import { cssVariable } from '../../app/page/core/palette.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
 import { chartData, valueRange } from '../../app/page/timeline/chart.js';
+import { secondsAxis } from '../../app/page/timeline/step_axis.js';
 import { formatValue } from '../../app/page/timeline/legend.js';
 import {
   fitWindow,
@@ -59,6 +60,30 @@ test('times of irregular steps', () => {
   const irregular = makeTrace({ ...FUSION, time: times });
   assert.equal(irregular.seconds(3), 1.5);
   assert.equal(irregular.stepText, '0.25 to 1.00 s');
+});
+
+test('the axis in seconds is the inverse of its steps and keeps gaps', () => {
+  const times = { shape: [4], values: [0, 0.25, 0.5, 1.5] };
+  const irregular = makeTrace({ ...FUSION, time: times }, { steps: 4 });
+  for (const [run, expected] of /** @type {const} */ ([
+    [trace, [-0.05, 0, 0.05, 0.1, 0.25, 0.3, 0.4]],
+    [irregular, [-0.05, 0, 0.125, 0.25, 1, 1.5, 1.6]],
+  ])) {
+    const axis = secondsAxis(run);
+    [-0.5, 0, 0.5, 1, 2.5, 3, 4].forEach((step, i) => {
+      assert.ok(Math.abs(axis.position(step) - expected[i]) < 1e-6, `${step}`);
+      assert.ok(Math.abs(axis.step(axis.position(step)) - step) < 1e-6, `${step}`);
+    });
+  }
+  const [positions] = chartData({ title: '', unit: '', series: [] }, 4, secondsAxis(irregular));
+  assert.deepEqual([...positions], times.values);
+});
+
+test('times distinguish neighbouring steps', () => {
+  assert.equal(trace.timeText(3), '0.3 s');
+  const fast = makeTrace(FUSION);
+  fast.dt = 0.05;
+  assert.equal(fast.timeText(3), '0.15 s');
 });
 
 test('missing quantities are explained', () => {

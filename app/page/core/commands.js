@@ -114,6 +114,7 @@ function actionCommands(page) {
     ['Next failure', 'n', () => page.failures.go(1, performance.now())],
     ['Previous failure', 'b', () => page.failures.go(-1, performance.now())],
     ['Whole episode in the timeline', '0', () => page.timeline.showAll()],
+    ['Timeline axis: steps or seconds', '', () => page.switchTimeAxis()],
     ['Change of the maps from this step', 'm', () => page.maps.togglePin(), '#maps-options .pin'],
     ['Save .rrd', 's', () => page.save(), '#save'],
     ['Undo the selection', 'ctrl z', () => page.undo.undo()],

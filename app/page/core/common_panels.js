@@ -8,7 +8,7 @@ import { setPanelState } from '../widgets/panel_state.js';
 import { element, html, messageOf } from './dom.js';
 import { swatch } from './palette.js';
 import { stats } from './stats.js';
-import { displayName, fixed, sentence } from './units.js';
+import { displayName, sentence } from './units.js';
 
 const LOADING_DELAY = 150; // ms until a panel shows that it loads
 
@@ -103,7 +103,7 @@ export function showBlackouts(trace) {
  */
 export function showCount(trace, step) {
   html('#readout b').textContent = `${step} / ${trace.steps - 1}`;
-  html('#readout span').textContent = `${fixed(trace.seconds(step))} s`;
+  html('#readout span').textContent = trace.timeText(step);
 }
 
 /**

@@ -273,7 +273,7 @@ export class Page {
     if (any('task', 'filter', 'data', 'episode', 'faults', 'run')) this.finetune.load();
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
-    if (any('component', 'weights', 'track', 'charts')) this.#showComponent(this.#trace);
+    if (any('component', 'weights', 'track', 'charts', 'time')) this.#showComponent(this.#trace);
     if (any('plane', 'others')) this.angleSlider.show(this.#trace);
     if (any('step', 'angle', 'beside', 'map', 'plane', 'others')) this.#move(this.#trace);
   }
@@ -484,5 +484,9 @@ export class Page {
     const names = this.#trace?.components.map(({ name }) => name) ?? [];
     const index = names.indexOf(this.#store.state.component);
     if (names.length) this.#store.set({ component: names[(index + 1) % names.length] });
+  }
+
+  switchTimeAxis() {
+    this.#store.set({ time: this.#store.state.time === 'steps' ? 'seconds' : 'steps' });
   }
 }

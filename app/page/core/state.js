@@ -24,6 +24,7 @@ import { displayName } from './units.js';
  * @property {string} track lowest chart: a key of `TRACKS`, or a column of a filter's own scalars
  * @property {string} charts of the timeline from top to bottom (chart_list.js), empty for the default
  * @property {string} window visible steps such as 20-60, empty for all
+ * @property {string} time axis of the timeline: `steps` or `seconds`
  * @property {string} diagnostic selected diagnostic, empty for the list
  * @property {string} options of the diagnostic, URL-encoded: size=21
  * @property {string} over episodes of the diagnosis and of diagnostics: `episode` (the selected one) or `held-out`
@@ -85,6 +86,7 @@ const CHOICES = {
   tab: ['scene', ...TABS],
   weights: ['raw', 'effective'],
   track: Object.keys(TRACKS),
+  time: ['steps', 'seconds'],
   over: ['episode', 'held-out'],
   list: ['events', 'episodes'],
   among: ['held-out', 'all'],

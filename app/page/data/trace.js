@@ -8,6 +8,7 @@ import { displayUnit, fixed, mainUnit, wrapDegrees } from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
+const MAX_TIME_DIGITS = 4;
 
 /**
  * Returns the label of a modality's estimate: the prior of the fused filter, updated with this modality only.
@@ -95,6 +96,15 @@ export class Trace {
    */
   seconds(step) {
     return this.#slice('time')?.[step] ?? step * this.dt;
+  }
+
+  /**
+   * Returns the time since step 0 with its unit, such as 2.60 s, with decimals that distinguish neighbouring steps.
+   * @param {number} step
+   */
+  timeText(step) {
+    const digits = Math.max(1, Math.ceil(-Math.log10(this.dt) - 1e-9));
+    return `${fixed(this.seconds(step), Math.min(digits, MAX_TIME_DIGITS))} s`;
   }
 
   /** Duration of the steps: `0.10 s`, or the shortest and the longest. */

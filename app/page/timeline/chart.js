@@ -1,8 +1,11 @@
-/** A chart of the timeline: a uPlot chart without its own cursor, legend and step axis, with shaded intervals. */
+/** A chart of the timeline: a uPlot chart without its own cursor and legend, with shaded intervals. */
+
+/** @import { StepAxis } from './step_axis.js' */
 
 import { context2d } from '../core/dom.js';
 import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
 import { drawStack } from './stack.js';
+import { STEPS } from './step_axis.js';
 
 /**
  * @typedef {object} Series
@@ -34,6 +37,7 @@ import { drawStack } from './stack.js';
  * @property {number} height px
  * @property {() => Interval} window visible steps
  * @property {number} steps
+ * @property {StepAxis} axis
  * @property {boolean} withAxis whether the step axis has numbers
  *
  * @typedef {{stroke: string, grid: uPlot.Axis.Grid, ticks: uPlot.Axis.Ticks, font: string}} AxisStyle
@@ -79,6 +83,12 @@ export function chart(parent, track, shading, frame) {
     font: FONT,
   };
   const { bounds } = track;
+  const { axis } = frame;
+  /** @returns {Interval} */
+  const range = () => {
+    const [from, to] = frame.window();
+    return [axis.position(from), axis.position(to)];
+  };
   return new uPlot(
     {
       width: frame.width,
@@ -88,7 +98,7 @@ export function chart(parent, track, shading, frame) {
       legend: { show: false },
       select: { show: false, left: 0, top: 0, width: 0, height: 0 },
       scales: {
-        x: { time: false, range: () => frame.window() },
+        x: { time: false, range },
         y: { distr: track.log ? 3 : 1, range: () => valueRange(track, frame.window()) },
       },
       axes: [
@@ -104,18 +114,19 @@ export function chart(parent, track, shading, frame) {
       ...lines(track),
       hooks: {
         drawClear: [
-          (plot) => drawStack(plot, track),
+          (plot) => drawStack(plot, track, axis),
           (plot) =>
             shadeIntervals(
               plot,
               shading,
               track.series.some(({ stacked }) => stacked),
+              axis,
             ),
         ],
         drawAxes: [(plot) => void (bounds && shadeBounds(plot, bounds))],
       },
     },
-    chartData(track, frame.steps),
+    chartData(track, frame.steps, axis),
     parent,
   );
 }
@@ -146,18 +157,19 @@ function lines(track) {
 }
 
 /**
- * Returns uPlot's data for a track: the steps, the edges of the bands and the lines.
+ * Returns uPlot's data for a track: the positions of the steps, the edges of the bands and the lines.
  * @param {Track} track
  * @param {number} steps
+ * @param {StepAxis} [axis]
  * @returns {uPlot.AlignedData}
  */
-export function chartData({ series }, steps) {
+export function chartData({ series }, steps, axis = STEPS) {
   const edges = series.flatMap(({ values, sigma }) =>
     sigma ? [2, -2].map((factor) => values.map((v, t) => v + factor * sigma[t])) : [],
   );
   const values = series.map((item) => item.values);
   return [
-    Float64Array.from({ length: steps }, (_, t) => t),
+    Float64Array.from({ length: steps }, (_, t) => axis.position(t)),
     ...edges,
     ...(values.length ? values : [new Array(steps).fill(null)]),
   ];
@@ -192,8 +204,9 @@ function valueAxis({ log, note }, { grid, ticks }) {
  * @param {Frame} frame
  * @returns {uPlot.Axis}
  */
-function stepAxis(style, { withAxis }) {
-  const axis = { ...style, gap: 2, space: scaled(60), incrs: STEP_INCREMENTS };
+function stepAxis(style, { withAxis, axis: { inSeconds } }) {
+  const increments = inSeconds ? {} : { incrs: STEP_INCREMENTS };
+  const axis = { ...style, gap: 2, space: scaled(60), ...increments };
   if (!withAxis)
     return {
       ...axis,
@@ -259,16 +272,18 @@ function extremesOf({ name, values, sigma }, first, last) {
  * @param {uPlot} plot
  * @param {Shading} shading
  * @param {boolean} [hasAreas] whether areas fill the chart, whose colours a band for contact would change: it is a strip
+ * @param {StepAxis} [axis]
  */
-export function shadeIntervals(plot, shading, hasAreas = false) {
+export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
   const { contact, blackout, edits, failure = [], repair = [] } = shading;
   const { ctx, bbox } = plot;
   /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] @param {number} [top] */
   const shade = (intervals, fill, height = bbox.height, top = bbox.top) => {
     ctx.fillStyle = fill ?? 'transparent';
     for (const [first, last] of intervals) {
-      const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));
-      const right = Math.min(bbox.left + bbox.width, plot.valToPos(last + 0.5, 'x', true));
+      const left = Math.max(bbox.left, plot.valToPos(axis.position(first - 0.5), 'x', true));
+      const end = plot.valToPos(axis.position(last + 0.5), 'x', true);
+      const right = Math.min(bbox.left + bbox.width, end);
       if (right > left) ctx.fillRect(left, top, Math.max(right - left, 1), height);
     }
   };
@@ -278,9 +293,9 @@ export function shadeIntervals(plot, shading, hasAreas = false) {
     const strip = STRIP_HEIGHT * devicePixelRatio;
     const bottom = bbox.top + bbox.height - strip;
     shade(contact, colour('contact'), strip, bottom);
-    labelIntervals(plot, contact, shading.label ?? '', bottom, colour('surface'), null);
+    labelIntervals(plot, axis, contact, shading.label ?? '', bottom, colour('surface'), null);
     shade(blackout, hatching(ctx), strip);
-    labelIntervals(plot, blackout, 'no image', bbox.top, colour('ink'), colour('surface'));
+    labelIntervals(plot, axis, blackout, 'no image', bbox.top, colour('ink'), colour('surface'));
   } else {
     shade(contact, colour('contact-band'));
     shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
@@ -294,20 +309,22 @@ export function shadeIntervals(plot, shading, hasAreas = false) {
 /**
  * Writes a label into each interval that has room for it.
  * @param {uPlot} plot
+ * @param {StepAxis} axis
  * @param {Interval[]} intervals
  * @param {string} text
  * @param {number} top of the strip
  * @param {string} ink
  * @param {string | null} background
  */
-function labelIntervals({ ctx, bbox, valToPos }, intervals, text, top, ink, background) {
+function labelIntervals({ ctx, bbox, valToPos }, axis, intervals, text, top, ink, background) {
   const height = STRIP_HEIGHT * devicePixelRatio;
   ctx.font = `${scaled(9.5) * devicePixelRatio}px system-ui, sans-serif`;
   [ctx.textAlign, ctx.textBaseline] = ['center', 'middle'];
   const width = ctx.measureText(text).width + 6 * devicePixelRatio;
   for (const [first, last] of intervals) {
-    const left = Math.max(bbox.left, valToPos(first - 0.5, 'x', true));
-    const right = Math.min(bbox.left + bbox.width, valToPos(last + 0.5, 'x', true));
+    const left = Math.max(bbox.left, valToPos(axis.position(first - 0.5), 'x', true));
+    const end = valToPos(axis.position(last + 0.5), 'x', true);
+    const right = Math.min(bbox.left + bbox.width, end);
     if (right - left < width) continue;
     const centre = (left + right) / 2;
     ctx.fillStyle = background ?? 'transparent';

@@ -1,9 +1,10 @@
-/** The menu that adds, removes and reorders the charts of the timeline. */
+/** The menu that adds, removes and reorders the charts of the timeline, and selects its time axis. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
 import { create, html } from '../core/dom.js';
+import { choice } from '../widgets/pickers.js';
 import { FIXED_CHARTS, chartKeys, formatCharts, moved, toggled } from './chart_list.js';
 import { trackOptions } from './tracks.js';
 
@@ -51,6 +52,12 @@ export class ChartMenu {
   #draw() {
     const trace = this.#trace;
     if (!trace) return;
+    /** @type {[string, string][]} */
+    const axes = [
+      ['steps', 'steps'],
+      ['seconds', 'seconds'],
+    ];
+    choice(html('#time-axis'), axes, this.#store.state.time, (time) => this.#store.set({ time }));
     const { track } = this.#store.state;
     const options = trackOptions(trace, track).filter(([key]) => key !== track);
     /** @type {Map<string, string>} */

@@ -5,7 +5,6 @@
 
 import { create } from '../core/dom.js';
 import { cssVariable } from '../core/palette.js';
-import { fixed } from '../core/units.js';
 import { formatValue } from './legend.js';
 
 const DISTANCE = 14; // px from the pointer
@@ -60,7 +59,7 @@ export class HoverValues {
   move(trace, step, { x, y, width, height }) {
     const groups = trace.groups.filter((name) => trace.group(name)[step]);
     const states = [...groups, ...(trace.blackout[step] ? ['image blackout'] : [])];
-    const time = `step ${step} · ${fixed(trace.seconds(step))} s`;
+    const time = `step ${step} · ${trace.timeText(step)}`;
     this.#title.textContent = [time, ...states].join(' · ');
     for (const { text, track, index } of this.#cells)
       text.data = formatValue(track.series[index].values[step], track);

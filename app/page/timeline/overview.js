@@ -2,6 +2,7 @@
 
 /** @import { EventMarks } from './event_marks.js' */
 /** @import { Shading } from './chart.js' */
+/** @import { StepAxis } from './step_axis.js' */
 /** @import { StepWindow } from './step_window.js' */
 
 import { create, context2d } from '../core/dom.js';
@@ -11,6 +12,7 @@ import { GUTTER, hatching } from './chart.js';
 /**
  * @typedef {object} Target of the overview
  * @property {() => StepWindow} all steps
+ * @property {() => StepAxis} axis
  * @property {() => StepWindow} window
  * @property {(window: StepWindow) => void} setWindow
  * @property {(step: number, timeStamp: number) => void} scrub
@@ -114,15 +116,17 @@ export class Overview {
 
   /** @param {number} step */
   #x(step) {
-    const [first, last] = this.#target.all();
-    return GUTTER.left + ((step - first) / (last - first)) * this.#width;
+    const axis = this.#target.axis();
+    const [first, last] = this.#target.all().map(axis.position);
+    return GUTTER.left + ((axis.position(step) - first) / (last - first)) * this.#width;
   }
 
   /** @param {PointerEvent} event */
   #stepAt({ clientX }) {
-    const [first, last] = this.#target.all();
+    const axis = this.#target.axis();
+    const [first, last] = this.#target.all().map(axis.position);
     const share = (clientX - this.#host.getBoundingClientRect().left - GUTTER.left) / this.#width;
-    return first + Math.min(Math.max(share, 0), 1) * (last - first);
+    return axis.step(first + Math.min(Math.max(share, 0), 1) * (last - first));
   }
 
   /** @param {PointerEvent} event */

@@ -1,6 +1,7 @@
 /** Stacked areas: fusion weights, which sum to one, with a column for each step. */
 
 /** @import { Series, Track } from './chart.js' */
+/** @import { StepAxis } from './step_axis.js' */
 
 import { colour, cssVariable, lineStyle, translucent } from '../core/palette.js';
 
@@ -45,8 +46,9 @@ export const opacity = (index) => OPACITIES[index % OPACITIES.length];
  * Draws the stacked series of a track: areas for the run, light edges for the comparison run.
  * @param {uPlot} plot
  * @param {Track} track
+ * @param {StepAxis} axis
  */
-export function drawStack(plot, track) {
+export function drawStack(plot, track, axis) {
   const { ctx, bbox } = plot;
   const stacked = track.series.filter((item) => item.stacked);
   if (!stacked.length) return;
@@ -58,41 +60,44 @@ export function drawStack(plot, track) {
   const edges = upperEdges(run);
   run.forEach(({ name }, i) => {
     ctx.fillStyle = translucent(lineStyle(name).stroke, opacity(i));
-    ctx.fill(columns(plot, edges[i], edges[i - 1] ?? null));
+    ctx.fill(columns(plot, axis, edges[i], edges[i - 1] ?? null));
   });
   ctx.strokeStyle = colour('ink');
   ctx.lineWidth = devicePixelRatio;
-  for (const edge of edges.slice(0, -1)) ctx.stroke(steps(plot, edge));
+  for (const edge of edges.slice(0, -1)) ctx.stroke(steps(plot, axis, edge));
   ctx.strokeStyle = colour('surface');
   ctx.lineWidth = 1.5 * devicePixelRatio;
   const others = upperEdges(stacked.filter(({ comparison }) => comparison));
-  for (const edge of others.slice(0, -1)) ctx.stroke(steps(plot, edge));
+  for (const edge of others.slice(0, -1)) ctx.stroke(steps(plot, axis, edge));
   ctx.restore();
 }
 
 /**
  * First and last step whose columns are visible.
  * @param {uPlot} plot
+ * @param {StepAxis} axis
  * @param {ArrayLike<number>} values
  */
-function visibleSteps({ scales }, values) {
+function visibleSteps({ scales }, axis, values) {
   const { min = 0, max = 0 } = scales.x;
-  return [Math.max(0, Math.floor(min)), Math.min(values.length - 1, Math.ceil(max))];
+  const [from, to] = [axis.step(min), axis.step(max)];
+  return [Math.max(0, Math.floor(from)), Math.min(values.length - 1, Math.ceil(to))];
 }
 
 /**
  * The area between two edges as one rectangle for each step.
  * @param {uPlot} plot
+ * @param {StepAxis} axis
  * @param {ArrayLike<number>} top
  * @param {ArrayLike<number> | null} bottom null for zero
  */
-function columns(plot, top, bottom) {
+function columns(plot, axis, top, bottom) {
   const path = new Path2D();
-  const [first, last] = visibleSteps(plot, top);
+  const [first, last] = visibleSteps(plot, axis, top);
   const y = (/** @type {number} */ value) => plot.valToPos(value, 'y', true);
-  let left = Math.round(plot.valToPos(first - 0.5, 'x', true));
+  let left = Math.round(plot.valToPos(axis.position(first - 0.5), 'x', true));
   for (let t = first; t <= last; t++) {
-    const right = Math.round(plot.valToPos(t + 0.5, 'x', true));
+    const right = Math.round(plot.valToPos(axis.position(t + 0.5), 'x', true));
     const base = bottom ? bottom[t] : 0;
     // Whole pixels: otherwise a gap shows between neighbours.
     if (Number.isFinite(top[t])) path.rect(left, y(top[t]), right - left, y(base) - y(top[t]));
@@ -104,16 +109,19 @@ function columns(plot, top, bottom) {
 /**
  * An edge as a line with a tread for each step.
  * @param {uPlot} plot
+ * @param {StepAxis} axis
  * @param {ArrayLike<number>} edge
  */
-function steps(plot, edge) {
+function steps(plot, axis, edge) {
   const path = new Path2D();
-  const [first, last] = visibleSteps(plot, edge);
+  const [first, last] = visibleSteps(plot, axis, edge);
   let drawing = false;
   for (let t = first; t <= last; t++) {
     if (Number.isFinite(edge[t])) {
       const y = plot.valToPos(edge[t], 'y', true);
-      const [left, right] = [t - 0.5, t + 0.5].map((x) => plot.valToPos(x, 'x', true));
+      const [left, right] = [t - 0.5, t + 0.5].map((step) =>
+        plot.valToPos(axis.position(step), 'x', true),
+      );
       if (drawing) path.lineTo(left, y);
       else path.moveTo(left, y);
       path.lineTo(right, y);

@@ -6,6 +6,7 @@
 /** @import { Shading, Track } from './chart.js' */
 /** @import { EventMark } from './event_marks.js' */
 /** @import { ValueCell } from './legend.js' */
+/** @import { StepAxis } from './step_axis.js' */
 /** @import { StepWindow } from './step_window.js' */
 
 import { create, element, html } from '../core/dom.js';
@@ -21,6 +22,7 @@ import { isCompact, isDense, layoutKey, noteElement, trackHeights } from './layo
 import { formatValue, legend, updateLegend } from './legend.js';
 import { Overview } from './overview.js';
 import { StandalonePicker } from './standalone_picker.js';
+import { STEPS, secondsAxis } from './step_axis.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
 import { TrackSizes } from './track_sizes.js';
 import { selectedError, trackOptions, tracks } from './tracks.js';
@@ -54,6 +56,8 @@ export class Timeline {
   #window = [0, 1];
   #plot = { left: 0, width: 1 }; // px in the host
   #origin = { left: 0, top: 0 }; // px of the host in the browser window
+  /** @type {StepAxis} */
+  #axis = STEPS;
   #step = 0;
   /** Step below the pointer. @type {number | null} */
   #hover = null;
@@ -88,6 +92,7 @@ export class Timeline {
     this.#marks = new EventMarks(html('#marks', body), store);
     this.#overview = new Overview(html('#overview', body), this.#marks, {
       all: () => this.#allSteps,
+      axis: () => this.#axis,
       window: () => this.#window,
       setWindow: (window) => this.#setWindow(window),
       scrub: (step, inputTime) => store.set({ step: this.#nearest(step) }, { inputTime }),
@@ -134,7 +139,6 @@ export class Timeline {
     this.#standalone.show(trace);
     this.#group.show(trace.groups);
     this.#menu.show(trace);
-    this.#stepLabel.textContent = `step, ${trace.stepText} each`;
     this.redraw();
     this.#setWindow(this.#window);
   }
@@ -144,6 +148,11 @@ export class Timeline {
     if (!this.#trace) return;
     const { state } = this.#store;
     const comparison = this.#activeComparison;
+    this.#axis = state.time === 'seconds' ? secondsAxis(this.#trace) : STEPS;
+    const { stepText } = this.#trace;
+    this.#stepLabel.textContent = this.#axis.inSeconds
+      ? `time in s, ${stepText} steps`
+      : `step, ${stepText} each`;
     this.#tracks = tracks(this.#trace, state, comparison);
     const options = trackOptions(this.#trace, state.track);
     this.#trackSelect.replaceChildren(...options.map(([key, label]) => new Option(label, key)));
@@ -164,7 +173,8 @@ export class Timeline {
     }
     this.#tracks.forEach((track, i) => Object.assign(track, grown[i]));
     this.#updateShading();
-    for (const { plot, track } of this.#charts) plot.setData(chartData(track, trace.steps));
+    for (const { plot, track } of this.#charts)
+      plot.setData(chartData(track, trace.steps, this.#axis));
     this.#updateCursor();
   }
 
@@ -282,15 +292,16 @@ export class Timeline {
 
   /** @param {number} step */
   #x(step) {
-    const [from, to] = this.#window;
-    return this.#plot.left + ((step - from) / (to - from)) * this.#plot.width;
+    const [from, to] = this.#window.map(this.#axis.position);
+    const share = (this.#axis.position(step) - from) / (to - from);
+    return this.#plot.left + share * this.#plot.width;
   }
 
   /** @param {number} clientX */
   #stepAt(clientX) {
-    const [from, to] = this.#window;
+    const [from, to] = this.#window.map(this.#axis.position);
     const share = (clientX - this.#origin.left - this.#plot.left) / this.#plot.width;
-    return from + share * (to - from);
+    return this.#axis.step(from + share * (to - from));
   }
 
   /** @param {number} step */
@@ -304,7 +315,7 @@ export class Timeline {
     this.#window = fitWindow(window, this.#allSteps);
     const text = this.#windowText;
     this.#store.set({ window: text });
-    const [min, max] = this.#window;
+    const [min, max] = this.#window.map(this.#axis.position);
     for (const { plot } of this.#charts) plot.setScale('x', { min, max });
     this.#overview.update();
     this.move(this.#store.state.step);
@@ -363,6 +374,7 @@ export class Timeline {
       height: height + (lowest ? GUTTER.axis - 4 : 0),
       window: () => this.#window,
       steps: trace.steps,
+      axis: this.#axis,
       withAxis: lowest,
     });
     this.#charts.push({ plot, track, top: row.offsetTop, height });
@@ -399,7 +411,7 @@ export class Timeline {
   #showValues(step) {
     if (!this.#trace) return;
     const name = this.#hover === null ? 'cursor' : 'pointer';
-    this.#readout.textContent = `${name} ${step} · ${fixed(this.#trace.seconds(step))} s`;
+    this.#readout.textContent = `${name} ${step} · ${this.#trace.timeText(step)}`;
     updateLegend(this.#cells, step);
   }
 
@@ -410,7 +422,7 @@ export class Timeline {
   #describe(step) {
     const trace = this.#trace;
     if (!trace) return '';
-    const parts = [`step ${step}`, `${fixed(trace.seconds(step))} s`];
+    const parts = [`step ${step}`, trace.timeText(step)];
     if (trace.hasTruth(step))
       parts.push(`error ${withUnit(fixed(trace.error('fused', 'main')?.[step]), trace.mainUnit)}`);
     const groups = trace.groups.filter((name) => trace.group(name)[step]);
