@@ -92,6 +92,14 @@ class Episode:
             return np.full(len(self), self.dt, np.float64)
         return np.concatenate([[self.dt], np.diff(self.time)])[: len(self)]
 
+    @property
+    def duration_text(self) -> str:
+        """Duration of a step, such as ``0.10 s``, or the shortest and the longest."""
+        if self.time is None or len(self) < 2:
+            return f"{self.dt:.2f} s"
+        steps = np.diff(self.time)
+        return f"{steps.min():.2f} to {steps.max():.2f} s"
+
     def __len__(self) -> int:
         return len(self.states)
 

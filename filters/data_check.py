@@ -47,6 +47,9 @@ TOLERANCE = 0.03
 CLIP = 5.0
 """Largest normalised value in features: a single collision must not dominate an episode."""
 
+DURATION_TOLERANCE = 0.05
+"""Relative difference of a step's duration from the task's: jitter of clocks."""
+
 SUMMARIES = PRETRAINED / "data_summary.json"
 
 Array = NDArray[np.float64]
@@ -204,8 +207,29 @@ def _feature_findings(task: Task, summary: Mapping[str, Any], features: Array, i
     return result
 
 
+def duration_warning(checkpoint: Checkpoint, episodes: Sequence[Episode]) -> str | None:
+    """Why the learned dynamics do not fit the durations of the steps; None if they do, and for external filters.
+
+    The built-in dynamics predict over one step of the task and receive no times; external filters receive ``dt``.
+    """
+    if isinstance(checkpoint, ExternalFilter) or not episodes:
+        return None
+    dt = checkpoint.task.dt
+    durations = np.concatenate([episode.durations for episode in episodes])
+    if np.allclose(durations, dt, rtol=DURATION_TOLERANCE, atol=0.0):
+        return None
+    low, high = durations.min(), durations.max()
+    span = f"{low:.3g} s" if np.isclose(low, high) else f"{low:.3g} to {high:.3g} s"
+    return f"steps of the data last {span}; the filter's dynamics predict over {dt:.3g} s and ignore the times"
+
+
 def data_warning(checkpoint: Checkpoint, episodes: Sequence[Episode], faults: Faults = NO_FAULTS) -> str | None:
-    """``findings`` in one line; None without any. faults: injected into the episodes; their sensors are ignored."""
+    """Durations of steps and ``findings`` in one line; None without any.
+
+    faults: injected into the episodes; their sensors are ignored.
+    """
+    if warning := duration_warning(checkpoint, episodes):
+        return warning
     ignored = {key for fault in faults for key in fault.keys(checkpoint.task)}
     result = findings(checkpoint, episodes, [*ignored, *(["control"] if ignored else [])])
     if not result:

@@ -365,7 +365,7 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     first = candidates[0]
     if first.probability < SURE and len(candidates) > 1 and candidates[1].probability > COMPARABLE * first.probability:
         return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
-    since = f" from step {first.steps[0]}" if first.steps is not None and first.steps[0] > 0 else ""
+    since = _since(case, first)
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {first.cause.title}"
@@ -373,6 +373,15 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
         text += f"; and {second.cause.title[0].lower()}{second.cause.title[1:]}, probability {second.probability:.2f}"
     return f"{text}; the filter is unaffected" if masked else text
+
+
+def _since(case: Case, candidate: Candidate) -> str:
+    """The first step of a cause and its time; empty without steps, and for causes of the whole episode."""
+    if candidate.steps is None or candidate.steps[0] <= 0:
+        return ""
+    step = candidate.steps[0]
+    episodes = [t.episode for t in case.traces if t.episode_index in candidate.episodes[:1]] or [case.traces[0].episode]
+    return f" from step {step} ({episodes[0].times[step]:.1f} s)"
 
 
 def _provenance(case: Case) -> dict[str, Any]:

@@ -242,7 +242,7 @@ def weights_figure(trace: Trace) -> Figure:
             axes.set_ylabel(f"weight, {task.components[i].label}" if component_wise else "weight")
         for axes in charts:
             _shade_phases(axes, trace)
-        charts[-1].set_xlabel("step")
+        charts[-1].set_xlabel(f"step, {trace.episode.duration_text} each")
         for axes in (charts[0], charts[len(task.map_indices)]):
             axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
     return figure

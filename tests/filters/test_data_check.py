@@ -50,6 +50,20 @@ def test_no_warning_for_clean_episodes(checkpoint: Checkpoint, fresh: list[Episo
     assert [data_warning(checkpoint, sample) for sample in samples] == [None] * len(samples)
 
 
+def test_other_durations_of_steps(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
+    """The built-in dynamics ignore the times: jitter of 1 % has no warning, half and irregular steps have one."""
+    (episode, *_), dt = fresh, checkpoint.task.dt
+    jitter = np.random.default_rng(0).uniform(0.99, 1.01, len(episode))
+    assert data_warning(checkpoint, [replace(episode, time=np.cumsum(dt * jitter) - dt)]) is None
+    half = data_warning(checkpoint, [replace(episode, dt=dt / 2)])
+    assert (
+        half
+        == f"steps of the data last {dt / 2:.3g} s; the filter's dynamics predict over {dt:.3g} s and ignore the times"
+    )
+    gap = np.arange(len(episode)) * dt + np.where(np.arange(len(episode)) < 5, 0.0, 1.0)
+    assert f"last {dt:.3g} to {dt + 1:.3g} s" in (data_warning(checkpoint, [replace(episode, time=gap)]) or "")
+
+
 @pytest.mark.parametrize("axes", [[1, 0, 2], [2, 1, 0], [0, 2, 1]])
 def test_swapped_force_axes(checkpoint: Checkpoint, fresh: list[Episode], axes: list[int]) -> None:
     """Only relations between channels show it: each axis by itself stays within the training data."""
