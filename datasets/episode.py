@@ -80,6 +80,11 @@ class Episode:
             return self.contact.astype(np.float32)
         return self.covariates.get(name, np.full(len(self), np.nan, np.float32))
 
+    def present(self, key: str) -> NDArray[np.bool_]:
+        """(T,): whether a step has a reading of a sensor (``Task.masks``); other steps repeat the last one."""
+        name = self.task.masks.get(key)
+        return np.ones(len(self), np.bool_) if name is None else np.asarray(self.covariate(name) != 0.0)
+
     @property
     def times(self) -> NDArray[np.float64]:
         """(T,) s since the first step."""
@@ -115,6 +120,16 @@ class Episode:
             digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
             digest.update(array.tobytes())
         return digest.hexdigest()
+
+
+def hold(readings: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:
+    """Readings (T, ...) with the last present one at absent steps, and zeros before the first one."""
+    if present.all():
+        return readings
+    last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
+    held = readings[np.maximum(last, 0)]
+    held[last < 0] = 0
+    return held
 
 
 def time_error(time: NDArray[Any]) -> str:

@@ -198,6 +198,8 @@ class Task:
             absent, as are ranges of scans that are not above 0.
         periods: observation key -> s between the readings of a sensor that is slower than the steps and repeats its
             last reading, so that these repetitions are no fault.
+        masks: observation key -> boolean covariate that is 1 at the steps with a reading, of a sensor whose readings
+            are absent at other steps, which repeat the last one (``Episode.present``).
         warmup: first steps that are excluded from metrics, because runs start at the truth.
     """
 
@@ -221,6 +223,7 @@ class Task:
     covariates: Mapping[str, Covariate] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
     periods: Mapping[str, float] = field(default_factory=dict)
+    masks: Mapping[str, str] = field(default_factory=dict)
     scans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     clouds: tuple[str, ...] = ()
 

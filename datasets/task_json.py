@@ -52,6 +52,7 @@ def task_from_json(values: Any) -> Task:
             warmup=values["warmup"],
             arrays=tuple(values.get("arrays", ())),  # definitions of earlier versions lack it
             periods=dict(values.get("periods", {})),
+            masks=dict(values.get("masks", {})),
             scans=_tuples(values.get("scans", {})),
             clouds=tuple(values.get("clouds", ())),
             **_covariates(values),
@@ -217,6 +218,13 @@ def _check_covariates(task: Task, place: str) -> None:
         ):
             raise BadInput(f"{where} has groups {covariate.groups!r:.200}, expected {expected or 'one or more'} names.")
         groups += covariate.group_names(name)
+    flags = [name for name, covariate in task.covariates.items() if covariate.kind == "boolean" and name != "contact"]
+    for key, name in task.masks.items():
+        if key not in task.observations or name not in flags or [*task.masks.values()].count(name) > 1:
+            raise BadInput(
+                f"{place}: mask of {key!r:.200} is {name!r:.200}, expected an observation and a boolean covariate of "
+                f"its own: {', '.join(flags) or 'there is none'}."
+            )
     if len(set(groups)) < len(groups):
         raise BadInput(f"{place}: groups of its covariates have the same name: {', '.join(groups):.200}.")
 

@@ -146,7 +146,8 @@ class LiveRecorder:
         self._writer: LiveFileWriter | None = None
         self._sizes = {"n": len(self._task.components)}
         self._channels = 0  # of innovations
-        self._held: dict[str, NDArray[Any]] = {}  # last readings of slow sensors
+        task = self._task  # last readings of sensors with absent ones
+        self._held: dict[str, Any] = {key: np.zeros(task.observations[key], task.dtype(key)) for key in task.masks}
         self._times: tuple[float, float] | None = None  # of the first and the last written step
 
     def step(
@@ -168,12 +169,11 @@ class LiveRecorder:
             values: StepTrace returned by the filter's ``step``; for an external filter the mean, (mean, covariance), or
                 a dictionary. The batch axis N = 1 may be missing.
             observations: by the task's keys; some may be missing, at all steps. Those with a period (``Task.periods``)
-                may be missing at later steps, which repeat the last reading.
+                or mask (``Task.masks``) may be missing at single steps, which repeat the last reading.
             control: (c,).
             truth: (n,) true state, if measured, or with quaternions (``Task.states``). Default: NaN.
             contact: whether the robot truly touches the object. Default: the observation ``contact``, if any.
-            covariates: values of the task's other covariates: a number, a bool or the name of a group. A missing one is
-                unknown.
+            covariates: values of the task's other covariates: number, bool or name of a group; unknown if missing.
             qpos: (nq,) joint positions for the replay of the task's simulation.
             evidence: input of the filter's ``step`` that returned the StepTrace.
             time: of the step, s of any clock; at all steps or none. Default: steps times the task's ``dt``.
@@ -181,7 +181,8 @@ class LiveRecorder:
         Raises BadInput at the first step only, for invalid values and if the files cannot be created.
         """
         arrays = self._held | {key: np.array(value) for key, value in observations.items()}
-        self._held = {key: arrays[key] for key in self._task.periods if key in arrays}
+        self._held = {key: arrays[key] for key in (*self._task.periods, *self._task.masks) if key in arrays}
+        covariates = {name: key in observations for key, name in self._task.masks.items()} | dict(covariates)
         row = _Row(
             values
             if isinstance(values, StepTrace)

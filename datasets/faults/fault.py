@@ -15,6 +15,9 @@ from beliefscope.datasets.task import Task
 Readings = NDArray[Any]
 """(T, ...): readings of a sensor at each step."""
 
+Mask = NDArray[np.bool_]
+"""(T,): whether each step has a reading (``Episode.present``)."""
+
 AXES = ("x", "y", "z")
 
 MAX_VALUE = 1e6
@@ -80,13 +83,25 @@ class Fault:
 
     def apply(self, readings: Readings, dt: float, rng: np.random.Generator) -> Readings:
         """(T, ...): faulty readings, a new array of the same type."""
-        steps = np.arange(len(readings))
-        at = (steps >= self.from_) & (steps < (len(steps) if self.to is None else self.to))
-        span = Span(at, min(self.from_, len(steps) - 1), dt)
+        span = self._span(len(readings), dt)
         changed = self.change(readings, span, rng)
         if readings.dtype == np.uint8:
             changed = np.rint(changed).clip(0, 255)
         return choose_steps(span.at, changed, readings).astype(readings.dtype)
+
+    def apply_presence(self, present: Mask, dt: float, rng: np.random.Generator) -> Mask:
+        """(T,): steps with a reading after the fault. rng: in the state that ``apply`` received."""
+        span = self._span(len(present), dt)
+        return np.where(span.at, self.presence(present, span, rng), present)
+
+    def presence(self, present: Mask, span: Span, rng: np.random.Generator) -> Mask:
+        """(T,): steps with a reading if the fault is active at all steps. Most faults change readings only."""
+        return present
+
+    def _span(self, steps: int, dt: float) -> Span:
+        index = np.arange(steps)
+        at = (index >= self.from_) & (index < (steps if self.to is None else self.to))
+        return Span(at, min(self.from_, steps - 1), dt)
 
     def to_json(self) -> dict[str, Any]:
         """``{"fault": name, parameter: value, ...}``; ``from`` and ``to`` only if they differ from the defaults."""

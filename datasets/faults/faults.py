@@ -16,6 +16,7 @@ from beliefscope.datasets.faults.fault import (
     AXES,
     Fault,
     GaussianNoise,
+    Mask,
     Offset,
     Readings,
     Span,
@@ -338,6 +339,9 @@ class Delay(ModalityFault):
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return delay_steps(readings, self.steps)
 
+    def presence(self, present: Mask, span: Span, rng: np.random.Generator) -> Mask:
+        return delay_steps(present, self.steps)
+
 
 @dataclass(frozen=True)
 class Drop(ModalityFault):
@@ -348,12 +352,17 @@ class Drop(ModalityFault):
     steps: int = integer_field(1, "steps", "length of a dropout", minimum=1)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        started = np.concatenate([[0], np.cumsum(span.at & (rng.random(len(readings)) < self.probability))])
-        now = np.arange(1, len(started))
-        lost = started[now] > started[np.maximum(now - self.steps, 0)]
+        lost = self._lost(span, rng)
         if readings.dtype == np.uint8:
             return choose_steps(lost, np.zeros_like(readings), readings)
-        return readings[np.maximum.accumulate(np.where(lost & span.at, 0, now - 1))]
+        return readings[np.maximum.accumulate(np.where(lost & span.at, 0, np.arange(len(lost))))]
+
+    def presence(self, present: Mask, span: Span, rng: np.random.Generator) -> Mask:
+        return present & ~self._lost(span, rng)
+
+    def _lost(self, span: Span, rng: np.random.Generator) -> Mask:  # (T,) steps of a dropout
+        started = np.concatenate([[0], np.cumsum(span.at & (rng.random(len(span.at)) < self.probability))])
+        return np.asarray(started[1:] > started[np.maximum(np.arange(1, len(started)) - self.steps, 0)])
 
 
 FAULTS: dict[str, type[Fault]] = {

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from beliefscope.datasets.episode import Episode, FloatArray
+from beliefscope.datasets.episode import Episode, FloatArray, hold
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.control_faults import ControlFault
 from beliefscope.datasets.faults.fault import Fault, Readings, parameters
@@ -85,18 +85,24 @@ class Faults:
         if not self.sequence:
             return episode
         observations, digest = dict(episode.observations), int(episode.digest()[:16], 16)
+        present = {key: episode.present(key) for key in episode.task.masks}
         for position, fault in enumerate(self.sequence):
             for key in fault.keys(episode.task):
                 if key not in observations:
                     raise unknown_name("observation of the episode", key, observations)
                 # The same random numbers for all sensors of a modality: they drop out together.
-                rng = np.random.default_rng([seed, digest, position])
-                observations[key] = fault.apply(observations[key], episode.dt, rng)
+                rng = [seed, digest, position]
+                observations[key] = fault.apply(observations[key], episode.dt, np.random.default_rng(rng))
+                if key in present:
+                    present[key] = fault.apply_presence(present[key], episode.dt, np.random.default_rng(rng))
+                    observations[key] = hold(observations[key], present[key])
         controls = _controls(episode, observations)
         for position, fault in enumerate(self.sequence):
             if isinstance(fault, ControlFault):
                 controls = fault.apply(controls, episode.dt, np.random.default_rng([seed, digest, position]))
-        return replace(episode, observations=observations, controls=controls)
+        masks = {episode.task.masks[key]: mask.astype(np.float32) for key, mask in present.items()}
+        covariates = {**episode.covariates, **masks} if masks else episode.covariates
+        return replace(episode, observations=observations, controls=controls, covariates=covariates)
 
 
 NO_FAULTS = Faults()

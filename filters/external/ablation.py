@@ -29,13 +29,17 @@ def without(
     task = episode.task
     for modality in modalities:
         check_name(f"modality of task {task.name!r}", modality, task.modalities)
-    observations = dict(episode.observations)
+    observations, covariates = dict(episode.observations), dict(episode.covariates)
     for key in {key for modality in modalities for key in task.modalities[modality]}:
         if key in observations:
             readings = observations[key].copy()
             readings[steps] = _neutral(readings, absent)
             observations[key] = readings
-    return replace(episode, observations=observations)
+        if key in task.masks:
+            present = episode.present(key).astype(np.float32)
+            present[steps] = 0.0
+            covariates[task.masks[key]] = present
+    return replace(episode, observations=observations, covariates=covariates)
 
 
 def with_only(episode: Episode, modalities: Collection[str] | None, absent: Literal["mean", "nan"]) -> Episode:

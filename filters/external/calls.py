@@ -90,7 +90,8 @@ def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:
 def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
     """Observations (T, N, ...) by key, images as uint8; controls (T, N, c).
 
-    Of episodes with their own times, observations also have ``dt`` (T, N): s since the previous step.
+    Of episodes with their own times, observations also have ``dt`` (T, N): s since the previous step. Of sensors with
+    absent readings (``Task.masks``), they have ``KEY.present`` (T, N): 1 at steps with a reading, else 0.
     """
     for number, episode in enumerate(episodes):
         check_shapes(task, episode, f"episode {number}")
@@ -100,6 +101,9 @@ def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tu
     }
     if any(episode.time is not None for episode in episodes):
         observations[DT] = torch.from_numpy(np.stack([episode.durations for episode in episodes], axis=1))
+    for key in task.masks:
+        present = np.stack([episode.present(key) for episode in episodes], axis=1)
+        observations[f"{key}.present"] = torch.from_numpy(present)
     controls = torch.from_numpy(np.stack([episode.controls for episode in episodes], axis=1)).to(dtype)
     return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
@@ -200,5 +204,7 @@ def step_inputs(
     observations = {key: torch.as_tensor(episode.observations[key][index]) for key in task.observations}
     if episode.time is not None:
         observations[DT] = torch.as_tensor(episode.durations[index])
+    for key in task.masks:
+        observations[f"{key}.present"] = torch.as_tensor(episode.present(key)[index])
     typed = {key: v if v.dtype == torch.uint8 else v.to(dtype) for key, v in observations.items()}
     return typed, torch.as_tensor(episode.controls[index]).to(dtype)

@@ -27,19 +27,24 @@ def frozen_images(images: Gray, held: int = 0) -> Mask:
 
 
 def image_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
-    """Statistics of one image sensor; some only with a reference of the same sensor and size."""
-    images = episode.observations[key]
+    """Statistics of one image sensor; some only with a reference of the same sensor and size.
+
+    Steps without an image do not count.
+    """
+    images, present = episode.observations[key], episode.present(key)
+    if not present.any():
+        return {}
     lost = lost_images(images)
-    middle = median_image(images)
+    middle = median_image(images[present])
     values = {
-        f"black/{key}/all": float(lost.mean()),
-        f"frozen/{key}/all": float(frozen_images(images, episode.task.held_steps(key)).mean()),
-        f"noise/{key}/all": _noise(images[~lost & ~frozen_images(images)]),
+        f"black/{key}/all": float(lost[present].mean()),
+        f"frozen/{key}/all": float(frozen_images(images, episode.task.held_steps(key))[present].mean()),
+        f"noise/{key}/all": _noise(images[present & ~lost & ~frozen_images(images)]),
         f"sharpness/{key}/all": _sharpness(middle),
     }
     if HAND in episode.observations:
-        values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND])
-    usable = ~lost
+        values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND], present)
+    usable = present & ~lost
     if reference is None or (reference.key, reference.image.shape) != (key, middle.shape) or not usable.any():
         return values
     brightness = float(brightness_of(middle, reference))
@@ -56,9 +61,9 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     return values
 
 
-def is_usable(images: Gray, held: int = 0) -> bool:
-    """Whether at least half of the images of a window are seen and not frozen. held: as in ``repeats``."""
-    return bool((~lost_images(images) & ~frozen_images(images, held)).mean() >= 0.5)
+def is_usable(images: Gray, present: Mask, held: int = 0) -> bool:
+    """Whether at least half of the images of a window are present, seen and not frozen. held: as in ``repeats``."""
+    return bool((present & ~lost_images(images) & ~frozen_images(images, held)).mean() >= 0.5)
 
 
 def occluded_share(images: Gray, key: str, reference: Reference | None) -> dict[str, float]:
@@ -72,8 +77,8 @@ def occluded_share(images: Gray, key: str, reference: Reference | None) -> dict[
     return {f"occlusion/{key}/all": float(outside.mean())}
 
 
-def image_lag(images: Gray, hand: Array) -> float:
-    """Steps by which images (T, H, W) follow the measured hand (T, d); NaN if unknown.
+def image_lag(images: Gray, hand: Array, present: Mask) -> float:
+    """Steps by which images (T, H, W), at the steps ``present`` (T,), follow the measured hand (T, d); NaN if unknown.
 
     Cross-correlation of the logarithms of two speeds: the mean change of the pixels and that of the hand. The pixels'
     depends neither on the camera's position nor on what else is visible.
@@ -83,7 +88,7 @@ def image_lag(images: Gray, hand: Array) -> float:
     level = noise_level(images[~lost].astype(np.float64)) if (~lost).sum() >= MIN_STEPS else np.zeros(images.shape[1:])
     pixels = np.maximum(change - 3.0 * level, 0.0).mean((1, 2))
     speed = np.linalg.norm(np.diff(hand.astype(np.float64), axis=0), axis=1)
-    known = ~(lost[1:] | lost[:-1] | frozen[1:])
+    known = present[1:] & present[:-1] & ~(lost[1:] | lost[:-1] | frozen[1:])
     late, early = np.log(pixels + 10.0 * MOTION_FLOOR), np.log(speed + MOTION_FLOOR)
     return lag(late[:, None], early[:, None], known)[0]
 

@@ -58,19 +58,28 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
 
 def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | None:
     """(T,) affected steps of a statistic that counts steps; None for others."""
-    readings = episode.observations[key]
+    readings, present = episode.observations[key], episode.present(key)
     match kind:
         case "black":
-            return lost_images(readings)
+            return lost_images(readings) & present
         case "frozen":
-            return long_runs(frozen_images(readings, episode.task.held_steps(key)))
+            return _in_runs(frozen_images(readings, episode.task.held_steps(key)), present)
+        case "stuck" if axis:
+            return _in_runs(stuck(episode, key, AXES.index(axis)), present)
         case "stuck":
-            return long_runs(
-                stuck(episode, key, AXES.index(axis)) if axis else repeats(readings, episode.task.held_steps(key))
-            )
+            return _in_runs(repeats(readings, episode.task.held_steps(key)), present)
         case "saturation":
-            return saturated(readings[:, AXES.index(axis)].astype(np.float64))
+            marked = np.zeros(len(present), dtype=bool)
+            marked[present] = saturated(readings[present, AXES.index(axis)].astype(np.float64))
+            return marked
     return None
+
+
+def _in_runs(mask: Mask, present: Mask) -> Mask:
+    """(T,): steps with readings in long runs of the mask (T,), which steps without readings do not interrupt."""
+    marked = np.zeros(len(mask), dtype=bool)
+    marked[present] = long_runs(mask[present])
+    return marked
 
 
 def _without_lost(series: Array, readings: NDArray[Any]) -> Array:
@@ -84,15 +93,16 @@ def _without_lost(series: Array, readings: NDArray[Any]) -> Array:
 
 def _series(kind: str, key: str, axis: str, episode: Episode, reference: Reference | None) -> Array | None:
     """(T,) sizes of the deviation that a statistic measures; None if it has none."""
-    readings = episode.observations[key].astype(np.float64)
+    readings, present = episode.observations[key].astype(np.float64), episode.present(key)
     match kind:
-        case "noise" | "position noise":
+        case "noise" | "position noise" if present.sum() > 2:
             chosen = readings[:, [AXES.index(axis)]] if axis else readings.reshape(len(readings), -1)
-            size = np.median(np.abs(np.diff(chosen, n=2, axis=0)), axis=1)
+            size = np.median(np.abs(np.diff(chosen[present], n=2, axis=0)), axis=1)
             series = np.log(np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12))
-            return _without_lost(series, episode.observations[key])
+            steps = np.arange(len(readings))
+            return np.interp(steps, steps[present], _without_lost(series, episode.observations[key][present]))
         case "brightness" if reference is not None and reference.image.shape == readings.shape[1:]:
             return _without_lost(np.abs(brightness_of(readings, reference) - 1.0), episode.observations[key])
         case "level":
-            return np.where(free_motion(episode), np.abs(readings[:, AXES.index(axis)]), 0.0)
+            return np.where(free_motion(episode) & present, np.abs(readings[:, AXES.index(axis)]), 0.0)
     return None

@@ -25,13 +25,15 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
     """Level, drift, changes, noise, repeated and saturated readings of each axis of a vector sensor (T, d).
 
     Changes are the 90 % quantile of second differences in free motion: neither a bias nor a drift matters, wherever
-    it begins, but contact without its flag does.
+    it begins, but contact without its flag does. Steps without a reading do not count.
     """
-    readings = episode.observations[key].astype(np.float64)
-    calm = free_motion(episode)
+    readings, present = episode.observations[key].astype(np.float64), episode.present(key)
+    if not present.any():
+        return {}
+    calm = free_motion(episode) & present
     level, slope = robust_line(readings, calm)
     change = np.abs(np.diff(readings, n=2, axis=0))[calm[2:] & calm[1:-1] & calm[:-2]]
-    noise = noise_level(readings)
+    noise = noise_level(readings, present)
     values: dict[str, float] = {}
     for i in range(readings.shape[1]):
         axis = _axis(key, i, readings.shape[1])
@@ -40,15 +42,15 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
             f"drift/{axis}/free motion": float(slope[i] / episode.dt),
             f"change/{axis}/free motion": float(np.quantile(change[:, i], 0.9)) if len(change) else np.nan,
             f"noise/{axis}/all": float(noise[i]),
-            f"stuck/{axis}/all": float(stuck(episode, key, i).mean()),
-            f"saturation/{axis}/all": float(saturated(readings[:, i]).mean()),
+            f"stuck/{axis}/all": float(stuck(episode, key, i)[present].mean()),
+            f"saturation/{axis}/all": float(saturated(readings[present, i]).mean()),
         }
     return values
 
 
 def stuck(episode: Episode, key: str, axis: int) -> Mask:
     """(T,): whether an axis repeats its reading while the hand moves."""
-    same = repeats(episode.observations[key][:, axis], episode.task.held_steps(key))
+    same = repeats(episode.observations[key][:, axis], episode.task.held_steps(key)) & episode.present(key)
     return same & _moving(episode) if key != HAND else same
 
 
@@ -164,9 +166,11 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
         if readings.ndim == 2 and key not in (CONTACT, HAND):
             values |= axis_statistics(episode, key)
     if HAND in episode.observations:
-        noise = noise_level(episode.observations[HAND].astype(np.float64))
+        hand, present = episode.observations[HAND], episode.present(HAND)
+        noise = noise_level(hand.astype(np.float64), present)
         values[f"position noise/{HAND}/all"] = float(np.sqrt(np.square(noise).mean()))
-        values[f"stuck/{HAND}/all"] = float(repeats(episode.observations[HAND], episode.task.held_steps(HAND)).mean())
+        if present.any():
+            values[f"stuck/{HAND}/all"] = float(repeats(hand, episode.task.held_steps(HAND))[present].mean())
     return values | contact_statistics(episode) | wrench_statistics(episode) | control_statistics(episode)
 
 

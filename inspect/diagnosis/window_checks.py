@@ -91,13 +91,14 @@ def deviating_windows(values: Array) -> tuple[int, int] | None:
 def _part(episode: Episode, first: int) -> Episode:
     steps = slice(first, first + LENGTH)
     observations = {key: values[steps] for key, values in episode.observations.items()}
-    return Episode(episode.task, episode.states[steps], observations=observations, dt=episode.dt)
+    covariates = {name: values[steps] for name, values in episode.covariates.items()}
+    return Episode(episode.task, episode.states[steps], observations=observations, dt=episode.dt, covariates=covariates)
 
 
 def _statistics(part: Episode, reference: Reference | None) -> dict[str, float]:
     values = vector_statistics(part)
     for key in image_keys(part):
-        if is_usable(part.observations[key], part.task.held_steps(key)):
+        if is_usable(part.observations[key], part.present(key), part.task.held_steps(key)):
             values |= image_statistics(part, key, reference)
             values |= occluded_share(part.observations[key], key, reference)
     return values

@@ -147,12 +147,15 @@ def phases(trace: Trace) -> dict[str, Mask]:
 
 
 def shaded_groups(trace: Trace) -> dict[str, Mask]:
-    """Group -> mask (T,) of each group of the task's covariates, without those of false values."""
-    return {
-        group: mask
-        for name, covariate in trace.task.covariates.items()
-        for group, mask in list(covariate.masks(name, trace.episode.covariate(name)))[: covariate.shaded]
-    }
+    """Group -> mask (T,) of each group of the task's covariates, without those of false values.
+
+    Of the mask of a sensor (``Task.masks``), the steps without a reading.
+    """
+    groups: dict[str, Mask] = {}
+    for name, covariate in trace.task.covariates.items():
+        masks = list(covariate.masks(name, trace.episode.covariate(name)))
+        groups |= dict(masks[1:] if name in trace.task.masks.values() else masks[: covariate.shaded])
+    return groups
 
 
 GROUPS = {"all": (0, 1, 2, 3), "contact": (2, 3), "free motion": (0, 1), "blackout": (1, 3)}

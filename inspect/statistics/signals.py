@@ -36,15 +36,27 @@ def robust_line(values: Array, at: Mask) -> tuple[Array, Array]:
     return np.median(chosen - slope * steps[:, None], axis=0), slope
 
 
-def noise_level(values: Array) -> Array:
+def noise_level(values: Array, present: Mask | None = None) -> Array:
     """(...,) standard deviation of independent noise in values (T, ...), whatever smooth signal it is added to.
 
-    Median absolute second difference, which has the standard deviation sqrt(6) sigma. NaN for less than 3 values.
+    Median absolute second difference, which has the standard deviation sqrt(6) sigma. With absent values, the distance
+    of a value from the line between its neighbours, which has sqrt(1 + a^2 + b^2) sigma with their weights a and b.
+    NaN for less than 3 values.
+
+    Args:
+        present: (T,) steps with a value; default: all.
     """
-    if len(values) < 3:
+    steps = np.arange(len(values)) if present is None else np.flatnonzero(present)
+    if len(steps) < 3:
         return np.full(values.shape[1:], np.nan)
-    second = np.diff(values, n=2, axis=0)
-    result: Array = np.median(np.abs(second), axis=0) / (NORMAL_MAD * np.sqrt(6.0))
+    if len(steps) == len(values):
+        second: Array = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0) / (NORMAL_MAD * np.sqrt(6.0))
+        return second
+    chosen = values[steps]
+    weight = ((steps[2:] - steps[1:-1]) / (steps[2:] - steps[:-2])).reshape(-1, *[1] * (values.ndim - 1))
+    distance = chosen[1:-1] - weight * chosen[:-2] - (1.0 - weight) * chosen[2:]
+    spread = np.sqrt(1.0 + weight**2 + (1.0 - weight) ** 2)
+    result: Array = np.median(np.abs(distance / spread), axis=0) / NORMAL_MAD
     return result
 
 

@@ -43,7 +43,7 @@ def base_name(reference: str) -> str:
     return match[1] if (match := ELEMENTS.fullmatch(reference)) else reference
 
 
-def _listed(references: References) -> list[str]:
+def listed(references: References) -> list[str]:
     return [references] if isinstance(references, str) else references
 
 
@@ -86,6 +86,7 @@ class ColumnMap:
         episode: column that numbers or names the episodes; empty for a single one.
         state: component -> its column. control: columns. contact: column that is not zero in contact.
         sensors: modality -> columns, or one column of images. covariates: name -> column.
+        valid: modality -> column that is not zero at the steps with a reading of it.
         estimate: recorded estimate: ``filter``: its name; ``mean``; ``std`` or ``covariance``; or ``particles``
             (rows of M n numbers) in their place; ``weights``: modality -> column. Empty for a log without estimates.
     """
@@ -99,6 +100,7 @@ class ColumnMap:
     control: References = field(default_factory=list)
     contact: str = ""
     sensors: Mapping[str, References] = field(default_factory=dict)
+    valid: Mapping[str, str] = field(default_factory=dict)
     covariates: Mapping[str, CovariateColumn] = field(default_factory=dict)
     estimate: Mapping[str, Any] = field(default_factory=dict)
 
@@ -119,7 +121,7 @@ class ColumnMap:
     @property
     def truth(self) -> set[str]:
         """References to columns of the true state."""
-        return {name for component in self.state.values() for name in _listed(component.column) if name}
+        return {name for component in self.state.values() for name in listed(component.column) if name}
 
     @property
     def required(self) -> set[str]:
@@ -127,12 +129,12 @@ class ColumnMap:
         estimate = (self.estimate.get(key, []) for key in VALUES)
         weights = self.estimate.get("weights", {}).values()
         parts = (*self.sensors.values(), self.control, *estimate, *weights)
-        return self.truth | {name for part in parts for name in _listed(part)} | ({self.episode} - {""})
+        return self.truth | {name for part in parts for name in listed(part)} | ({self.episode} - {""})
 
     @property
     def references(self) -> set[str]:
         """References to all columns but ``time``."""
-        others = {self.contact, *(covariate.column for covariate in self.covariates.values())}
+        others = {self.contact, *self.valid.values(), *(covariate.column for covariate in self.covariates.values())}
         return self.required | (others - {""})
 
 
@@ -145,6 +147,12 @@ def read_map(path: Path) -> ColumnMap:
     for key in values:
         check_name(f"key of {path.name}", key, KEYS)
     sensors, estimate = (_table(values, name, path) for name in ("sensors", "estimate"))
+    settings = {name: value for name, value in sensors.items() if isinstance(value, dict)}
+    for name, value in settings.items():
+        if value.keys() != {"column", "valid"} or not isinstance(value["valid"], str):
+            raise BadInput(f"sensor {name!r} is {value!r:.100}, expected columns or {{column = NAME, valid = NAME}}")
+    sensors = {**sensors, **{name: value["column"] for name, value in settings.items()}}
+    valid = {name: value["valid"] for name, value in settings.items()}
     for key in estimate:
         check_name("key of [estimate]", key, ESTIMATE)
     dt = values.get("dt")
@@ -164,9 +172,8 @@ def read_map(path: Path) -> ColumnMap:
             raise BadInput(f"{key} in {path.name} is {value!r:.100}, expected the name of a column or a list of names")
     covariates = {name: _covariate(name, value) for name, value in _table(values, "covariates", path).items()}
     task = values.get("task", path.stem)
-    return ColumnMap(
-        task, state, dt, control=control, sensors=sensors, covariates=covariates, estimate=estimate, **names
-    )
+    columns = {"control": control, "sensors": sensors, "valid": valid, "covariates": covariates}
+    return ColumnMap(task, state, dt, estimate=estimate, **columns, **names)
 
 
 def _table(values: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:

@@ -30,6 +30,9 @@ DECODED = 3
 CLOCK = "clock"
 """Column of the times of the steps."""
 
+NEW = "new message of "
+"""Before the name of a column: whether its topic has had a message since the step before."""
+
 AGE = "age"
 """Field of every topic: s since its last message."""
 
@@ -116,7 +119,7 @@ def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
     The first tick is the first at which every topic of state, sensors, control, estimate and episode has a message;
     covariates are missing (NaN, empty text) before their first. The last tick is the first after the last message of
     the state's topics, or of all topics if the state is unknown. The column ``CLOCK`` has the times of the ticks, s
-    since the first one.
+    since the first one, ``NEW`` before a name whether its topic has had a message since the tick before.
 
     Raises BadInput for unknown topics and fields, topics without messages or whose times do not overlap, more than
     ``LONGEST`` ticks, and values of different shapes.
@@ -149,6 +152,7 @@ def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
                 columns[name] = np.where(index < 0, np.nan, values)
             else:
                 columns[name] = _held(_stacked(name, entry.values[name]), order, index, name)
+            columns[NEW + name] = np.diff(index, prepend=-1) > 0
     return columns
 
 

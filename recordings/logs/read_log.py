@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import CONTACT, Covariate
-from beliefscope.datasets.episode import Episode, time_error
+from beliefscope.datasets.episode import Episode, hold, time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.task_json import check_definition
@@ -26,9 +26,11 @@ from beliefscope.recordings.logs.column_map import (
     CovariateColumn,
     References,
     StateColumn,
+    base_name,
+    listed,
 )
 from beliefscope.recordings.logs.columns import column, joined
-from beliefscope.recordings.logs.messages import CLOCK
+from beliefscope.recordings.logs.messages import CLOCK, NEW
 
 Array = NDArray[np.float64]
 
@@ -61,14 +63,19 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
     rows = _episodes(columns, mapping, len(states))
     dt, times = _times(columns, mapping, rows)
     declared = {name: covariate for name, (covariate, _) in covariates.items()}
-    periods = {name: period for name, array in sensors.items() if (period := _period(array, rows, dt))}
-    task = _task(mapping, states, sensors, controls.shape[1], dt, declared, periods)
+    present = {name: _present(columns, mapping, name, array) for name, array in sensors.items()}
+    masks = {name: f"{name} reading" for name, mask in present.items() if not mask.all()}
+    declared |= {name: Covariate("boolean") for name in masks.values()}
+    values |= {masks[name]: present[name].astype(np.float32) for name in masks}
+    regular = {name: array for name, array in sensors.items() if name not in masks}
+    periods = {name: period for name, array in regular.items() if (period := _period(array, rows, dt))}
+    task = _task(mapping, states, sensors, controls.shape[1], dt, declared, periods, masks)
     return [
         Episode(
             task=task,
             states=states[at],
             controls=controls[at],
-            observations={name: array[at] for name, array in sensors.items()},
+            observations={name: hold(array[at], present[name][at]) for name, array in sensors.items()},
             contact=contact[at] != 0.0,
             qpos=np.zeros((len(at), 0), np.float32),
             dt=dt,
@@ -229,6 +236,18 @@ def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray
     return _float32(column(columns, references, f"sensor {name}"), f"sensor {name!r}")
 
 
+def _present(columns: Columns, mapping: ColumnMap, name: str, readings: NDArray[Any]) -> NDArray[np.bool_]:
+    """(T,): rows with a reading of a sensor: some value is known, ``valid`` is not zero, a topic has a new message."""
+    present = np.isfinite(readings).reshape(len(readings), -1).any(axis=1)
+    if name in mapping.valid:
+        valid = column(columns, mapping.valid[name], f"valid of sensor {name}")
+        if valid.shape != present.shape:
+            raise BadInput(f"valid of sensor {name!r} has shape {valid.shape}, expected {present.shape}")
+        present &= np.nan_to_num(valid) != 0.0
+    messages = [columns[new] for ref in listed(mapping.sensors[name]) if (new := NEW + base_name(ref)) in columns]
+    return present & np.any(messages, axis=0) if messages else present
+
+
 def _float32(values: Array, name: str) -> NDArray[np.float32]:
     """The values in single precision. Raises BadInput for infinite ones and those beyond its range."""
     with np.errstate(over="ignore"):
@@ -305,6 +324,7 @@ def _task(
     dt: float,
     covariates: dict[str, Covariate],
     periods: dict[str, float],
+    masks: dict[str, str],
 ) -> Task:
     units = [component.unit for component in mapping.components]
     spans = np.ptp(np.nan_to_num(states), axis=0)
@@ -322,6 +342,7 @@ def _task(
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
         periods=periods,
+        masks=masks,
         covariates=({"contact": CONTACT} if mapping.contact else {}) | covariates,
         arrays=tuple(name for name, array in sensors.items() if array.ndim > 2 and array.dtype != np.uint8),
     )
