@@ -226,24 +226,25 @@ def _external_runs(
         kept = None if modality is None else (modality,)
         seen = [with_only(episode, kept, external.adapter.absent) for episode in episodes]
         values, names = external.run(seen, seed, start=start)
-        runs[run_name] = _external_run(external.task, values, truth)
+        runs[run_name] = external_run(external.task, values, truth)
         if run_name == FILTER and modalities and "modality_mean" in values:
             for k, name in enumerate(names):
                 moments = {"estimate_mean": values["modality_mean"][:, :, k]}
-                runs[UPDATE.format(name)] = _external_run(external.task, moments, truth)
+                runs[UPDATE.format(name)] = external_run(external.task, moments, truth)
     return runs if start.mean.isnan().any() else runs | {STAY: _stay(external.task, start.mean, truth)}
 
 
-def _external_run(task: Task, values: Mapping[str, Tensor], truth: Tensor) -> Run:
+def external_run(task: Task, values: Mapping[str, Tensor], truth: Tensor) -> Run:
+    """Errors, float64, of the estimates of an external filter (``ExternalFilter.run``), and its covariances or NaN.
+
+    truth: (T, N, n). Angles are wrapped to -pi..pi, rotations as in ``Task.difference``.
+    """
     mean = values["estimate_mean"]
     unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
     return _errors(task, mean, truth), values.get("estimate_covariance", unknown)
 
 
 def _errors(task: Task, mean: Tensor, truth: Tensor) -> Tensor:
-    """(..., n) errors of estimates; angles may exceed pi."""
-    if not task.rotations:
-        return mean - truth
     return torch.from_numpy(task.difference(mean.numpy(), truth.numpy()))
 
 

@@ -17,6 +17,7 @@ from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.filters.evaluate import external_run
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
@@ -193,7 +194,9 @@ def _run(
         progress=progress,
     ).estimate
     mean = filter_.statistics.state_to_si(estimate.mean)
-    return _errors(filter_.task, mean, batch), filter_.statistics.covariance_to_si(estimate.covariance)
+    return filter_.task.difference(mean.numpy(), batch.states.numpy()), filter_.statistics.covariance_to_si(
+        estimate.covariance
+    )
 
 
 def _run_external(
@@ -206,13 +209,8 @@ def _run_external(
 ) -> tuple[Array, Tensor]:
     seen = [with_only(episode, slice_.only or None, external.adapter.absent) for episode in episodes]
     values, _ = external.run(seen, seed, progress)
-    mean = values["estimate_mean"]
-    covariance = values.get("estimate_covariance", torch.full((*mean.shape, mean.shape[-1]), torch.nan))
-    return _errors(external.task, mean, batch), covariance
-
-
-def _errors(task: Task, mean: Tensor, batch: Batch) -> Array:
-    return np.asarray(task.difference(mean.numpy(), batch.states.numpy()), dtype=np.float64)
+    errors, covariance = external_run(external.task, values, batch.states)
+    return errors.numpy(), covariance
 
 
 def sample_steps(episodes: Sequence[Episode], task: Task, count: int) -> Batch:

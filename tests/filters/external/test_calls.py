@@ -12,10 +12,14 @@ import pytest
 import torch
 from torch import nn
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.evaluate import evaluate
+from beliefscope.datasets.task import Component, Task
+from beliefscope.filters.evaluate import evaluate, external_run
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.finetuning.slices import Slice
+from beliefscope.inspect.statistics.episode_sums import measures_of, sum_episodes
 from beliefscope.inspect.statistics.innovations import nis_of
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 
@@ -89,6 +93,36 @@ def test_function_of_whole_sequences() -> None:
     episode = vehicle.drive(5)
     result = trace(external(mean, batched=False), episode)
     np.testing.assert_allclose(result.estimate_mean[:, :2], episode.observations["gps"], rtol=1e-6)
+
+
+class TurnCounter:
+    """Reports its readings with an offset of 0.1, and an angle that counts turns, with unit covariance."""
+
+    def initialize_beliefs(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((1, 2)), np.eye(2)[None]
+
+    def forward(self, observations: dict[str, Any], controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return observations["pose"] + np.array([0.1, 0.1 + 6.0 * np.pi]), np.eye(2)[None]
+
+
+def test_evaluation_and_sums_of_episodes_wrap_angles() -> None:
+    """Both give the errors of 0.1, whatever the number of turns."""
+    components = (Component("x", "m"), Component("heading", "rad"))
+    task = Task("turns", components, {"pose": (2,)}, {"pose": ("pose",)}, 0, 0.1, warmup=0)
+    heading = np.linspace(-3.0, 3.0, 50)
+    pose = np.stack([np.arange(50) / 50, heading], axis=1)
+    episode = Episode(task, pose, observations={"pose": pose})
+    counter = ExternalFilter(Adapter(TurnCounter(), task=task), task, "turns")
+    values, _ = counter.run([episode])
+    errors, covariance = external_run(task, values, torch.from_numpy(episode.states)[:, None])
+    np.testing.assert_allclose(errors.numpy(), 0.1, rtol=1e-4)
+    assert covariance.shape == (50, 1, 2, 2)
+    metrics = evaluate(counter, [episode])
+    sums = sum_episodes([counter], [Slice("all")], [episode]).sums[:, 0, 0]
+    by_name = {measure.name: float(measure.value(sums)[0]) for measure in measures_of(task)}
+    assert metrics.rmse["heading_deg"] == pytest.approx(np.degrees(0.1), rel=1e-5)
+    assert by_name["heading"] == pytest.approx(0.1, rel=1e-5)
+    assert by_name["nees"] == pytest.approx(metrics.nees, rel=1e-6) == pytest.approx(0.01, rel=1e-4)
 
 
 def test_global_generators_are_seeded_and_restored() -> None:
