@@ -26,6 +26,7 @@ from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.filters.names import is_code
 from beliefscope.filters.training.plan import PLANS
 
 CatalogNames = Mapping[tuple[str, str], str]
@@ -159,6 +160,10 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
             raise BadInput(f"study {study.name!r} does not name the training data of {task}")
         path, data_hash = files[task]
         names_ = {"task": task, "filter": filter_, "seed": int(seed.removeprefix("seed")), "preset": results.preset}
+        given = results.given.get(filter_, "")
+        if is_code(given):
+            raise BadInput(f"filter {filter_!r} is code: continue with beliefscope study --filter {given}")
+        names_["given"] = given
         cells.append(names_ | {"source": sources.get(task, task), "data": path, "data_hash": data_hash})
     return {"folder": str(study.folder.resolve()), "preset": results.preset, "cells": cells}
 

@@ -39,6 +39,7 @@ class Results(BaseModel):
 
     Attributes:
         checkpoints: trained cell -> hash; missing in files of earlier versions. cells: cell -> state.
+        given: name -> checkpoint file or build function of each filter that was evaluated only.
     """
 
     preset: str
@@ -47,6 +48,7 @@ class Results(BaseModel):
     rows: list[Annotated[Row, BeforeValidator(_rename)]]
     checkpoints: Mapping[str, str] = {}
     cells: Mapping[CellName, str] = {}
+    given: Mapping[str, str] = {}
 
     @property
     def unfinished(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""A study: filters x tasks x seeds, each trained once and evaluated with image blackouts."""
+"""A study: filters x tasks x seeds, each trained once, and given filters; all evaluated with image blackouts."""
 
 from __future__ import annotations
 
@@ -25,10 +25,13 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters import legacy_names
 from beliefscope.filters.catalog import architecture, filters_of
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from beliefscope.filters.engine import Engine, run_all
 from beliefscope.filters.evaluate import metrics
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Architecture, Filter
+from beliefscope.filters.names import is_code, is_path
+from beliefscope.filters.open_filter import open_filter
 from beliefscope.filters.start_offset import STUDY_OFFSET
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report
 from beliefscope.filters.training.study_table import OFFSET, TRUTH, Document, Row, rows_of, to_csv, to_markdown
@@ -37,12 +40,13 @@ from beliefscope.filters.training.train import measure, train, versions
 
 @dataclass(frozen=True)
 class Cell:
-    """One filter to be trained once, and everything its results depend on.
+    """One filter to be trained once, or a given one, and everything its results depend on.
 
     Attributes:
         task: its name. source: the argument of ``load_task``: the name, or ``path/to/file.py:NAME``.
         filter, seed, preset: names of the architecture and of the training schedule.
         data: file or folder of the episodes. data_hash: of the episodes. skip_bad: whether to skip unusable ones.
+        given: checkpoint file or build function of a filter that is evaluated only; empty for one to be trained.
     """
 
     task: str
@@ -53,6 +57,7 @@ class Cell:
     data: Path
     data_hash: str
     skip_bad: bool = False
+    given: str = ""
 
     def __str__(self) -> str:
         return f"{self.task}/{self.filter}/seed{self.seed}"
@@ -67,29 +72,33 @@ class Cell:
 
     def inputs(self) -> Document:
         """The part of the cell's document that identifies it, as read from JSON."""
-        return {
+        common = {
             "task": self.task,
             "filter": self.filter,
-            "architecture": architecture(self.definition, self.filter).to_json(),
             "seed": self.seed,
-            "plan": json.loads(json.dumps(asdict(PLANS[self.preset]))),
             "blackouts": list(BLACKOUTS),
             "data_hash": self.data_hash,
             "versions": versions(),
         }
+        if self.given:
+            return common | {"checkpoint_hash": given_filter(self.source, self.given).hash}
+        plan = json.loads(json.dumps(asdict(PLANS[self.preset])))
+        return common | {"architecture": architecture(self.definition, self.filter).to_json(), "plan": plan}
 
     def document(self, folder: Path) -> Document | None:
         """The document of the finished or failed cell; None if it is missing, incomplete or of other inputs."""
         try:
             document = read_json(self.path(folder).read_bytes())
-            document["architecture"] = Architecture.from_json(document["architecture"], self.definition).to_json()
-            document["plan"] = legacy_names.rename_keys(document["plan"], legacy_names.PLAN)
+            if not self.given:
+                document["architecture"] = Architecture.from_json(document["architecture"], self.definition).to_json()
+                document["plan"] = legacy_names.rename_keys(document["plan"], legacy_names.PLAN)
             if any(document.get(key) != value for key, value in self.inputs().items()):
                 return None
             if "error" not in document:
-                checkpoint = self.path(folder, ".safetensors").read_bytes()
-                if hashlib.sha256(checkpoint).hexdigest() != document["checkpoint_hash"]:
-                    return None
+                if not is_code(self.given):
+                    checkpoint = self.path(folder, ".safetensors").read_bytes()
+                    if hashlib.sha256(checkpoint).hexdigest() != document["checkpoint_hash"]:
+                        return None
                 if not {f"{blackout:g}" for blackout in BLACKOUTS} <= document[TRUTH].keys():
                     return None
                 to_markdown(rows_of({self: document}))  # fails for an incomplete document
@@ -120,8 +129,8 @@ def study_cells(
     """All cells by task, then seed, then filter, so that a table of all filters is available early.
 
     Args:
-        tasks: names or ``path/to/file.py:NAME``; empty for all with training data. filters: names; empty for all of
-            each task.
+        tasks: names or ``path/to/file.py:NAME``; empty for all with training data. filters: names to train; empty for
+            all of each task. Checkpoint files and build functions are evaluated only, with the tasks that they fit.
         files: data of tasks without a sample dataset, or in its place. note: receives each skipped trajectory.
 
     Raises BadInput for unknown names and unusable data.
@@ -130,9 +139,11 @@ def study_cells(
         raise unknown_name("preset", preset, PLANS)
     sources = list(dict.fromkeys(tasks or [*(name for name in TASKS if name in files or _trains(name)), *files]))
     available = {name for source in sources for name in filters_of(load_task(source))}
+    given = [text for text in filters if is_code(text) or is_path(text)]
     for name in filters:
-        if name not in available:
+        if name not in available and name not in given:
             raise unknown_name("filter", name, sorted(available))
+    fitting = _fitting(sources, given)
     cells = []
     for source in sources:
         task = load_task(source)
@@ -151,7 +162,39 @@ def study_cells(
             for name in filters_of(task)
             if not filters or name in filters
         ]
+        cells += [
+            Cell(task.name, name, 0, preset, source, path, data_hash, skip_bad, text)
+            for name, text in fitting[source].items()
+        ]
     return cells
+
+
+@lru_cache
+def given_filter(source: str, text: str) -> Checkpoint:
+    """A given filter of the task ``source``. Raises BadInput as ``open_filter``."""
+    return open_filter(source, text)
+
+
+def _fitting(sources: Sequence[str], given: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Task -> display name and text of each given filter that fits it. Raises BadInput for one that fits none."""
+    fitting: dict[str, dict[str, str]] = {source: {} for source in sources}
+    for text in given:
+        place = text if is_code(text) else str(Path(text).resolve())
+        errors = []
+        for source, names in fitting.items():
+            try:
+                name = Path(text).stem if not is_code(text) else given_filter(source, place).name
+            except BadInput as error:
+                errors.append(error)
+                continue
+            if name in names or name in filters_of(load_task(source)):
+                raise BadInput(
+                    f"filter {text!r} is displayed as {name!r}, which another filter of the study is; rename it"
+                )
+            names[name] = place
+        if len(errors) == len(fitting):
+            raise errors[0]
+    return fitting
 
 
 def _trains(task: str) -> bool:
@@ -180,7 +223,12 @@ def run_cell(cell: Cell, folder: Path, report: Report | None = None, wait: bool 
             return document
         try:
             document = cell.trained(folder)
-            document = _train_cell(cell, folder, report) if document is None else _evaluate_cell(cell, folder, document)
+            if cell.given:
+                document = _given_cell(cell, folder)
+            elif document is None:
+                document = _train_cell(cell, folder, report)
+            else:
+                document = _evaluate_cell(cell, folder, document)
         except Exception as error:
             document = _failure(cell, error)
         write_atomically(path, json.dumps(_finite(document), indent=1).encode())
@@ -212,6 +260,19 @@ def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
     return trained.record | cell.inputs() | results | {OFFSET: offset_metrics(trained.filter, episodes)}
 
 
+def _given_cell(cell: Cell, folder: Path) -> Document:
+    """The document of a given filter: its metrics; a checkpoint file is copied."""
+    episodes = _episodes(cell.source, cell.data, cell.skip_bad, cell.data_hash)
+    checkpoint = given_filter(cell.source, cell.given)
+    if not is_code(cell.given):
+        write_atomically(cell.path(folder, ".safetensors"), Path(cell.given).read_bytes())
+    filter_ = checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter
+    splits = {split: sum(e.split == split for e in episodes) for split in ("train", "val", "test")}
+    results = {"episodes": splits, "seconds": None, "trivial": trivial(cell.definition, episodes)}
+    metrics = {TRUTH: measure(filter_, held_out(episodes)), OFFSET: offset_metrics(filter_, episodes)}
+    return cell.inputs() | results | metrics
+
+
 def _evaluate_cell(cell: Cell, folder: Path, document: Document) -> Document:
     """The document of a trained cell with its metrics from both starts."""
     episodes = _episodes(cell.source, cell.data, cell.skip_bad, cell.data_hash)
@@ -225,7 +286,7 @@ def held_out(episodes: Sequence[Episode]) -> list[Episode]:
     return by_split["test"] or by_split["val"]
 
 
-def offset_metrics(filter_: Filter, episodes: Sequence[Episode]) -> Document:
+def offset_metrics(filter_: Filter | ExternalFilter, episodes: Sequence[Episode]) -> Document:
     """As ``measure``, on held-out episodes, from starts with ``STUDY_OFFSET``."""
     return measure(filter_, held_out(episodes), STUDY_OFFSET.of(filter_.task))
 
@@ -302,6 +363,7 @@ def write_tables(folder: Path, cells: Sequence[Cell], preset: str) -> tuple[list
         "preset": preset,
         "tasks": {cell.task: {"data": cell.data.name, "data_hash": cell.data_hash} for cell in cells},
         "filters": list(dict.fromkeys(cell.filter for cell in cells)),
+        "given": {cell.filter: cell.given for cell in cells if cell.given},
         "seeds": 1 + max(cell.seed for cell in cells),
         "versions": versions(),
         "cells": {str(c): "missing" if d is None else d.get("error", "finished") for c, d in documents.items()},

@@ -135,7 +135,7 @@ def _row(task: Task, name: str, key: str, blackout: float, requested: Sequence[D
     )
 
 
-def _numbers(metrics: Document, seconds: float) -> dict[str, float | None]:
+def _numbers(metrics: Document, seconds: float | None) -> dict[str, float | None]:
     consistency = {key: metrics[key] for key in ("nll", "nees", "coverage95")}
     return {**metrics["rmse"], **consistency, "seconds": seconds}
 

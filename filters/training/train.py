@@ -19,6 +19,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
 from beliefscope.filters.data_check import summarise
 from beliefscope.filters.evaluate import Metrics, evaluate
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.information_pf import with_particles
@@ -142,13 +143,15 @@ def versions() -> dict[str, str]:
     return {"beliefscope": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
 
 
-def measure(filter_: Filter, episodes: Sequence[Episode], start_offset: StartOffset = NO_OFFSET) -> dict[str, Any]:
+def measure(
+    filter_: Filter | ExternalFilter, episodes: Sequence[Episode], start_offset: StartOffset = NO_OFFSET
+) -> dict[str, Any]:
     """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``, ``"0.95"``).
 
     ``fused``: of the filter, with its ``baselines``, which a blackout does not change, and its single-modality
     ``updates``; a modality's name: of its standalone filter.
     """
-    several = len(filter_.names) > 1
+    several = len(filter_.task.modalities if isinstance(filter_, ExternalFilter) else filter_.names) > 1
     results: dict[str, Metrics] = {}
     for blackout in EVALUATED_BLACKOUTS:
         first = next(iter(results.values()), None)

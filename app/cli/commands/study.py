@@ -16,7 +16,12 @@ if TYPE_CHECKING:
     output=opt.option("DIR", "Study folder; created if missing.", "-o", "--output"),
     preset=opt.option("NAME", "Training schedule: smoke, cpu or full."),
     tasks=opt.option("TASK", "Repeatable. Default: all built-in tasks and those with --data.", "--task"),
-    filters=opt.option("NAME", "Repeatable. Default: all filters of each task.", "--filter"),
+    filters=opt.option(
+        "NAME|FILE",
+        "Filter to train; or a checkpoint (.safetensors) or build function (FILE.py:NAME) to evaluate only. "
+        "Repeatable. Default: all filters of each task.",
+        "--filter",
+    ),
     seeds=opt.option("K", "Train each filter with seeds 0 to K - 1.", parser=opt.integer(1)),
     data=opt.option("TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset."),
     engine=opt.ENGINE,
@@ -38,12 +43,13 @@ def study(
     Trains each filter once per seed and evaluates it with 0, 40 and 80 % image blackout on the test episodes. Writes
     checkpoints and metrics to DIR/cells, and updates DIR/table.md, table.csv, results.svg and results.png after each
     run. Completed runs are skipped, so the same command resumes an interrupted study, and several processes can share
-    one DIR.
+    one DIR. Given checkpoints and external filters are rows beside them, with one seed.
 
     \b
     Examples:
       beliefscope study -o study
       beliefscope study --task door --filter crossmodal-ekf --filter lstm --seeds 5 -o study
+      beliefscope study --task door --filter lstm --filter mine.safetensors --filter own_filter.py:build -o study
       beliefscope study --data push-real=mit_push --data door=door.h5 --preset full --engine ray -o /lab/study
     """
     from beliefscope.filters.training.study import run_cells, run_local, study_cells
