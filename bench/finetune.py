@@ -12,7 +12,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.finetuning.batch_mix import Mix
-from beliefscope.filters.finetuning.loop import FineTuneLoop
+from beliefscope.filters.finetuning.loop import FilterLoop
 from beliefscope.filters.finetuning.module_selection import freeze, select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice
@@ -32,22 +32,20 @@ def measure() -> list[Row]:
         filter_ = load_checkpoint(shipped("push", name)).filter
         mix = Mix.from_shares(filter_.task, filter_.names, settings.shares(), episodes, settings.seed)
         full_filter = copy.deepcopy(filter_)
-        full = backward(FineTuneLoop(full_filter, select_parameters(full_filter), settings, mix, mix))
+        full = backward(FilterLoop(full_filter, select_parameters(full_filter), settings, mix, mix))
         (steps,), images = index_images([mix.steps])
         for preset, bar in BARS.items():
             trained = select_parameters(filter_, [preset])
             freeze(filter_, trained)
             with cached_encoders(filter_, images):
-                cached = backward(
-                    FineTuneLoop(filter_, trained, settings, mix.with_steps(steps), mix.with_steps(steps))
-                )
+                cached = backward(FilterLoop(filter_, trained, settings, mix.with_steps(steps), mix.with_steps(steps)))
                 fast, slow, ratio = subject.alternate(cached, full, REPETITIONS)
             figures = f"{1e3 * fast:.0f} ms, without cache {1e3 * slow:.0f} ms, {ratio:.1f} x"
             rows.append((f"{name}, {preset}", figures, bar))
     return rows
 
 
-def backward(loop: FineTuneLoop) -> Callable[[], None]:
+def backward(loop: FilterLoop) -> Callable[[], None]:
     """Return a function for one forward and backward pass of the windows of step 0."""
 
     def run() -> None:

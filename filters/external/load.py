@@ -16,8 +16,7 @@ The contract (examples in ``docs/own_filter.md``):
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from functools import lru_cache
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,8 +32,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.batch import start_offset
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.catalog import filters_of
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.adapter import (
     SHAPES,
     Adapter,
@@ -60,6 +58,7 @@ from beliefscope.filters.external.calls import (
 )
 from beliefscope.filters.external.fingerprint import fingerprint
 from beliefscope.filters.external.hooks import Capture
+from beliefscope.filters.external.weights import load_weights, pretrained_std
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import START_VARIANCE
 
@@ -124,7 +123,7 @@ class ExternalFilter(Checkpoint):
         if self._units.initial_std is not None:
             own = self._units.initial_std.float() ** 2
         else:
-            own = START_VARIANCE * (self._units.std if self.adapter.std else _state_std(self._task)).float() ** 2
+            own = START_VARIANCE * (self._units.std if self.adapter.std else pretrained_std(self._task)).float() ** 2
         variance = torch.from_numpy(self._task.start_variance()).float()
         variance = torch.where(variance.isnan(), own, variance)
         return Gaussian(mean, torch.diag(variance).expand(len(mean), -1, -1))
@@ -333,7 +332,8 @@ class UnavailableFilter(ExternalFilter):
 def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()) -> ExternalFilter:
     """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` returns when called without arguments.
 
-    The global generators of torch and NumPy are seeded for the call.
+    The global generators of torch and NumPy are seeded for the call. ``NAME@FILE.safetensors`` loads weights into the
+    module, such as those of a fine-tuning.
 
     Args:
         task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.
@@ -343,6 +343,7 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
         BadInput: the name does not exist, the call fails or does not return a filter, or the task differs.
     """
     place, _, attribute = source.rpartition(":")
+    attribute, _, weights = attribute.partition("@")
     with user_code.importable(place):
         module = user_code.load_module(place)
         build = getattr(module, attribute, None)
@@ -357,8 +358,10 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
                 result = build()
         except Exception as error:
             raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
-    name = f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-")
-    return as_external(result, source, task, given, name)
+    if weights:
+        load_weights(result.module if isinstance(result, Adapter) else result, Path(weights), place)
+    names = [Path(place).stem if place.endswith(".py") else place, attribute, Path(weights).stem]
+    return as_external(result, source, task, given, "-".join(filter(None, names)))
 
 
 def as_external(
@@ -389,12 +392,3 @@ def as_external(
     if loaded is None:
         raise BadInput(f"{source} does not name its task: give it an attribute task, or use --task")
     return ExternalFilter(adapter, loaded, name or source, source)
-
-
-@lru_cache(maxsize=16)
-def _state_std(task: Task) -> Tensor:
-    """(n,) m and rad: standard deviations of the pretrained filters' training states; NaN if there are none."""
-    for name in filters_of(task):
-        with suppress(BadInput):  # not every filter is pretrained
-            return load_checkpoint(shipped(task, name)).filter.statistics.mean_std("state")[1]
-    return torch.full((len(task.components),), torch.nan)

@@ -19,7 +19,7 @@ from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix
 from beliefscope.filters.finetuning.calibration import calibrate_noise, noise_parameters
-from beliefscope.filters.finetuning.loop import FineTuneLoop, Validation, validate
+from beliefscope.filters.finetuning.loop import FilterLoop, FineTuneLoop, Validation, validate
 from beliefscope.filters.finetuning.module_selection import digest, freeze, select_parameters
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
 from beliefscope.filters.training.encoder_cache import Images, cached_encoders, index_images
@@ -90,15 +90,15 @@ def finetune(
         raise BadInput("calibrate needs the noise of dynamics and sensors to be trained; add noise-only to --train")
     frozen = freeze(filter_, trained)
     frozen_digest = digest(filter_, frozen)
-    groups, events = _split(episodes, settings.events)
+    groups, events = split_episodes(episodes, settings.events)
     mixes, images = _mixes(filter_, groups, events, settings, device)
     key = cache_key(base=base.hash, settings=settings.to_json(), data=data_hash, versions=versions(), device=device)
     state = Partial(partial, key) if partial else None
     callbacks = Callbacks(report, on_validation, on_resume, stop)
     with cached_encoders(filter_, images):
         before = validate(filter_, mixes["test"], 0, 0.0, settings)
-        loop = FineTuneLoop(filter_, trained, settings, mixes["train"], mixes["val"])
-        seconds = _run(loop, state, began, callbacks)
+        loop = FilterLoop(filter_, trained, settings, mixes["train"], mixes["val"])
+        seconds = run_loop(loop, state, began, callbacks)
         if seconds is None:
             return None
         loop.restore_best()
@@ -157,7 +157,7 @@ def _mixes(
     return {name: mix.with_steps(steps) for (name, mix), steps in zip(mixes.items(), indexed, strict=True)}, images
 
 
-def _run(loop: FineTuneLoop, state: Partial | None, began: float, callbacks: Callbacks) -> float | None:
+def run_loop(loop: FineTuneLoop, state: Partial | None, began: float, callbacks: Callbacks) -> float | None:
     """Runs the loop, from its saved state if there is one; returns the seconds spent in total, None if paused."""
     spent = 0.0
     if state is not None and (saved := state.load()) is not None:
@@ -180,7 +180,7 @@ def _run(loop: FineTuneLoop, state: Partial | None, began: float, callbacks: Cal
     return spent + time.monotonic() - began
 
 
-def _split(
+def split_episodes(
     episodes: Sequence[Episode], events: Sequence[StepRange]
 ) -> tuple[dict[str, list[Episode]], dict[str, dict[int, list[StepRange]]]]:
     """Episodes to train on, validate on and test on; and the events of the first group by position in it."""

@@ -86,7 +86,7 @@ def score(current: Validation, base: Validation, shares: Mapping[str, float], li
 
 
 class FineTuneLoop:
-    """Trains some of a filter's parameters on a mix of slices.
+    """Trains some of a module's parameters on a mix of slices; subclasses have the loss and the metrics.
 
     Every step draws from generators seeded with its number, so that an interrupted run resumes with identical results.
 
@@ -95,13 +95,8 @@ class FineTuneLoop:
         failures: validations since the best one.
     """
 
-    def __init__(
-        self, filter_: Filter, trained: Mapping[str, nn.Parameter], settings: FineTune, train: Mix, val: Mix
-    ) -> None:
-        """Raises BadInput if a slice has no window of this length in the training episodes."""
-        self.filter, self.trained, self.settings = filter_, dict(trained), settings
-        self.train, self.val = train, val
-        self.starts = train.starts(settings.length)
+    def __init__(self, module: nn.Module, trained: Mapping[str, nn.Parameter], settings: FineTune) -> None:
+        self.module, self.trained, self.settings = module, dict(trained), settings
         self.base = {name: p.detach().clone() for name, p in trained.items()}
         self.best = dict(self.base)
         self.gradients = dict.fromkeys(trained, 0.0)
@@ -117,7 +112,7 @@ class FineTuneLoop:
 
     def _rates(self) -> dict[str, float]:
         rate = self.settings.rate
-        encoders = {id(p) for m in self.filter.modules() if isinstance(m, ImageEncoder) for p in m.parameters()}
+        encoders = {id(p) for m in self.module.modules() if isinstance(m, ImageEncoder) for p in m.parameters()}
         rates = {name: rate * ENCODER_RATE if id(p) in encoders else rate for name, p in self.trained.items()}
         if "dynamics.log_noise" in rates:
             rates["dynamics.log_noise"] = rate * NOISE_RATE
@@ -163,32 +158,20 @@ class FineTuneLoop:
 
     def step_loss(self, step: int) -> Tensor:
         """The loss of the windows drawn for this step."""
-        settings, device = self.settings, self.train.steps.states.device
-        seed = int.from_bytes(hashlib.sha256(f"{settings.seed} {step}".encode()).digest()[:7], "big")
-        generator = torch.Generator().manual_seed(seed)
-        noise = torch.Generator(device).manual_seed(seed)
-        windows = self.train.windows(
-            self.train.sample_starts(self.starts, settings.windows, generator), settings.length
-        )
-        evidence = windows.select_evidence(self.filter.encode(windows.batch))
-        return losses.through_filter(
-            self.filter,
-            evidence,
-            windows.batch,
-            noise,
-            settings.particles,
-            settings.likelihood_weight,
-            windows.weight,
-        )
+        raise NotImplementedError
+
+    def measure(self, step: int, loss: float | None) -> Validation:
+        """Metrics of the current weights on the validation episodes."""
+        raise NotImplementedError
 
     def validate(self) -> Validation:
         """Validates the current weights, and stores them if they are the best so far."""
         settings = self.settings
         if not self.validations:
-            validation = validate(self.filter, self.val, 0, None, settings)
+            validation = self.measure(0, None)
         else:
             loss = self.loss / (self.done - self.validations[-1].step)
-            validation = validate(self.filter, self.val, self.done, loss, settings)
+            validation = self.measure(self.done, loss)
             shares = {slice_.name: share for slice_, share in settings.shares().items()}
             total = score(validation, self.validations[0], shares, settings.likelihood_weight)
             validation = replace(validation, score=total)
@@ -216,7 +199,7 @@ class FineTuneLoop:
         return {
             name: [
                 math.sqrt(self.gradients[name] / max(self.done, 1)),
-                float((parameter - self.base[name]).norm()),
+                float((parameter.detach() - self.base[name]).norm()),
                 float(self.base[name].norm()),
             ]
             for name, parameter in self.trained.items()
@@ -246,3 +229,37 @@ class FineTuneLoop:
                         key: value if key == "step" else value.to(parameter.device) for key, value in moments.items()
                     }
         return float(progress["seconds"])
+
+
+class FilterLoop(FineTuneLoop):
+    """The optimisation of a built-in filter on the loss of its training."""
+
+    def __init__(
+        self, filter_: Filter, trained: Mapping[str, nn.Parameter], settings: FineTune, train: Mix, val: Mix
+    ) -> None:
+        """Raises BadInput if a slice has no window of this length in the training episodes."""
+        super().__init__(filter_, trained, settings)
+        self.filter, self.train, self.val = filter_, train, val
+        self.starts = train.starts(settings.length)
+
+    def step_loss(self, step: int) -> Tensor:
+        settings, device = self.settings, self.train.steps.states.device
+        seed = int.from_bytes(hashlib.sha256(f"{settings.seed} {step}".encode()).digest()[:7], "big")
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.Generator(device).manual_seed(seed)
+        windows = self.train.windows(
+            self.train.sample_starts(self.starts, settings.windows, generator), settings.length
+        )
+        evidence = windows.select_evidence(self.filter.encode(windows.batch))
+        return losses.through_filter(
+            self.filter,
+            evidence,
+            windows.batch,
+            noise,
+            settings.particles,
+            settings.likelihood_weight,
+            windows.weight,
+        )
+
+    def measure(self, step: int, loss: float | None) -> Validation:
+        return validate(self.filter, self.val, step, loss, self.settings)

@@ -12,7 +12,9 @@ from beliefscope.recordings.report.command_lines import finetune_command
 
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
+    from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.finetuning.finetune import FineTuned
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
@@ -22,7 +24,10 @@ if TYPE_CHECKING:
 @opt.with_options(
     target=opt.argument("TASK|CHECKPOINT", "Task of the filter given with --filter, or .safetensors file."),
     output=opt.CHECKPOINT,
-    filter=opt.option("NAME|CHECKPOINT", "Name of a built-in filter, or .safetensors file."),
+    filter=opt.option(
+        "NAME|FILE",
+        "Name of a built-in filter, .safetensors file, or build function of an external filter (FILE.py:NAME).",
+    ),
     fault_sets=opt.option("FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", "--faults"),
     clean_weight=opt.option(
         "SHARE",
@@ -78,9 +83,13 @@ def finetune(
     Without --train, --freeze, --slice, --faults and --event, the filter learns a sensor fault that its training data
     lack, for 150 steps: reliability-only learns occluded images; without images, haptics-only learns noisy haptics.
 
+    The file of an external filter defines loss(module, windows) beside its build function; CHECKPOINT then has the
+    weights of its torch module, and FILE.py:NAME@CHECKPOINT is the fine-tuned filter.
+
     \b
     Examples:
       beliefscope finetune push --filter crossmodal-ekf -o finetuned.safetensors
+      beliefscope finetune door --filter own.py:build --freeze dynamics -o finetuned.safetensors
       beliefscope finetune push --filter crossmodal-ekf --slice 'blackout 0.8' -o finetuned.safetensors
       beliefscope finetune mine.safetensors --train haptics-only --faults blackout=0.95 -o finetuned.safetensors
       beliefscope finetune door --filter crossmodal-pf --freeze dynamics --slice contact -o finetuned.safetensors
@@ -88,6 +97,7 @@ def finetune(
       beliefscope finetune push --filter crossmodal-ekf --slice contact --success contact -o finetuned.safetensors
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
+    from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.finetuning.settings import parse_rates
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
@@ -119,6 +129,8 @@ def finetune(
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command = finetune_command(target, filter, data, settings)
         members = list(episodes)
+        if isinstance(base, ExternalFilter):
+            return _external(base, members, settings, output, episodes.hash, command)
         tuned = _run(base, members, settings, partial, log, rerun, data_hash=episodes.hash, command=command)
         profile = measure_profile(tuned.filter, base.name, members, command)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
@@ -126,6 +138,48 @@ def finetune(
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
+
+
+def _external(
+    base: ExternalFilter, episodes: list[Episode], settings: FineTune, output: Path, data_hash: str, command: str
+) -> console.Result:
+    """Fine-tune the module of an external filter on its own loss."""
+    from beliefscope.filters.external.load import load_external
+    from beliefscope.filters.external.weights import save_weights
+    from beliefscope.filters.finetuning.external import finetune_external, loss_of
+    from beliefscope.filters.finetuning.finetune import Callbacks
+    from beliefscope.filters.finetuning.report import error_summary
+
+    validations: list[Validation] = []
+    partial = output.with_name(f"{output.name}.partial")
+    with console.bars() as update:
+
+        def report(step: int, count: int, loss: float) -> None:
+            errors = error_summary(base.task.main_error, validations[0], validations[-1])
+            update("Fine-tuning", step / count, f"loss {loss:.3g}; {errors}")
+
+        result = finetune_external(
+            base,
+            loss_of(base.source),
+            episodes,
+            data_hash=data_hash,
+            settings=settings,
+            command=command,
+            callbacks=Callbacks(
+                report,
+                validations.append,
+                lambda step: console.note(f"resuming after step {step}, from {partial.name}"),
+                lambda: False,
+            ),
+            partial=partial,
+        )
+    assert result is not None, "runs without a stop callback always complete"
+    tensors, record = result
+    save_weights(tensors, output)
+    source = f"{base.source.partition('@')[0]}@{output}"
+    digest = load_external(source, base.task).hash
+    lines = [*_summary(record), "", f"beliefscope change {base.source} {source} --task {base.task.name}"]
+    return opt.checkpoint_result(output, base.task.name, base.name, digest, record, lines)
 
 
 def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) -> Success:
@@ -156,11 +210,12 @@ def _modules_and_data(
     events: Sequence[str],
 ) -> FineTune:
     """Settings with these modules and data, or the default ones of the filter if none are given."""
+    from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.finetuning.defaults import default_settings
     from beliefscope.filters.finetuning.settings import FineTune, StepRange
     from beliefscope.filters.finetuning.slices import parse_slices
 
-    if not any((train, freeze, slices, fault_sets, events)):
+    if not isinstance(base, ExternalFilter) and not any((train, freeze, slices, fault_sets, events)):
         return default_settings(base.filter)
     return FineTune(
         train=tuple(train),

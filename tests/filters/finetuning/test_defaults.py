@@ -13,7 +13,7 @@ from beliefscope.filters.catalog import architecture, build, filters_of
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix
 from beliefscope.filters.finetuning.defaults import default_settings, reason
-from beliefscope.filters.finetuning.loop import FineTuneLoop, Validation
+from beliefscope.filters.finetuning.loop import FilterLoop, Validation
 from beliefscope.filters.finetuning.module_selection import freeze, presets, select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice, parse_slices
@@ -53,7 +53,7 @@ def test_every_offered_preset_has_a_gradient(name: str, short_episodes: Callable
         freeze(filter_, trained)
         for parameter in trained.values():
             parameter.grad = None
-        FineTuneLoop(filter_, trained, settings, mix, mix).step_loss(0).backward()
+        FilterLoop(filter_, trained, settings, mix, mix).step_loss(0).backward()
         assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in trained.values()), preset
 
 
@@ -72,7 +72,7 @@ def test_weights_that_lose_accuracy_on_clean_data_are_not_kept(
     slice_ = Slice("blackout", Faults.parse("blackout=1"))
     settings = FineTune(length=6, windows=2, mix=((slice_, 1.0),), clean_weight=0.1)
     mix = Mix.from_shares(filter_.task, filter_.names, settings.shares(), short_episodes("door", [0], 8), 0)
-    loop = FineTuneLoop(filter_, select_parameters(filter_), settings, mix, mix)
+    loop = FilterLoop(filter_, select_parameters(filter_), settings, mix, mix)
     best = []
     for step in range(3):
         loop.done = step

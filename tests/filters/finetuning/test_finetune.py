@@ -17,7 +17,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.finetuning.batch_mix import Mix
 from beliefscope.filters.finetuning.finetune import FineTuned, finetune
-from beliefscope.filters.finetuning.loop import FineTuneLoop, Validation, score
+from beliefscope.filters.finetuning.loop import FilterLoop, Validation, score
 from beliefscope.filters.finetuning.module_selection import freeze, named_tensors, select_parameters
 from beliefscope.filters.finetuning.report import no_change
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
@@ -73,7 +73,7 @@ def test_cached_encoders_give_the_same_gradients(
 
     def gradients(mix: Mix) -> dict[str, torch.Tensor]:
         filter_.zero_grad(set_to_none=True)
-        loss = FineTuneLoop(filter_, trained, settings, mix, mix).step_loss(3)
+        loss = FilterLoop(filter_, trained, settings, mix, mix).step_loss(3)
         loss.backward()
         return {key: p.grad.clone() for key, p in trained.items() if p.grad is not None} | {"loss": loss.detach()}
 
@@ -212,7 +212,7 @@ def test_l2_sp_is_a_proximal_step(episodes: list[Episode]) -> None:
     filter_ = copy.deepcopy(base().filter)
     trained = select_parameters(filter_, ["weight_model.output"])
     freeze(filter_, trained)
-    loop = FineTuneLoop(filter_, trained, settings, mix_of(episodes[:1], settings), mix_of(episodes[:1], settings))
+    loop = FilterLoop(filter_, trained, settings, mix_of(episodes[:1], settings), mix_of(episodes[:1], settings))
     with torch.no_grad():
         for p in trained.values():
             p.add_(0.5)

@@ -1,0 +1,49 @@
+"""Weights of an external filter's torch module in a safetensors file, and units of a task's pretrained filters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor, nn
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.task import Task
+from beliefscope.filters.catalog import filters_of
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+
+
+def save_weights(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Write the tensors of a module, for ``FILE.py:NAME@PATH``."""
+    write_atomically(path, save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}))
+
+
+def load_weights(module: object, path: Path, place: str) -> None:
+    """Load weights into the module that ``place`` builds.
+
+    Raises BadInput for a file that cannot be read or whose tensors are not those of the module.
+    """
+    if not isinstance(module, nn.Module):
+        raise BadInput(f"{place} builds a {type(module).__name__}, weights need a torch module")
+    try:
+        module.load_state_dict(load_file(path))
+    except (OSError, SafetensorError) as error:
+        raise BadInput(f"weights {str(path)!r} cannot be read: {error!s:.200}") from None
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise BadInput(f"weights {str(path)!r} do not fit {place}: {reason:.200}") from None
+
+
+@lru_cache(maxsize=16)
+def pretrained_std(task: Task) -> Tensor:
+    """(n,) m and rad: standard deviations of the pretrained filters' training states; NaN if there are none."""
+    for name in filters_of(task):
+        with suppress(BadInput):  # not every filter is pretrained
+            return load_checkpoint(shipped(task, name)).filter.statistics.mean_std("state")[1]
+    return torch.full((len(task.components),), torch.nan)
