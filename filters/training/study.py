@@ -183,10 +183,11 @@ def _fitting(sources: Sequence[str], given: Sequence[str]) -> dict[str, dict[str
         errors = []
         for source, names in fitting.items():
             try:
-                name = Path(text).stem if not is_code(text) else given_filter(source, place).name
+                checkpoint = given_filter(source, place)
             except BadInput as error:
                 errors.append(error)
                 continue
+            name = checkpoint.name if is_code(text) else Path(text).stem
             if name in names or name in filters_of(load_task(source)):
                 raise BadInput(
                     f"filter {text!r} is displayed as {name!r}, which another filter of the study is; rename it"

@@ -83,7 +83,7 @@ def finetune(
     Without --train, --freeze, --slice, --faults and --event, the filter learns a sensor fault that its training data
     lack, for 150 steps: reliability-only learns occluded images; without images, haptics-only learns noisy haptics.
 
-    The file of an external filter defines loss(module, windows) beside its build function; CHECKPOINT then has the
+    Beside the build function of an external filter, its file defines loss(module, windows); CHECKPOINT then has the
     weights of its torch module, and FILE.py:NAME@CHECKPOINT is the fine-tuned filter.
 
     \b
@@ -98,7 +98,6 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.settings import parse_rates
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -109,35 +108,42 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
-    rate, own_rates = parse_rates(rates or ())
     settings = replace(
         _modules_and_data(base, train or (), freeze or (), slices or (), fault_sets or (), events or ()),
         length=length,
-        rate=rate,
-        rates=own_rates,
         l2_sp=l2_sp,
         calibrate=calibrate,
         patience=patience,
         success=Criterion.parse(success) if success else None,
         seed=seed,
     )
-    if clean_weight is not None:
-        settings = replace(settings, clean_weight=clean_weight)
-    if steps is not None:
-        settings = replace(settings, steps=steps)
-    partial = output.with_name(f"{output.name}.partial")
+    settings = _changed(settings, clean_weight, steps, rates or ())
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
-        command = finetune_command(target, filter, data, settings)
-        members = list(episodes)
+        command, members = finetune_command(target, filter, data, settings), list(episodes)
         if isinstance(base, ExternalFilter):
             return _external(base, members, settings, output, episodes.hash, command)
-        tuned = _run(base, members, settings, partial, log, rerun, data_hash=episodes.hash, command=command)
+        tuned = _run(base, members, settings, _partial(output), log, rerun, data_hash=episodes.hash, command=command)
         profile = measure_profile(tuned.filter, base.name, members, command)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
+
+
+def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, rates: Sequence[str]) -> FineTune:
+    """The settings with the values that are given, and with learning rates."""
+    from beliefscope.filters.finetuning.settings import parse_rates
+
+    rate, own_rates = parse_rates(rates)
+    weight = settings.clean_weight if clean_weight is None else clean_weight
+    steps = settings.steps if steps is None else steps
+    return replace(settings, clean_weight=weight, steps=steps, rate=rate, rates=own_rates)
+
+
+def _partial(output: Path) -> Path:
+    """File from which an interrupted run resumes."""
+    return output.with_name(f"{output.name}.partial")
 
 
 def _external(
@@ -151,7 +157,7 @@ def _external(
     from beliefscope.filters.finetuning.report import error_summary
 
     validations: list[Validation] = []
-    partial = output.with_name(f"{output.name}.partial")
+    partial = _partial(output)
     with console.bars() as update:
 
         def report(step: int, count: int, loss: float) -> None:

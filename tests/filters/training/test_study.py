@@ -28,7 +28,7 @@ from beliefscope.app.cli.main import main
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_checkpoint
+from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.training import study
 from beliefscope.filters.training.plan import BLACKOUTS, EVALUATED_BLACKOUTS
 from beliefscope.filters.training.study import Cell, run_cell, run_cells
@@ -263,35 +263,6 @@ def test_cell_with_a_changed_checkpoint_is_not_finished(data: Path, finished: Pa
     path = first.path(folder, ".safetensors")
     path.write_bytes(path.read_bytes()[:-1] + bytes([path.read_bytes()[-1] ^ 1]))
     assert first.finished(folder) is None
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_given_filters_are_rows(data: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A trained checkpoint that is given has the metrics of its training; an external filter needs no checkpoint."""
-    trained = finished / "cells" / "door" / "haptics-ekf" / "seed0.safetensors"
-    shutil.copy(trained, tmp_path / "mine.safetensors")
-    code = f"{Path(__file__).parents[3] / 'examples' / '04_own_filter.py'}:build"
-    given = ["--filter", str(tmp_path / "mine.safetensors"), "--filter", code]
-    words = ["study", "--preset", "smoke", "--task", "door", "--data", f"door={data}", *given]
-    assert run([*words, "-o", str(tmp_path / "study")]) == 0
-    mine, own = (document(tmp_path / "study", f"door/{name}/seed0") for name in ("mine", "04_own_filter-build"))
-    expected = document(finished, "door/haptics-ekf/seed0")
-    assert {key: mine[key] for key in (TRUTH, OFFSET)} == {key: expected[key] for key in (TRUTH, OFFSET)}
-    assert 0.0 < own[TRUTH]["0"]["fused"]["rmse"]["angle_deg"] < 10.0
-    table = (tmp_path / "study" / "table.md").read_text()
-    assert "| mine | 0% | 1 of 1 |" in table
-    assert "| 04_own_filter-build | 80% | 1 of 1 |" in table
-    times = [path.stat().st_mtime_ns for path in (tmp_path / "study" / "cells" / "door").glob("*/*.json")]
-    assert run([*words, "-o", str(tmp_path / "study")]) == 0
-    assert times == [path.stat().st_mtime_ns for path in (tmp_path / "study" / "cells" / "door").glob("*/*.json")]
-    capsys.readouterr()
-    assert (
-        run([*words, "--filter", str(PRETRAINED / "push-crossmodal-ekf.safetensors"), "-o", str(tmp_path / "other")])
-        == 2
-    )
-    shutil.copy(trained, tmp_path / "lstm.safetensors")
-    assert run([*words, "--filter", str(tmp_path / "lstm.safetensors"), "-o", str(tmp_path / "other")]) == 2
-    assert "which another filter of the study is; rename it" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("no_figures")
