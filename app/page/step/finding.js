@@ -67,7 +67,8 @@ function worstFinding(trace, component) {
     return { tone: 'none', headline, evidence: '', step };
   }
   const { tone, text } = stepSummary(trace, step, component);
-  return { tone, headline: `Largest error at step ${step}.`, evidence: text, step };
+  const headline = `Largest error at step ${step} (${trace.timeText(step)}).`;
+  return { tone, headline, evidence: text, step };
 }
 
 /**
