@@ -35,29 +35,33 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     if not present.any():
         return {}
     lost = lost_images(images)
+    usable = present & ~lost
     middle = median_image(images[present])
+    known = reference is not None and (reference.key, reference.image.shape) == (key, middle.shape) and usable.any()
+    brightness = float(brightness_of(middle, reference)) if reference is not None and known else 1.0
     values = {
         f"black/{key}/all": float(lost[present].mean()),
         f"frozen/{key}/all": float(frozen_images(images, episode.task.held_steps(key))[present].mean()),
-        f"noise/{key}/all": _noise(images[present & ~lost & ~frozen_images(images)]),
+        f"noise/{key}/all": _noise(images[usable & ~frozen_images(images)], brightness),
         f"sharpness/{key}/all": _sharpness(middle),
     }
     if HAND in episode.observations:
         values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND], present)
-    usable = present & ~lost
-    if reference is None or (reference.key, reference.image.shape) != (key, middle.shape) or not usable.any():
+    if reference is None or not known:
         return values
-    brightness = float(brightness_of(middle, reference))
     values |= {
         f"brightness/{key}/all": brightness,
         f"occlusion/{key}/all": float(occluded_pixels(middle, brightness, reference).mean()),
     }
-    if reference.has_hand and HAND in episode.observations:
-        hand = episode.observations[HAND].astype(np.float64)[usable]
-        offset = np.median(reference.hand(images[usable]) - hand, axis=0)
-        values |= {f"offset/{HAND} {axis}/all": float(m) for axis, m in zip("xyz", offset, strict=False)}
-        x, y = registration(reference.images(hand), normalised(images[usable]).reshape(-1, *middle.shape))
-        values |= {f"shift/{key} x/all": x, f"shift/{key} y/all": y}
+    both = (
+        usable & episode.present(HAND) if reference.has_hand and HAND in episode.observations else np.zeros_like(usable)
+    )
+    if both.any():
+        hand, seen = episode.observations[HAND].astype(np.float64)[both], normalised(images[both])
+        shift = np.array(registration(reference.images(hand), seen))
+        offset = np.full(2, np.nan) if reference.hand is None else reference.hand.offset(seen, hand)
+        for axis, scene, own in zip("xy", shift, offset, strict=True):
+            values |= {f"shift/{key} {axis}/all": float(scene), f"hand offset/{key} {axis}/all": float(own)}
     return values
 
 
@@ -132,12 +136,12 @@ def brightness_of(images: Array, reference: Reference) -> Array:
     return np.asarray(np.median(ratio, axis=-1) if bright.any() else np.full(images.shape[:-2], np.nan))
 
 
-def _noise(images: Gray) -> float:
-    """Gray levels: median noise of the pixels between ``DARK`` and ``BRIGHT``."""
+def _noise(images: Gray, brightness: float) -> float:
+    """Gray levels: median noise of the pixels between ``DARK`` and ``BRIGHT``, of darker images of the same pixels."""
     if len(images) < MIN_STEPS:
         return np.nan
     middle = np.median(images, axis=0)
-    usable = (middle > DARK) & (middle < BRIGHT)
+    usable = (middle > DARK * min(brightness, 1.0)) & (middle < BRIGHT)
     level = noise_level(images.astype(np.float64))
     return float(np.median(level[usable] if usable.any() else level))
 

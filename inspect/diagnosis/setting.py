@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from beliefscope.datasets.episode import Episode
@@ -30,6 +30,9 @@ class Setting:
 
 Deviations = Mapping[str, Deviation]
 """Statistic -> deviation."""
+
+Undo = Callable[[Setting, Deviations], Setting | None]
+"""Returns the setting without the fault; None if it cannot be undone."""
 
 
 def without_sensor(setting: Setting, external: ExternalFilter, modality: str) -> Setting | None:

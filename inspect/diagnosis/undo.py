@@ -9,11 +9,9 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from beliefscope.filters.batch import Batch
@@ -25,18 +23,12 @@ from beliefscope.filters.filter import MAX_LOGIT, Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.inspect.diagnosis.setting import Deviations, Setting, without_sensor
+from beliefscope.inspect.diagnosis.setting import Deviations, Setting, Undo, without_sensor
+from beliefscope.inspect.diagnosis.undo_readings import READINGS, advance
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
-
-POSITION, CHANGE = slice(0, 3), slice(3, 6)
-"""Channels of controls that command a hand position: the previous position and its change."""
 
 MIN_SLOPE = 0.2
 """Smallest slope of a dynamics model that can be rescaled."""
-
-
-Undo = Callable[[Setting, Deviations], Setting | None]
-"""Returns the setting without the fault; None if it cannot be undone."""
 
 
 def undo(name: str, setting: Setting, deviations: Deviations, base: Checkpoint | None = None) -> Setting | None:
@@ -81,26 +73,6 @@ def _with_evidence(setting: Setting, change: Callable[[Evidence], Evidence]) -> 
 
     object.__setattr__(filter_, "encode", encode_and_change)
     return _with_filter(setting, filter_)
-
-
-def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], float], NDArray[Any]]) -> Setting | None:
-    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes dt."""
-    episodes = dict(setting.episodes)
-    for index in setting.affected:
-        episode = episodes[index]
-        if key == "control":
-            controls = change(episode.controls, episode.dt).astype(np.float32)
-            episodes[index] = replace(episode, controls=controls)
-            continue
-        if key not in episode.observations:
-            return None
-        readings = episode.observations[key]
-        changed = change(readings.astype(np.float64), episode.dt)
-        if readings.dtype == np.uint8:
-            changed = np.rint(changed).clip(0, 255)
-        observations = {**episode.observations, key: changed.astype(readings.dtype)}
-        episodes[index] = replace(episode, observations=observations)
-    return replace(setting, episodes=episodes)
 
 
 def drop(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
@@ -251,82 +223,6 @@ def restore_equations(setting: Setting, deviations: Deviations) -> Setting | Non
     return _with_filter(setting, filter_.eval().requires_grad_(False))
 
 
-def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
-    """A delayed image, the delayed haptics, or controls, advanced by their delay."""
-    lag = deviations.get("lag/control/all" if key == "control" else "lag/image/all")
-    steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
-    keys = setting.checkpoint.task.modalities.get(key, (key,))
-    result: Setting | None = setting
-    for name in keys:
-        if result is not None:
-            result = _with_readings(
-                result, name, lambda values, dt: values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
-            )
-    return result if steps else None
-
-
-def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Images shifted back; their borders are repeated."""
-    x, y = (_excess(deviations, f"shift/image {axis}/all") for axis in "xy")
-    if x is None or y is None:
-        return None
-
-    def back(images: NDArray[Any], dt: float) -> NDArray[Any]:
-        rows, columns = (np.arange(size) + round(n) for size, n in zip(images.shape[1:], (y, x), strict=True))
-        height, width = images.shape[1:]
-        return images[:, rows.clip(0, height - 1)][:, :, columns.clip(0, width - 1)]
-
-    return _with_readings(setting, "image", back)
-
-
-def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Images of healthy brightness."""
-    ratio = _ratio(deviations, "brightness/image/all")
-    return None if not ratio else _with_readings(setting, "image", lambda images, dt: images / ratio)
-
-
-def tare_force(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Force without its excess level in free motion."""
-    bias = [_excess(deviations, f"level/force {axis}/free motion") for axis in "xyz"]
-    if None in bias:
-        return None
-    return _with_readings(setting, "force", lambda force, dt: force - np.array(bias)[: force.shape[1]])
-
-
-def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Force without its excess slope in free motion."""
-    slope = [_excess(deviations, f"drift/force {axis}/free motion") for axis in "xyz"]
-    if None in slope:
-        return None
-    return _with_readings(
-        setting, "force", lambda f, dt: f - np.array(slope)[: f.shape[1]] * dt * np.arange(len(f))[:, None]
-    )
-
-
-def scale_force(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Force of healthy size."""
-    gain = _ratio(deviations, "size/force/contact")
-    return None if not gain else _with_readings(setting, "force", lambda force, dt: force / gain)
-
-
-def negate_force(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Force with the opposite sign."""
-    return _with_readings(setting, "force", lambda force, dt: -force)
-
-
-def scale_control(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Controls whose change of the hand position has the healthy scale."""
-    scale = _ratio(deviations, "scale/control/all")
-    channels = CHANGE if setting.checkpoint.task.control_size >= CHANGE.stop else slice(None)
-
-    def rescaled(controls: NDArray[Any], dt: float) -> NDArray[Any]:
-        controls = controls.copy()
-        controls[:, channels] /= scale
-        return controls
-
-    return None if not scale else _with_readings(setting, "control", rescaled)
-
-
 def _by_component(
     deviations: Deviations, kind: str, model: str, filter_: Filter, value: Callable[[Deviation], float]
 ) -> Tensor | None:
@@ -335,15 +231,6 @@ def _by_component(
     if not all(name in deviations for name in names):
         return None
     return torch.tensor([value(deviations[name]) for name in names], dtype=torch.float32)
-
-
-def _excess(deviations: Deviations, name: str) -> float | None:
-    return deviations[name].value - deviations[name].healthy if name in deviations else None
-
-
-def _ratio(deviations: Deviations, name: str) -> float | None:
-    deviation = deviations.get(name)
-    return deviation.value / deviation.healthy if deviation is not None and deviation.healthy else None
 
 
 def _noise(evidence: Evidence) -> Tensor:
@@ -373,13 +260,7 @@ UNDO: dict[str, Undo] = {
     "invert beta": invert_beta,
     "10 x particles": more_particles,
     "restore equations": restore_equations,
-    "realign image": realign_image,
-    "expose image": expose_image,
-    "tare force": tare_force,
-    "detrend force": detrend_force,
-    "scale force": scale_force,
-    "negate force": negate_force,
-    "scale control": scale_control,
+    **READINGS,
 }
 """The other interventions."""
 

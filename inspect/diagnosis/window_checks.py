@@ -41,7 +41,7 @@ SUMMARIES: dict[str, tuple[str, Callable[[Array], float]]] = {
     "sharpness": (EXTREME, np.min),
     "brightness": (RANGE, _ratio),
     "shift": (RANGE, _difference),
-    "offset": (RANGE, _difference),
+    "hand offset": (RANGE, _difference),
     "level": (RANGE, _difference),
 }
 """Kind of statistic -> phase, and summary of its values in the windows."""

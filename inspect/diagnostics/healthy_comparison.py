@@ -81,6 +81,7 @@ KINDS = {
     "occlusion": ("share of occluded pixels", False, 0.01),
     "shift": ("shift in pixels", False, 0.2),
     "lag": ("delay in steps", False, 0.5),
+    "hand offset": ("distance in pixels of the hand in the image from its measured position", False, 0.1),
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
@@ -120,8 +121,8 @@ PHASES = {
 """Phase of a statistic -> how its label begins and ends; others are phases of the task."""
 
 RISING = frozenset(
-    {"error", "angle error", "regret", "outside", "black", "frozen", "occlusion", "change", "opposition"}
-    | {"module error", "module scatter", "dynamics error"}
+    {"error", "angle error", "regret", "outside", "black", "frozen", "stuck", "saturation", "occlusion", "change"}
+    | {"opposition", "module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 

@@ -86,9 +86,17 @@ def has_profile(checkpoint: Checkpoint, path: Path | None) -> bool:
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:
-    """Profile of a checkpoint: in its header, or in the file beside the shipped checkpoint of this hash; else None."""
-    if isinstance(checkpoint, Checkpoint) and checkpoint.healthy_profile is not None:
-        return HealthyProfile.from_json(checkpoint.healthy_profile)
+    """Profile of a checkpoint: beside the shipped checkpoint of this hash, else in its header; None without either.
+
+    The file beside a shipped checkpoint is measured again when statistics are added, its header is not.
+    """
+    own = checkpoint.healthy_profile if isinstance(checkpoint, Checkpoint) else None
+    document = _beside_shipped(task, filter_, checkpoint_hash) or own
+    return None if document is None else HealthyProfile.from_json(document)
+
+
+def _beside_shipped(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
+    """JSON of the profile in the file beside the shipped checkpoint of this hash."""
     try:
         path = shipped(task, filter_)
     except BadInput:
@@ -97,4 +105,4 @@ def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Chec
     if not path.is_file():
         return None
     document = read_json(path.read_text())
-    return HealthyProfile.from_json(document["healthy_profile"]) if document["checkpoint"] == checkpoint_hash else None
+    return document["healthy_profile"] if document["checkpoint"] == checkpoint_hash else None

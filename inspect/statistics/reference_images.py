@@ -1,4 +1,4 @@
-"""Healthy reference of the images of a task: the median image, the image expected for a hand position, and its inverse.
+"""Healthy reference of the images of a task: the median image, the image expected for a hand position, and the hand.
 
 A healthy profile stores it, so that the images of later episodes can be compared with it without ground truth.
 """
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, lost_images
+from beliefscope.inspect.statistics.hand_in_image import HandFilter, fit_hand_filter, quadratic
 from beliefscope.inspect.statistics.signals import Array
 
 Gray = NDArray[np.uint8]
@@ -20,17 +21,11 @@ Gray = NDArray[np.uint8]
 HAND = "effector_position"
 """Observation key of the measured hand position."""
 
-DIGITS = 3
-"""Significant digits of stored weights."""
-
 LEVELS = 127
 """Largest integer of stored expected images."""
 
 TAIL = 0.002
 """Share of the images below and above the range of a pixel."""
-
-RIDGE = 100.0
-"""Penalty of the weights, relative to images of unit variance."""
 
 
 @dataclass(frozen=True)
@@ -40,63 +35,59 @@ class Reference:
     Attributes:
         key: observation key of the images.
         image: (H, W) median over episodes of their median images. spread: (H, W) largest difference of an episode's.
-        weights: (1 + H W, d) of the regression of the hand position on an image, normalised to zero mean and unit
-            variance; row 0 is the constant. Empty (0, 0) for data without hand positions.
-        expected: (F, H, W) coefficients of the normalised image as a quadratic polynomial of the hand position.
-        scale: (2, d) m: mean and standard deviation of the hand position.
+        expected: (F, H, W) coefficients of the image, normalised to zero mean and unit variance, as a quadratic
+            polynomial of the hand position.
+        scale: (2, d) m: mean and standard deviation of the hand position; (2, 0) for data without it.
         range: (2, H, W) nearly smallest and largest gray level of the images, corrected for the exposure of their
             episode; None in profiles of earlier versions.
+        hand: where the hand is seen; None for data without hand positions and in profiles of earlier versions.
     """
 
     key: str
     image: Gray
     spread: Gray
-    weights: Array
     expected: Array
     scale: Array
     range: Gray | None = None
+    hand: HandFilter | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values; weights rounded to ``DIGITS``."""
+        """JSON values."""
         size = np.maximum(np.abs(self.expected).max(axis=(1, 2)), 1e-9) / LEVELS  # (F,)
         levels = np.rint(self.expected / size[:, None, None]).astype(int)
         return {
             "key": self.key,
             "image": self.image.tolist(),
             "spread": self.spread.tolist(),
-            "weights": _rounded(self.weights.T),
             "expected": {"size": size.tolist(), "levels": levels.reshape(len(levels), self.image.size).tolist()},
             "scale": self.scale.tolist(),
             "range": None if self.range is None else self.range.tolist(),
+            "hand": None if self.hand is None else self.hand.to_json(),
         }
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Reference:
         """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
         image, spread = (np.array(value[name], dtype=np.uint8) for name in ("image", "spread"))
-        weights = np.array(value["weights"], dtype=np.float64).T
         size = np.array(value["expected"]["size"], dtype=np.float64)
         levels = np.array(value["expected"]["levels"], dtype=np.float64).reshape(len(size), *image.shape)
         scale = np.array(value["scale"], dtype=np.float64)
         range_ = None if value.get("range") is None else np.array(value["range"], dtype=np.uint8)
-        if image.ndim != 2 or spread.shape != image.shape or len(weights) not in (0, 1 + image.size):
-            raise ValueError(f"image {image.shape}, spread {spread.shape}, weights {weights.shape}")
+        hand = None if value.get("hand") is None else HandFilter.from_json(value["hand"])
+        if image.ndim != 2 or spread.shape != image.shape:
+            raise ValueError(f"image {image.shape}, spread {spread.shape}")
         if range_ is not None and range_.shape != (2, *image.shape):
             raise ValueError(f"image {image.shape}, range {range_.shape}")
-        return cls(str(value["key"]), image, spread, weights, levels * size[:, None, None], scale, range_)
+        return cls(str(value["key"]), image, spread, levels * size[:, None, None], scale, range_, hand)
 
     @property
     def has_hand(self) -> bool:
         """Whether the data have hand positions."""
-        return bool(self.weights.size)
-
-    def hand(self, images: Gray) -> Array:
-        """(T, d) m: the hand position seen in images (T, H, W)."""
-        return self.weights[0] + normalised(images) @ self.weights[1:]
+        return bool(self.scale.size)
 
     def images(self, hand: Array) -> Array:
         """(T, H, W): the normalised images expected for hand positions (T, d), m."""
-        return np.tensordot(_polynomial((hand - self.scale[0]) / self.scale[1]), self.expected, axes=1)
+        return np.tensordot(quadratic((hand - self.scale[0]) / self.scale[1]), self.expected, axes=1)
 
 
 def image_keys(episode: Episode) -> list[str]:
@@ -119,7 +110,8 @@ def measure_reference(episodes: Sequence[Episode]) -> Reference | None:
     image = np.nanmedian(medians, axis=0)
     spread = np.nanmax(np.abs(medians - image), axis=0)
     gray, spread = (np.rint(values).clip(0, 255).astype(np.uint8) for values in (image, np.ceil(spread)))
-    return Reference(key, gray, spread, *_hand_camera(episodes, key), _gray_range(episodes, key, medians, image))
+    expected, scale, hand = _hand_camera(episodes, key)
+    return Reference(key, gray, spread, expected, scale, _gray_range(episodes, key, medians, image), hand)
 
 
 def _gray_range(episodes: Sequence[Episode], key: str, medians: Array, image: Array) -> Gray:
@@ -135,39 +127,22 @@ def _gray_range(episodes: Sequence[Episode], key: str, medians: Array, image: Ar
     return np.rint(result).clip(0, 255).astype(np.uint8)
 
 
-def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, Array]:
-    """``weights``, ``expected`` and ``scale`` of a reference, from the steps with an image.
-
-    Ridge regression of the hand position on the image, and least squares of the image on polynomials of the position.
-    """
+def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, HandFilter | None]:
+    """``expected``, ``scale`` and ``hand`` of a reference, from the steps with an image."""
+    size = episodes[0].observations[key].shape[1:]
     if HAND not in episodes[0].observations:
-        return np.zeros((0, 0)), np.zeros((0, *episodes[0].observations[key].shape[1:])), np.zeros((2, 0))
+        return np.zeros((0, *size)), np.zeros((2, 0)), None
     seen = [~lost_images(episode.observations[key]) for episode in episodes]
     pairs = list(zip(episodes, seen, strict=True))
     images = np.concatenate([normalised(episode.observations[key][at]) for episode, at in pairs])
     hand = np.concatenate([episode.observations[HAND][at] for episode, at in pairs]).astype(np.float64)
-    image_mean, hand_mean = images.mean(0), hand.mean(0)
-    centred = images - image_mean
-    gram = centred.T @ centred + RIDGE * np.eye(images.shape[1])
-    weights = np.linalg.solve(gram, centred.T @ (hand - hand_mean))
-    weights = np.concatenate([(hand_mean - image_mean @ weights)[None], weights])
-    scale = np.stack([hand_mean, np.maximum(hand.std(0), 1e-6)])
-    expected = np.linalg.lstsq(_polynomial((hand - scale[0]) / scale[1]), images, rcond=None)[0]
-    return weights, expected.reshape(-1, *episodes[0].observations[key].shape[1:]), scale
-
-
-def _polynomial(x: Array) -> Array:
-    """(T, F): constant, linear and quadratic terms of x (T, d)."""
-    i, j = np.triu_indices(x.shape[1])
-    return np.concatenate([np.ones((len(x), 1)), x, x[:, i] * x[:, j]], axis=1)
-
-
-def _rounded(values: Array) -> list[list[float]]:
-    return [[float(f"{value:.{DIGITS}g}") for value in row] for row in values.tolist()]
+    scale = np.stack([hand.mean(0), np.maximum(hand.std(0), 1e-6)])
+    expected = np.linalg.lstsq(quadratic((hand - scale[0]) / scale[1]), images.reshape(len(images), -1), rcond=None)[0]
+    return expected.reshape(-1, *size), scale, fit_hand_filter(images, hand)
 
 
 def normalised(images: Gray) -> Array:
-    """(T, H W): images with zero mean and unit variance, so that exposure does not matter."""
-    values = images.reshape(len(images), -1).astype(np.float64)
-    values -= values.mean(1, keepdims=True)
-    return values / np.maximum(values.std(1, keepdims=True), 1e-9)
+    """(T, H, W): images with zero mean and unit variance, so that exposure does not matter."""
+    values = images.astype(np.float64)
+    values -= values.mean((1, 2), keepdims=True)
+    return values / np.maximum(values.std((1, 2), keepdims=True), 1e-9)

@@ -67,8 +67,7 @@ function worstFinding(trace, component) {
     return { tone: 'none', headline, evidence: '', step };
   }
   const { tone, text } = stepSummary(trace, step, component);
-  const headline = `Largest error at step ${step} (${trace.timeText(step)}).`;
-  return { tone, headline, evidence: text, step };
+  return { tone, headline: `Largest error at step ${step}.`, evidence: text, step };
 }
 
 /**

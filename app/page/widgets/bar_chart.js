@@ -16,10 +16,6 @@ const COLOURS = {
   image: '--image',
   haptics: '--haptics',
 };
-/** Colours of filters with other names, such as a user's, in the order of their first use. */
-const OTHERS = ['--ink', '--spare-3', '--spare-4', '--spare-5', '--spare-6', '--spare-7'];
-/** @type {string[]} */
-const others = [];
 /** @type {Record<string, string>} */
 const TEXTURES = { pf: 'M-1 5 5-1M1 7 7 1', ukf: 'M1 2h2M4 5h2', lstm: 'M0 1.5h6M0 4.5h6' };
 const TEXTURE_SIZE = 6; // px
@@ -295,12 +291,7 @@ const fusionRule = (filter) => filter.replace(/-?(ekf|ukf|pf)$/, '');
 const texture = (filter) =>
   Object.keys(TEXTURES).find((kind) => `-${filter}`.endsWith(`-${kind}`)) ?? '';
 /** @param {string} filter */
-function colourOf(filter) {
-  const rule = fusionRule(filter);
-  if (COLOURS[rule]) return COLOURS[rule];
-  if (!others.includes(rule)) others.push(rule);
-  return OTHERS[others.indexOf(rule) % OTHERS.length];
-}
+const colourOf = (filter) => COLOURS[fusionRule(filter)] ?? '--ink';
 
 /**
  * @param {string} filter

@@ -30,11 +30,12 @@ CAUSES = (
     Cause(
         "dynamics.broken",
         "Dynamics broken",
-        (Symptom("dynamics spread/*", 1), Symptom("dynamics error/*", 1)),
+        (Symptom("dynamics error/*|dynamics bias/*", 0), Symptom("dynamics spread/*|dynamics slope/*", 0)),
         DYNAMICS,
         RETRAIN,
         "restore dynamics",
         lowers="lag/dynamics/*",
+        prior=-0.2,
     ),
     Cause(
         "process_noise.small",

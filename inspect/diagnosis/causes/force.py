@@ -34,7 +34,7 @@ CAUSES = (
         "force.gain",
         "Force gain wrong",
         (Symptom("lever/force*|size/force/*", 0), Symptom("size/force/*|noise/force*", 0)),
-        f"level/force*|drift/force*|saturation/force*|{CONTACT}|{HAPTICS}",
+        f"level/force*|drift/force*|change/force*|saturation/force*|{CONTACT}|{HAPTICS}",
         "Check the units and the calibration of the force sensor.",
         "scale force",
     ),

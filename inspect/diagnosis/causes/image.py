@@ -5,7 +5,7 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
 
-HAND = "offset/effector_position*"
+HAND = "hand offset/image*"
 """Position of the hand in the image against the measured one."""
 
 CHECK = "Check the camera and its driver; until then, run the filter without the image."
@@ -39,8 +39,8 @@ CAUSES = (
     Cause(
         "image.shift",
         "Camera moved",
-        (Symptom("shift/image*", 0),),
-        f"occlusion/image/*|brightness/image/*|sharpness/image/*|{HAND}|{IMAGE}",
+        (Symptom(f"shift/image*|{HAND}", 0), Symptom("shift/image*|module bias/*image*", 0, 0.5)),
+        f"occlusion/image/*|brightness/image/*|sharpness/image/*|{IMAGE}",
         "Calibrate the camera pose again.",
         "realign image",
     ),

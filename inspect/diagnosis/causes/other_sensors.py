@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, HAPTICS
+from beliefscope.inspect.diagnosis.causes.image import HAND
 
 IN_PHASES = "|".join(f"{kind}/*" for kind in ("level", "drift", "change", "size", "lever", "axes", "direction"))
 """Statistics of force and torque in free motion or in contact."""
@@ -15,7 +16,7 @@ CAUSES = (
     Cause(
         "effector.offset",
         "End-effector position offset",
-        (Symptom("offset/effector_position*", 0, otherwise=(Symptom("offset/control*", 0),)),),
+        (Symptom(HAND, 0, otherwise=(Symptom("offset/control*", 0),)),),
         f"{HAPTICS}|{DYNAMICS}",
         "Calibrate the robot's kinematics against the camera.",
         "drop haptics",
@@ -24,7 +25,7 @@ CAUSES = (
         "effector.noise",
         "End-effector position noisy",
         (Symptom("position noise/effector_position*"),),
-        f"offset/effector_position*|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        f"{HAND}|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{HAPTICS}|{DYNAMICS}",
         "Check the joint encoders and the filter of the robot's kinematics.",
         "drop haptics",
     ),
@@ -64,7 +65,7 @@ CAUSES = (
         "haptics.dropout",
         "Haptics lost: all readings repeat the last one",
         (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
-        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|position noise/*|{HAPTICS}"
+        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|{HAND}|position noise/*|{HAPTICS}"
         f"|{DYNAMICS}",
         "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
@@ -73,7 +74,7 @@ CAUSES = (
         "haptics.delay",
         "Haptics delayed",
         (Symptom("lag/image/*", -1),),
-        f"lag/contact/*|lag/control/*|lag/dynamics/*|offset/effector_position*|level/*|direction/force/*|{HAPTICS}|{DYNAMICS}",
+        f"lag/contact/*|lag/control/*|lag/dynamics/*|{HAND}|level/*|direction/force/*|{HAPTICS}|{DYNAMICS}",
         "Synchronise the clocks of camera and robot.",
         "advance haptics",
     ),

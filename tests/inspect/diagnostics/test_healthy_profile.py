@@ -142,7 +142,7 @@ def test_a_measured_profile_is_that_of_new_episodes() -> None:
     assert measured.reference.image.shape == (32, 32)
     trace = next(trace_all(checkpoint, episodes, [0]))
     own, others = (measure_reference(chosen) for chosen in (episodes, [e for i, e in enumerate(episodes) if i % 4]))
-    name = "offset/effector_position x/all"
+    name = "hand offset/image x/all"
     values = [episode_statistics(trace, checkpoint, reference)[name] for reference in (own, others)]
     assert measured.statistics[name][0] == pytest.approx(values[1], abs=1e-5)
     assert abs(values[0]) < abs(values[1])
@@ -177,6 +177,11 @@ def test_shipped_profiles_belong_to_their_checkpoints() -> None:
         assert found.episodes >= 50
         assert math.isfinite(np.nanmean(found.statistics["nees/fused/all"]))
         assert find_profile(checkpoint.task.name, checkpoint.name, "other", None) is None
+        used = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
+        assert used is not None  # that of the file, not an earlier one in the header
+        assert used.statistics.keys() == found.statistics.keys()
+        assert used.reference is not None
+        assert used.reference.hand is not None
         if checkpoint.kind == "pf":
             assert "ess//all" in found.statistics
 
