@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -20,8 +21,9 @@ from beliefscope.recordings.rerun_log.entities import SIGMAS, angles, plane_heig
 from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
-VIEWING_DISTANCE = 1.2
-"""m from the centre of the scene, so that the reach of the arm is in view."""
+VIEWING_DISTANCE, REACHES = 1.2, 2.2
+"""Distance of the eye from the centre of the scene: at least the first, m, so that the reach of the arm is in view, and
+the second times the distance of the farthest true state or hand from the centre."""
 EYE_HEIGHT = 2.2
 """Height of the eye above a point cloud, in extents, so that all of it is in view."""
 BACKGROUND = [16, 17, 24]
@@ -74,6 +76,11 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
     anchor = np.array([*positions(trace)[:, [x, y]].mean(axis=0), plane_height(trace, task)])
     effector = trace.episode.observations.get("effector_position")
     middle = anchor if effector is None else 0.5 * (anchor + effector.mean(axis=0))
+    reach = np.linalg.norm(positions(trace)[:, [x, y]] - middle[:2], axis=1).max()
+    if effector is not None:
+        reach = max(reach, np.linalg.norm(effector - middle, axis=1).max())
+    distance = max(VIEWING_DISTANCE, REACHES * float(reach))
+    spacing = 0.1 * 10.0 ** math.floor(math.log10(distance))
     trail = rr.VisibleTimeRange(
         STEP,
         start=rrb.TimeRangeBoundary.cursor_relative(seq=-TRAIL_STEPS),
@@ -82,9 +89,9 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
     scene = rrb.Spatial3DView(
         origin="world",
         name="Scene",
-        eye_controls=_eye(middle, middle + VIEWING_DISTANCE * np.array([-0.62, -0.12, 0.78]), (0, 0, 1)),
+        eye_controls=_eye(middle, middle + distance * np.array([-0.62, -0.12, 0.78]), (0, 0, 1)),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
-        line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, plane=rr.components.Plane3D.XY),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=spacing, plane=rr.components.Plane3D.XY),
         overrides={"world/effector": rrb.VisibleTimeRanges(trail)},
     )
     above = rrb.Spatial3DView(
