@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sklearn.tree import DecisionTreeClassifier
 
 from beliefbench.cases import Case, healthy_profile, load_case, read_truth
 from beliefbench.scorecard import Answer, component
@@ -134,6 +133,8 @@ class Learned:
         return answer_of({cause: vote / total for cause, vote in votes.items()})
 
     def decision_tree(self, case: Case) -> Answer:
+        from sklearn.tree import DecisionTreeClassifier  # takes a second
+
         tree = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(self.matrix, self.causes)
         share = tree.predict_proba(_vector(features(case.folder), self.names)[None])[0]
         return answer_of({str(c): float(p) for c, p in zip(tree.classes_, share, strict=True) if p > 0})

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 from beliefscope.inspect.statistics.signals import Array
 
@@ -90,9 +89,12 @@ class HandFilter:
         return _peaks(_around(self._response(images[inside]), expected[inside]).mean(axis=0)[None])[0] - SEARCH
 
     def _response(self, images: Array) -> Array:
-        """(T, H, W)."""
-        response: Array = fftconvolve(images - self.background, self.kernel[None], mode="same", axes=(1, 2))
-        return response
+        """(T, H, W): convolution of the images without the background, which is zero around them."""
+        contrasts = images - self.background
+        height, width = contrasts.shape[1:]
+        shape = (height + 2 * RADIUS, width + 2 * RADIUS)
+        full = np.fft.irfft2(np.fft.rfft2(contrasts, shape) * np.fft.rfft2(self.kernel, shape), shape)
+        return full[:, RADIUS : RADIUS + height, RADIUS : RADIUS + width]
 
 
 def fit_hand_filter(images: Array, hand: Array) -> HandFilter:
