@@ -32,8 +32,11 @@ RIDGE = 1.0
 BRIGHT = 0.95
 """Quantile of the squared contrast from which pixels are taken for the hand at first."""
 
-FRAMES = 2000
-"""Maximum number of images to which the filter is fitted."""
+FRAMES, PIXELS = 2000, 4_000_000
+"""Maximum number of images to which the filter is fitted, and of their pixels, for the memory of large ones."""
+
+MIN_SIDE = 8
+"""Pixels: smallest side of images in which a hand is sought."""
 
 MIN_FRAMES = 4
 """Minimum number of images with the hand inside."""
@@ -97,14 +100,18 @@ class HandFilter:
         return full[:, RADIUS : RADIUS + height, RADIUS : RADIUS + width]
 
 
-def fit_hand_filter(images: Array, hand: Array) -> HandFilter:
+def fit_hand_filter(images: Array, hand: Array) -> HandFilter | None:
     """Fit the filter to normalised images (T, H, W) and hand positions (T, d), m.
 
     The pixel of the hand is unknown: it begins as the centre of the largest contrasts. In turn, the camera's map is
     fitted to the pixels, the filter to the map, and the pixels are the peaks of its response near those of the map.
+    None for images that are too small, and so large that less than ``MIN_FRAMES`` are within ``PIXELS``.
     """
-    if len(images) > FRAMES:
-        chosen = np.linspace(0, len(images) - 1, FRAMES).astype(int)
+    frames = min(FRAMES, PIXELS // max(images[0].size, 1))
+    if min(images.shape[1:]) < MIN_SIDE or min(frames, len(images)) < MIN_FRAMES:
+        return None
+    if len(images) > frames:
+        chosen = np.linspace(0, len(images) - 1, frames).astype(int)
         images, hand = images[chosen], hand[chosen]
     background = images.mean(0)
     contrasts = images - background

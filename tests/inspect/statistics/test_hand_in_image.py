@@ -41,7 +41,9 @@ def scene(seed: int, shift: tuple[int, int] = (0, 0)) -> tuple[Array, Array]:
 @pytest.fixture(scope="module")
 def hand_filter() -> HandFilter:
     scenes = [scene(seed) for seed in range(20)]
-    return fit_hand_filter(np.concatenate([s[0] for s in scenes]), np.concatenate([s[1] for s in scenes]))
+    result = fit_hand_filter(np.concatenate([s[0] for s in scenes]), np.concatenate([s[1] for s in scenes]))
+    assert result is not None
+    return result
 
 
 def test_the_map_of_the_camera_is_recovered(hand_filter: HandFilter) -> None:
@@ -76,6 +78,11 @@ def test_json_keeps_the_offsets(hand_filter: HandFilter) -> None:
     )
     with pytest.raises(ValueError, match="kernel"):
         HandFilter.from_json(document | {"kernel": [[1.0]]})
+
+
+@pytest.mark.parametrize("shape", [(50, 1, 1), (50, 5, 40), (2, SIZE, SIZE), (6, 1200, 1200)])
+def test_too_small_too_few_and_too_large_images_have_no_filter(shape: tuple[int, int, int]) -> None:
+    assert fit_hand_filter(np.zeros(shape), np.zeros((shape[0], 2))) is None
 
 
 def test_quadratic_terms() -> None:
