@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, Literal
@@ -178,9 +178,7 @@ class Diagnosis:
         causes = [cause for cause in self.causes if cause.probability >= SHOWN]
         if not causes:
             return []
-        rows = tuple(
-            (c.cause.name, c.probability, _share(c.recovered), ", ".join(map(str, c.episodes))) for c in causes
-        )
+        rows = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
         tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
         evidence = tuple((c.cause.name, e.text, e.episode, e.step) for c in causes for e in c.evidence)
         actions = tuple((c.cause.name, c.next) for c in causes)
@@ -189,6 +187,17 @@ class Diagnosis:
             Table("Evidence", ("cause", "deviation", "episode", "step"), evidence),
             Table("Next", ("cause", "action"), actions),
         ]
+
+
+def index_ranges(indices: Sequence[int]) -> str:
+    """Increasing indices as text, three and more consecutive ones as a range: ``3, 4, 9 to 12``."""
+    runs: list[list[int]] = []
+    for index in indices:
+        if runs and index == runs[-1][-1] + 1:
+            runs[-1].append(index)
+        else:
+            runs.append([index])
+    return ", ".join(f"{r[0]} to {r[-1]}" if len(r) > 2 else ", ".join(map(str, r)) for r in runs)
 
 
 def _share(recovery: Recovery | None) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges
 from beliefscope.inspect.diagnosis.scoring import (
     Explanation,
     applicable,
@@ -180,3 +180,8 @@ def test_a_cause_may_lower_statistics_without_raising_them() -> None:
     lower, higher = (explain(bias, [module, deviation("module spread/image x/all", t)]).score for t in (-10.0, 10.0))
     assert lower == explain(bias, [module]).score
     assert higher < lower - 0.9
+
+
+def test_consecutive_episodes_are_ranges() -> None:
+    assert index_ranges([3, 4, 9, 10, 11, 12, 20]) == "3, 4, 9 to 12, 20"
+    assert index_ranges([]) == ""
