@@ -19,7 +19,7 @@ from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile
-from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.healthy import SensorRecord, profile_of, sensor_record
 
 REAL = "beliefscope convert push-real --data mit_push -o push-real.h5"
 SEED = 7
@@ -51,14 +51,15 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="TASK-FILTER")
     parser.add_argument("--push-real", type=Path)
     options = parser.parse_args()
-    episodes: dict[str, tuple[list[Episode], str]] = {}
+    episodes: dict[str, tuple[list[Episode], str, SensorRecord]] = {}
     for path in sorted(PRETRAINED.glob("*.safetensors")):
         if options.names and path.stem not in options.names:
             continue
         checkpoint = load_checkpoint(path)
         task = checkpoint.task.name
         if task not in episodes:
-            episodes[task] = held_out(task, options.push_real)
+            clean, source = held_out(task, options.push_real)
+            episodes[task] = clean, source, sensor_record(clean)
         profile = profile_of(checkpoint, *episodes[task])
         write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
+from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.statistics.reference_images import measure_reference
+from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 from beliefscope.inspect.traces.batch import trace_all
 
 MAX_EPISODES = 120
@@ -23,21 +25,46 @@ FOLDS = 4
 """Number of groups of episodes."""
 
 
-def profile_of(checkpoint: Checkpoint, episodes: Sequence[Episode], data: str) -> HealthyProfile:
-    """The healthy profile of a filter over clean episodes. ``data``: where they come from.
+@dataclass(frozen=True)
+class SensorRecord:
+    """What a healthy profile says about sensors, which is the same for all filters of a task.
 
-    Images are compared with a reference of the other groups of episodes, so that the statistics are those of new ones.
+    Attributes:
+        rows: statistics of the sensors by episode. Images are compared with a reference of the other groups of
+            episodes, so that the statistics are those of new ones.
+        reference: images of all episodes.
     """
-    rows: list[dict[str, float]] = []
-    particles = None
+
+    rows: Sequence[Mapping[str, float]]
+    reference: Reference | None
+
+
+def sensor_record(episodes: Sequence[Episode]) -> SensorRecord:
+    """The statistics of the sensors of clean episodes, and their images."""
     groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
     references = [measure_reference(group) for group in groups]
+    rows = [sensor_statistics(episode, references[i % FOLDS]) for i, episode in enumerate(episodes)]
+    return SensorRecord(rows, measure_reference(episodes))
+
+
+def profile_of(
+    checkpoint: Checkpoint, episodes: Sequence[Episode], data: str, sensors: SensorRecord | None = None
+) -> HealthyProfile:
+    """The healthy profile of a filter over clean episodes.
+
+    Args:
+        data: where the episodes come from.
+        sensors: record of their sensors, if it is known.
+    """
+    sensors = sensors or sensor_record(episodes)
+    rows: list[dict[str, float]] = []
+    particles = None
     for trace in trace_all(checkpoint, episodes, range(len(episodes))):
-        rows.append(episode_statistics(trace, checkpoint, references[trace.episode_index % FOLDS]))
+        rows.append(episode_statistics(trace, checkpoint, sensors.rows[trace.episode_index]))
         particles = trace.particle_count
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return HealthyProfile(data, len(rows), particles, columns, measure_reference(episodes))
+    return HealthyProfile(data, len(rows), particles, columns, sensors.reference)
 
 
 def measure_profile(filter_: Filter, name: str, episodes: Sequence[Episode], data: str) -> dict[str, Any] | None:

@@ -14,6 +14,7 @@ import numpy as np
 from beliefbench.cases import Case, healthy_profile, load_case, read_truth
 from beliefbench.scorecard import Answer, component
 from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
@@ -91,7 +92,10 @@ def deviations(case: Case) -> dict[str, float]:
     State components are averaged, so that features of different tasks agree.
     """
     profile = HealthyProfile.from_json(case.checkpoint.healthy_profile)
-    rows = [episode_statistics(trace, case.checkpoint, profile.reference) for trace in traces_of(case)]
+    rows = [
+        episode_statistics(trace, case.checkpoint, sensor_statistics(trace.episode, profile.reference))
+        for trace in traces_of(case)
+    ]
     groups: dict[str, list[float]] = {}
     for name, healthy in profile.statistics.items():
         values = np.array([row.get(name, np.nan) for row in rows])

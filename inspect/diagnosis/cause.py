@@ -23,6 +23,7 @@ class Symptom:
             ``shifted``, all by the same amount; ``common``, those of all modalities by the same amount in each
             component; ``alone``, the opposite of ``common``.
         otherwise: symptoms that may occur in its place.
+        optional: whether it counts only where it can be observed.
     """
 
     statistics: str
@@ -30,6 +31,7 @@ class Symptom:
     weight: float = 1.0
     target: Literal["", "mirrored", "shifted", "common", "alone"] = ""
     otherwise: tuple[Symptom, ...] = ()
+    optional: bool = False
 
     def matches(self, statistic: str) -> bool:
         """Whether a statistic belongs to the symptom or those in its place, whatever its value."""

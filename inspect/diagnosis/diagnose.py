@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery
 from beliefscope.inspect.diagnosis.interventions import ratios, recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, burden, explain, probabilities
-from beliefscope.inspect.diagnosis.sensor_checks import localise
+from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
@@ -76,7 +77,7 @@ class Case:
     """Episodes of a filter and their deviations from the healthy profile.
 
     Attributes:
-        rows: statistics by episode.
+        rows: statistics by episode. sensors: those of sensors only.
         deviations: with t-values relative to their critical values, largest first.
         p_value: probability of deviations of this size in a healthy filter.
     """
@@ -84,6 +85,7 @@ class Case:
     setting: Setting
     traces: Sequence[Trace]
     rows: Rows
+    sensors: Rows
     profile: HealthyProfile
     deviations: Sequence[Deviation]
     p_value: float
@@ -198,19 +200,30 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
     )
 
 
-def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float) -> Case:
-    """Compare all statistics of traces with the healthy profile."""
-    rows = [episode_statistics(trace, setting.checkpoint, profile.reference) for trace in traces]
-    return _compared(setting, traces, rows, profile, alarm_rate)
+def examine(
+    setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float, earlier: Case | None = None
+) -> Case:
+    """Compare all statistics of traces with the healthy profile.
+
+    earlier: case of the same episodes, whose statistics of sensors remain where the readings are the same.
+    """
+    known = {} if earlier is None else {id(t.episode): s for t, s in zip(earlier.traces, earlier.sensors, strict=True)}
+    sensors = [
+        known[id(trace.episode)] if id(trace.episode) in known else sensor_statistics(trace.episode, profile.reference)
+        for trace in traces
+    ]
+    pairs = zip(traces, sensors, strict=True)
+    rows = [episode_statistics(trace, setting.checkpoint, of_sensors) for trace, of_sensors in pairs]
+    return _compared(setting, traces, rows, sensors, profile, alarm_rate)
 
 
 def _compared(
-    setting: Setting, traces: Sequence[Trace], rows: Rows, profile: HealthyProfile, alarm_rate: float
+    setting: Setting, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
     scattered, all_rows = with_scatter(profile, rows)
     comparison = compare(scattered, all_rows)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
-    return Case(setting, traces, all_rows, profile, deviations, comparison.p_value, alarm_rate)
+    return Case(setting, traces, all_rows, sensors, profile, deviations, comparison.p_value, alarm_rate)
 
 
 def focus(case: Case) -> Case:
@@ -221,11 +234,12 @@ def focus(case: Case) -> Case:
     others = [value for value in values if np.isfinite(value)]
     if not others or not alarm.low <= np.mean(others) <= alarm.high:
         return case
-    traces = [trace for trace, chosen in zip(case.traces, hit, strict=True) if chosen]
-    rows = [row for row, chosen in zip(case.rows, hit, strict=True) if chosen]
+    traces = list(compress(case.traces, hit))
+    rows, sensors = (list(compress(rows, hit)) for rows in (case.rows, case.sensors))
     episodes = {trace.episode_index: case.setting.episodes[trace.episode_index] for trace in traces}
     setting = replace(case.setting, episodes=episodes, affected=frozenset(episodes))
-    part = replace(_compared(setting, traces, rows, case.profile, case.alarm_rate), p_value=case.p_value)
+    part = _compared(setting, traces, rows, sensors, case.profile, case.alarm_rate)
+    part = replace(part, p_value=case.p_value)
     return part if part.alarms else case
 
 
@@ -253,7 +267,7 @@ def confirm(
         indices = [trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit]
         setting = replace(case.setting, affected=frozenset(indices), steps=steps)
         if (replay := replay_without(by_name[name], setting, case.by_statistic, seed, base)) is not None:
-            after = examine(setting, replay, case.profile, case.alarm_rate)
+            after = examine(setting, replay, case.profile, case.alarm_rate, case)
             restored = max(0.0, 1.0 - burden(after.deviations) / before)
             left = _symptoms(by_name[name], (d for d in after.deviations if d.alarm))
             changes = {} if left or by_name[name].undo.startswith("drop") else ratios(VISIBLE, case.rows, after.rows)

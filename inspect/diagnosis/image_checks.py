@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode, lost_images
-from beliefscope.inspect.statistics.reference_images import HAND, Gray, Reference, median_image, normalised
+from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
+from beliefscope.inspect.statistics.reference_images import (
+    HAND,
+    Gray,
+    Reference,
+    median_image,
+    normalised,
+    object_positions,
+)
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats
 
 BLACK = 8
@@ -53,16 +61,26 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
         f"brightness/{key}/all": brightness,
         f"occlusion/{key}/all": float(occluded_pixels(middle, brightness, reference).mean()),
     }
-    both = (
-        usable & episode.present(HAND) if reference.has_hand and HAND in episode.observations else np.zeros_like(usable)
-    )
-    if both.any():
-        hand, seen = episode.observations[HAND].astype(np.float64)[both], normalised(images[both])
-        shift = np.array(registration(reference.images(hand), seen))
-        offset = np.full(2, np.nan) if reference.hand is None else reference.hand.offset(seen, hand)
-        for axis, scene, own in zip("xy", shift, offset, strict=True):
-            values |= {f"shift/{key} {axis}/all": float(scene), f"hand offset/{key} {axis}/all": float(own)}
+    seen = normalised(images[usable])
+    if reference.has_hand and HAND in episode.observations and (both := usable & episode.present(HAND)).any():
+        hand = episode.observations[HAND].astype(np.float64)[both]
+        shift = registration(reference.images(hand), seen[both[usable]])
+        values |= {f"shift/{key} {axis}/all": pixels for axis, pixels in zip("xy", shift, strict=True)}
+        values |= _landmark("hand", key, reference.hand, seen[both[usable]], hand)
+    if (positions := object_positions(episode)) is not None:
+        values |= _landmark("object", key, reference.object, seen, positions[usable])
     return values
+
+
+def _landmark(
+    name: str, key: str, landmark: LandmarkFilter | None, images: Array, positions: Array
+) -> dict[str, float]:
+    """Offset and match of a landmark with a name in normalised images (T, H, W); none without its filter."""
+    if landmark is None:
+        return {}
+    offset, match = landmark.locate(images, positions)
+    values = {f"{name} offset/{key} {axis}/all": float(pixels) for axis, pixels in zip("xy", offset, strict=True)}
+    return values | {f"{name} match/{key}/all": match}
 
 
 def is_usable(images: Gray, present: Mask, held: int = 0) -> bool:

@@ -115,8 +115,9 @@ def explain(cause: Cause, deviations: Iterable[Deviation]) -> Explanation:
             group = name.rpartition("/")[0]
             size = (OF_FILTER if matches(FILTER, name) else 1.0) * strength(abs(deviation.t))
             unexplained[group] = max(unexplained.get(group, 0.0), size)
-    weights = [symptom.weight for symptom in cause.symptoms]
-    supports = [support(s, found) for s, found in zip(cause.symptoms, members, strict=True)]
+    observed = [(s, group) for s, group in zip(cause.symptoms, members, strict=True) if group or not s.optional]
+    weights = [symptom.weight for symptom, _ in observed]
+    supports = [support(symptom, group) for symptom, group in observed]
     total = sum(w * s for w, s in zip(weights, supports, strict=True)) / sum(weights)
     return Explanation(cause.component, cause.prior + total, unexplained)
 
@@ -153,6 +154,6 @@ def burden(deviations: Iterable[Deviation]) -> float:
 
 
 def applicable(causes: Sequence[Cause], statistics: Iterable[str]) -> list[Cause]:
-    """The causes whose symptoms can all be observed."""
+    """The causes whose symptoms can all be observed, except for optional ones."""
     names = list(statistics)
-    return [c for c in causes if all(any(s.matches(name) for name in names) for s in c.symptoms)]
+    return [c for c in causes if all(s.optional or any(s.matches(name) for name in names) for s in c.symptoms)]

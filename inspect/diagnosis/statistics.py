@@ -11,26 +11,23 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.label_checks import label_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.statistics.reference_images import Reference
 from beliefscope.inspect.trace import Trace
 
 SCATTER = {"module bias": "module scatter"}
 """Kind of statistic -> kind of its distance from the other episodes: whether a bias is the same in all of them."""
 
 
-def episode_statistics(trace: Trace, checkpoint: Checkpoint, reference: Reference | None) -> dict[str, float]:
+def episode_statistics(trace: Trace, checkpoint: Checkpoint, sensors: Mapping[str, float]) -> dict[str, float]:
     """``KIND/SUBJECT/PHASE`` -> value, of all diagnostics that apply to the trace, of sensors, labels and modules.
 
-    reference: healthy images of the profile that the statistics are compared with, or None.
+    sensors: statistics of the episode's sensors, which do not depend on the filter (``sensor_statistics``).
     """
     values: dict[str, float] = {}
     for entry in DIAGNOSTICS.values():
         if entry.statistics is not None and entry.refusal(trace, None) is None:
             values |= entry.statistics(trace)
-    values |= sensor_statistics(trace.episode, reference) | label_statistics(trace)
-    return values | model_statistics(trace, checkpoint)
+    return {**values, **sensors, **label_statistics(trace), **model_statistics(trace, checkpoint)}
 
 
 def with_scatter(

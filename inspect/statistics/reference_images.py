@@ -1,4 +1,4 @@
-"""Healthy reference of the images of a task: the median image, the image expected for a hand position, and the hand.
+"""Healthy reference of the images of a task: the median image, the image expected for a hand position, and landmarks.
 
 A healthy profile stores it, so that the images of later episodes can be compared with it without ground truth.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, lost_images
-from beliefscope.inspect.statistics.hand_in_image import HandFilter, fit_hand_filter, quadratic
+from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter, fit_landmark_filter, quadratic
 from beliefscope.inspect.statistics.signals import Array
 
 Gray = NDArray[np.uint8]
@@ -41,6 +41,8 @@ class Reference:
         range: (2, H, W) nearly smallest and largest gray level of the images, corrected for the exposure of their
             episode; None in profiles of earlier versions.
         hand: where the hand is seen; None for data without hand positions and in profiles of earlier versions.
+        object: where the object is seen, from the labels of the map's components; None for data without labels, and
+            in profiles of earlier versions.
     """
 
     key: str
@@ -49,7 +51,8 @@ class Reference:
     expected: Array
     scale: Array
     range: Gray | None = None
-    hand: HandFilter | None = None
+    hand: LandmarkFilter | None = None
+    object: LandmarkFilter | None = None
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -63,6 +66,7 @@ class Reference:
             "scale": self.scale.tolist(),
             "range": None if self.range is None else self.range.tolist(),
             "hand": None if self.hand is None else self.hand.to_json(),
+            "object": None if self.object is None else self.object.to_json(),
         }
 
     @classmethod
@@ -73,12 +77,14 @@ class Reference:
         levels = np.array(value["expected"]["levels"], dtype=np.float64).reshape(len(size), *image.shape)
         scale = np.array(value["scale"], dtype=np.float64)
         range_ = None if value.get("range") is None else np.array(value["range"], dtype=np.uint8)
-        hand = None if value.get("hand") is None else HandFilter.from_json(value["hand"])
+        hand, object_ = (
+            None if value.get(name) is None else LandmarkFilter.from_json(value[name]) for name in ("hand", "object")
+        )
         if image.ndim != 2 or spread.shape != image.shape:
             raise ValueError(f"image {image.shape}, spread {spread.shape}")
         if range_ is not None and range_.shape != (2, *image.shape):
             raise ValueError(f"image {image.shape}, range {range_.shape}")
-        return cls(str(value["key"]), image, spread, levels * size[:, None, None], scale, range_, hand)
+        return cls(str(value["key"]), image, spread, levels * size[:, None, None], scale, range_, hand, object_)
 
     @property
     def has_hand(self) -> bool:
@@ -111,7 +117,8 @@ def measure_reference(episodes: Sequence[Episode]) -> Reference | None:
     spread = np.nanmax(np.abs(medians - image), axis=0)
     gray, spread = (np.rint(values).clip(0, 255).astype(np.uint8) for values in (image, np.ceil(spread)))
     expected, scale, hand = _hand_camera(episodes, key)
-    return Reference(key, gray, spread, expected, scale, _gray_range(episodes, key, medians, image), hand)
+    range_, object_ = _gray_range(episodes, key, medians, image), _object_filter(episodes, key)
+    return Reference(key, gray, spread, expected, scale, range_, hand, object_)
 
 
 def _gray_range(episodes: Sequence[Episode], key: str, medians: Array, image: Array) -> Gray:
@@ -127,7 +134,7 @@ def _gray_range(episodes: Sequence[Episode], key: str, medians: Array, image: Ar
     return np.rint(result).clip(0, 255).astype(np.uint8)
 
 
-def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, HandFilter | None]:
+def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, LandmarkFilter | None]:
     """``expected``, ``scale`` and ``hand`` of a reference, from the steps with an image."""
     size = episodes[0].observations[key].shape[1:]
     if HAND not in episodes[0].observations:
@@ -138,7 +145,38 @@ def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, H
     hand = np.concatenate([episode.observations[HAND][at] for episode, at in pairs]).astype(np.float64)
     scale = np.stack([hand.mean(0), np.maximum(hand.std(0), 1e-6)])
     expected = np.linalg.lstsq(quadratic((hand - scale[0]) / scale[1]), images.reshape(len(images), -1), rcond=None)[0]
-    return expected.reshape(-1, *size), scale, fit_hand_filter(images, hand)
+    return expected.reshape(-1, *size), scale, fit_landmark_filter(images, hand)
+
+
+def _object_filter(episodes: Sequence[Episode], key: str) -> LandmarkFilter | None:
+    """``object`` of a reference, from the steps with an image of labelled episodes."""
+    parts = []
+    for episode in episodes:
+        if (positions := object_positions(episode)) is not None:
+            seen = ~lost_images(episode.observations[key])
+            parts.append((normalised(episode.observations[key][seen]), positions[seen], _others(episode)[seen]))
+    return fit_landmark_filter(*map(np.concatenate, zip(*parts, strict=True))) if parts else None
+
+
+def _others(episode: Episode) -> Array:
+    """(T, e): what moves in the images beside the object's position: the hand, and the other components of the state.
+
+    Of angles these are cosine and sine.
+    """
+    columns = [np.ones((len(episode), 1))]
+    if HAND in episode.observations:
+        columns.append(episode.observations[HAND].astype(np.float64))
+    for i, component in enumerate(episode.task.components):
+        if i not in episode.task.map_indices:
+            values = episode.states[:, [i]].astype(np.float64)
+            columns += [np.cos(values), np.sin(values)] if component.unit == "rad" else [values]
+    return np.concatenate(columns, axis=1)
+
+
+def object_positions(episode: Episode) -> Array | None:
+    """(T, d): true values of the components of the likelihood map; None without labels or map components."""
+    positions = episode.states[:, list(episode.task.map_indices)].astype(np.float64)
+    return positions if positions.size and np.isfinite(positions).all() else None
 
 
 def normalised(images: Gray) -> Array:

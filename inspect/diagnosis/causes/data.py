@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.image import OBJECT
 
 MODULES = f"module */*|{WEIGHTS}|{DYNAMICS}"
 
@@ -18,14 +19,18 @@ CAUSES = (
             Symptom("lag/labels*|lag/dynamics/*", 1, 2.0),
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
-        f"{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
+        f"{OBJECT}|object match/image*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
         "Synchronise the clock of the motion capture with the sensors.",
     ),
     Cause(
         "labels.offset",
         "Labels offset",
-        (Symptom("module bias/*image*", 0), Symptom("module bias/*", 0, 0.3, "common")),
-        f"{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
+        (
+            Symptom(f"module bias/*image*|{OBJECT}", 0),
+            Symptom(OBJECT, 0, optional=True),
+            Symptom("module bias/*", 0, 0.3, "common"),
+        ),
+        f"object match/image*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
         "Register the frame of the motion capture with the robot's.",
     ),
     Cause(
@@ -33,9 +38,14 @@ CAUSES = (
         "Data differ from the training data as a whole",
         (
             Symptom("module error/*", 1),
-            Symptom("module power/*|sharpness/image/*|occlusion/image/*|shift/image*|lever/force*|size/*", 0),
+            Symptom(
+                "module power/*|object match/image*|sharpness/image/*|occlusion/image/*|shift/image*|lever/force*"
+                "|size/*",
+                0,
+            ),
         ),
-        f"sharpness/*|occlusion/*|shift/*|brightness/*|offset/*|*/force*|*/torque*|*/contact/*|{LABELS}|{MODULES}",
+        f"{OBJECT}|object match/image*|sharpness/*|occlusion/*|shift/*|brightness/*|offset/*|*/force*|*/torque*"
+        f"|*/contact/*|{LABELS}|{MODULES}",
         "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "
         "-o tuned.safetensors`.",
         prior=-0.4,

@@ -8,6 +8,12 @@ from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
 HAND = "hand offset/image*"
 """Position of the hand in the image against the measured one."""
 
+OBJECT = "object offset/image*"
+"""Position of the object in the image against the labelled one."""
+
+LANDMARKS = f"{HAND}|{OBJECT}|hand match/image*|object match/image*"
+"""Everything about landmarks in the image."""
+
 CHECK = "Check the camera and its driver; until then, run the filter without the image."
 
 CAUSES = (
@@ -23,8 +29,8 @@ CAUSES = (
         "image.frozen",
         "Image frozen",
         (Symptom("frozen/image/*"),),
-        f"lag/image/*|black/image/*|noise/image/*|occlusion/image/*|shift/image*|sharpness/image/*|brightness/image/*|{HAND}"
-        f"|{IMAGE}",
+        f"lag/image/*|black/image/*|noise/image/*|occlusion/image/*|shift/image*|sharpness/image/*|brightness/image/*"
+        f"|{LANDMARKS}|{IMAGE}",
         CHECK,
         "drop image",
     ),
@@ -32,15 +38,19 @@ CAUSES = (
         "image.delay",
         "Image delayed",
         (Symptom("lag/image/*"),),
-        f"frozen/image/*|shift/image*|{HAND}|{IMAGE}",
+        f"frozen/image/*|shift/image*|{LANDMARKS}|{IMAGE}",
         "Synchronise the clocks of camera and robot, or delay the other sensors by the same number of steps.",
         "advance image",
     ),
     Cause(
         "image.shift",
         "Camera moved",
-        (Symptom(f"shift/image*|{HAND}", 0), Symptom("shift/image*|module bias/*image*", 0, 0.5)),
-        f"occlusion/image/*|brightness/image/*|sharpness/image/*|{IMAGE}",
+        (
+            Symptom(f"shift/image*|{HAND}", 0),
+            Symptom("shift/image*|module bias/*image*", 0, 0.5),
+            Symptom(OBJECT, 0, 0.3, optional=True),
+        ),
+        f"{LANDMARKS}|occlusion/image/*|brightness/image/*|sharpness/image/*|{IMAGE}",
         "Calibrate the camera pose again.",
         "realign image",
     ),
@@ -48,7 +58,7 @@ CAUSES = (
         "image.noise",
         "Image noisy",
         (Symptom("noise/image/*"),),
-        f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{HAND}|{IMAGE}",
+        f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Reduce the camera's gain, or train with noisy images: `beliefscope finetune {task} --filter {filter} "
         "--faults image_noise=40 -o tuned.safetensors`.",
         "drop image",
@@ -57,7 +67,7 @@ CAUSES = (
         "image.blur",
         "Images blurred",
         (Symptom("sharpness/image/*", -1),),
-        f"shift/image*|lag/image/*|{HAND}|{IMAGE}",
+        f"shift/image*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Focus the camera and clean its lens, or shorten the exposure time.",
         "drop image",
         lowers="noise/image/*",
@@ -66,7 +76,7 @@ CAUSES = (
         "image.exposure",
         "Exposure changed",
         (Symptom("brightness/image/*", 0),),
-        f"sharpness/image/*|occlusion/image/*|shift/image*|lag/image/*|{HAND}|{IMAGE}",
+        f"sharpness/image/*|occlusion/image/*|shift/image*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Restore the camera's exposure or the lighting.",
         "expose image",
         lowers="noise/image/*",
@@ -75,7 +85,7 @@ CAUSES = (
         "image.occlusion",
         "Camera occluded",
         (Symptom("occlusion/image/*"),),
-        f"shift/image*|brightness/image/*|lag/image/*|{HAND}|{IMAGE}",
+        f"shift/image*|brightness/image/*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Clear the camera's view.",
         "drop image",
         lowers="noise/image/*|sharpness/image/*",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, HAPTICS
-from beliefscope.inspect.diagnosis.causes.image import HAND
+from beliefscope.inspect.diagnosis.causes.image import HAND, LANDMARKS
 
 IN_PHASES = "|".join(f"{kind}/*" for kind in ("level", "drift", "change", "size", "lever", "axes", "direction"))
 """Statistics of force and torque in free motion or in contact."""
@@ -25,7 +25,7 @@ CAUSES = (
         "effector.noise",
         "End-effector position noisy",
         (Symptom("position noise/effector_position*"),),
-        f"{HAND}|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        f"{LANDMARKS}|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{HAPTICS}|{DYNAMICS}",
         "Check the joint encoders and the filter of the robot's kinematics.",
         "drop haptics",
     ),
@@ -65,8 +65,8 @@ CAUSES = (
         "haptics.dropout",
         "Haptics lost: all readings repeat the last one",
         (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
-        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|{HAND}|position noise/*|{HAPTICS}"
-        f"|{DYNAMICS}",
+        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|{LANDMARKS}|position noise/*"
+        f"|{HAPTICS}|{DYNAMICS}",
         "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
     ),
@@ -74,7 +74,7 @@ CAUSES = (
         "haptics.delay",
         "Haptics delayed",
         (Symptom("lag/image/*", -1),),
-        f"lag/contact/*|lag/control/*|lag/dynamics/*|{HAND}|level/*|direction/force/*|{HAPTICS}|{DYNAMICS}",
+        f"lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*|{HAPTICS}|{DYNAMICS}",
         "Synchronise the clocks of camera and robot.",
         "advance haptics",
     ),

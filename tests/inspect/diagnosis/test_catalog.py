@@ -55,7 +55,7 @@ def row(cause: Cause) -> str:
 
     def text(s: Symptom) -> str:
         own = f"`{s.statistics.replace('|', '`, `')}` {'is ' + s.target if s.target else sign[s.direction]}"
-        return " or ".join([own, *map(text, s.otherwise)])
+        return " or ".join([own, *map(text, s.otherwise)]) + (", if known" if s.optional else "")
 
     symptoms = "; ".join(map(text, cause.symptoms))
     return f"| `{cause.name}` | {cause.title} | {symptoms} | {cause.undo or 'none'} |"
@@ -155,6 +155,17 @@ def test_two_causes_are_probable_if_each_explains_what_the_other_does_not() -> N
 def test_causes_that_cannot_be_observed_are_left_out() -> None:
     names = {cause.name for cause in applicable(CAUSES, ["black/image/all", "particles//all"])}
     assert names == {"image.blackout", "particles.few"}
+
+
+def test_an_optional_symptom_counts_only_where_it_is_observed() -> None:
+    """Labels offset and a biased image model: the object in the images agrees with the labels only in the latter."""
+    labels, model = (next(c for c in CAUSES if c.name == name) for name in ("labels.offset", "model.image.bias"))
+    bias = deviation("module bias/image x/all", 10.0)
+    unknown = applicable((labels,), ["module bias/image x/all"])
+    assert unknown == [labels]
+    agrees, differs = (deviation("object offset/image x/all", t) for t in (0.0, 10.0))
+    assert explain(model, [bias, agrees]).score > explain(labels, [bias, agrees]).score
+    assert explain(labels, [bias, differs]).score > explain(model, [bias, differs]).score
 
 
 def test_the_burden_counts_phases_once_and_the_filter_less() -> None:

@@ -207,6 +207,25 @@ def test_faults_are_localised(faults: str, statistic: str, steps: tuple[int, int
     assert localise("lag/image/all", faulty, reference("push")) is None
 
 
+def test_labels_with_an_offset_move_the_object_and_not_the_hand() -> None:
+    """The puck is seen where it was, to a fifth of a pixel (3 mm along x): the distance is that of the labels."""
+    with open_dataset("datasets/samples/push.h5") as data:
+        reference_ = measure_reference([data[i] for i in range(100, 140)])
+    assert reference_ is not None
+    assert reference_.object is not None
+    offset = np.array([0.02, -0.03], dtype=np.float32)
+    moved = []
+    for episode in episodes("push")[:4]:
+        before, after = (
+            sensor_statistics(e, reference_) for e in (episode, replace(episode, states=episode.states + offset))
+        )
+        assert all(after[f"hand offset/image {axis}/all"] == before[f"hand offset/image {axis}/all"] for axis in "xy")
+        moved.append([after[name] - before[name] for name in (f"object offset/image {axis}/all" for axis in "xy")])
+    middle = np.median(episodes("push")[0].states, axis=0)
+    expected = np.subtract(*reference_.object.pixels(np.stack([middle, middle + offset]).astype(np.float64)))
+    np.testing.assert_allclose(np.mean(moved, axis=0), expected, atol=0.2)
+
+
 def test_reference_survives_json() -> None:
     before = reference("push")
     again = Reference.from_json(before.to_json())

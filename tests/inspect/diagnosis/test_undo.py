@@ -19,6 +19,7 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood, recovery
+from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, undo
@@ -49,7 +50,10 @@ def traces(run: Setting) -> list[Trace]:
 
 def deviations(healthy: Setting, faulty: Setting) -> dict[str, Deviation]:
     """Mean statistics of two runs."""
-    rows = [[episode_statistics(trace, run.checkpoint, None) for trace in traces(run)] for run in (healthy, faulty)]
+    rows = [
+        [episode_statistics(trace, run.checkpoint, sensor_statistics(trace.episode, None)) for trace in traces(run)]
+        for run in (healthy, faulty)
+    ]
     result = {}
     for name in rows[0][0]:
         mean = [float(np.nanmean([row.get(name, np.nan) for row in group])) for group in rows]

@@ -14,12 +14,11 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnosis.statistics import episode_statistics
+from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile
 from beliefscope.inspect.healthy import measure_profile
 from beliefscope.inspect.statistics.reference_images import measure_reference
-from beliefscope.inspect.traces.batch import trace_all
 
 NAMES = [f"nees/{layer}/{phase}" for layer in ("image", "haptics", "fused") for phase in ("all", "contact")]
 NAMES += [f"weight/image/{phase}" for phase in ("all", "contact")]
@@ -140,10 +139,9 @@ def test_a_measured_profile_is_that_of_new_episodes() -> None:
     assert measured.episodes == 12
     assert measured.reference is not None
     assert measured.reference.image.shape == (32, 32)
-    trace = next(trace_all(checkpoint, episodes, [0]))
     own, others = (measure_reference(chosen) for chosen in (episodes, [e for i, e in enumerate(episodes) if i % 4]))
     name = "hand offset/image x/all"
-    values = [episode_statistics(trace, checkpoint, reference)[name] for reference in (own, others)]
+    values = [sensor_statistics(episodes[0], reference)[name] for reference in (own, others)]
     assert measured.statistics[name][0] == pytest.approx(values[1], abs=1e-5)
     assert abs(values[0]) < abs(values[1])
 
