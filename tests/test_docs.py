@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 import beliefscope as bs
 from beliefscope import __version__
-from beliefscope.filters.checkpoint import shipped
+from beliefscope.filters.checkpoint import PRETRAINED, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.palette import COLOURS
 
@@ -76,6 +76,14 @@ def test_every_diagnostic_has_limits_and_a_remedy() -> None:
         assert re.match(r"\*[^*]+\?\*", section), entry.title
         assert re.search(r"`[^`]*[=/(∫√Σ][^`]*`", section), f"{entry.title} has no equation"
         assert section.index("**How it can mislead.**") < section.index("**What to do.**")
+
+
+def test_false_alarms_of_every_trained_filter_are_documented() -> None:
+    text = (ROOT / "docs" / "diagnostics.md").read_text()
+    table = text.split("| filter | false alarms |")[1].split("\n\n")[0]
+    rates = dict(re.findall(r"^\| ([\w-]+) \| ([\d.]+) % \|", table, re.MULTILINE))
+    assert sorted(rates) == sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
+    assert max(map(float, rates.values())) <= 5.0, "no alarm in 95 % of the samples"
 
 
 def test_python_reference_is_complete() -> None:
