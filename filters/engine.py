@@ -108,7 +108,7 @@ def _run_on_ray(
     try:
         gpus = min(1, ray.cluster_resources().get("GPU", 0))
         # Ray takes functions only, no other callables such as partial ones.
-        run = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=3)(lambda item: function(item))
+        run: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=3)(lambda item: function(item))
         running = {run.remote(item): item for item in items}
         while running:
             (done, *_), _ = ray.wait(list(running))
