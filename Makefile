@@ -108,7 +108,7 @@ claims: install
 
 docs: install
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	@echo "The site is in build/site; to use its search as well: python -m http.server -d build/site"
+	@echo "The site is in build/site: open index.html."
 
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)

@@ -1,6 +1,6 @@
 """Effect of each fine-tuning preset on the shipped filters, as a Markdown table.
 
-    python bench/finetune_presets.py                             # the default preset of every filter of door and push
+    python bench/finetune_presets.py                             # the default of every filter of door and push
     python bench/finetune_presets.py --all door/crossmodal-ekf   # all presets of a filter
 
 Every run has the filter's default settings (``filters/finetuning/defaults.py``) except for the trained modules. Ratios
@@ -24,7 +24,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.io.atomic_write import write_atomically
-from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.store import has_sample, open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, shipped
 from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.filter import Filter
@@ -91,6 +91,14 @@ def run(task: str, name: str, preset: str) -> Result:
     return result
 
 
+def _has_training_episodes(task: str) -> bool:
+    """Whether the sample set has; those of field tasks have test episodes only, and real pushes have none."""
+    if not has_sample(task):
+        return False
+    with open_dataset(sample_path(task)) as data:
+        return any(summary.split == "train" for summary in data.summaries)
+
+
 def _measure(filter_: Filter, episodes: Sequence[Episode], faults: Faults) -> Metrics:
     return evaluate(filter_, episodes, faults=faults, particles=PARTICLES)
 
@@ -107,8 +115,8 @@ def row(result: Result) -> str:
 
 def main(arguments: list[str]) -> None:
     every = "--all" in arguments
-    shipped_names = [path.stem.split("-", 1) for path in sorted(PRETRAINED.glob("*.safetensors"))]
-    names = [f"{task}/{name}" for task, name in shipped_names if not name.startswith("real")]
+    checkpoints = map(load_checkpoint, sorted(PRETRAINED.glob("*.safetensors")))
+    names = [f"{c.task.name}/{c.name}" for c in checkpoints if _has_training_episodes(c.task.name)]
     print("| filter | preset | fault | validation | clean, validation | test | clean, test | NEES/n, clean | CPU, s |")
     print("| --- | --- | --- | ---: | ---: | --- | --- | ---: | ---: |", flush=True)
     for text in [argument for argument in arguments if argument != "--all"] or names:

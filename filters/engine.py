@@ -17,7 +17,10 @@ from beliefscope.datasets.parallel import run_in_processes
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+Block = TypeVar("Block", bound=Sequence[Any])
+
 Engine = Literal["local", "ray"]
+Progress = Callable[[float], None] | None
 
 
 def run_all(
@@ -49,6 +52,37 @@ def run_all(
             yield from results
 
 
+def run_blocks(
+    function: Callable[[Block, Progress], Result],
+    blocks: Sequence[Block],
+    engine: Engine = "local",
+    workers: int = 1,
+    progress: Progress = None,
+) -> Generator[tuple[Block, Result]]:
+    """As ``run_all``, for blocks of items, with the completed share of all items.
+
+    In this process, ``function(block, progress)`` may report the share of its block; elsewhere ``progress`` is None.
+    """
+    total, finished = sum(map(len, blocks)), 0
+
+    def call(block: Block) -> Result:
+        return function(block, lambda share: report(share * len(block)))
+
+    def report(items: float) -> None:
+        if progress is not None:
+            progress((finished + items) / total)
+
+    here = engine == "local" and min(workers, len(blocks)) <= 1
+    for block, result in run_all(call if here else partial(_silent, function), blocks, engine, workers):
+        finished += len(block)
+        report(0)
+        yield block, result
+
+
+def _silent(function: Callable[[Block, Progress], Result], block: Block) -> Result:
+    return function(block, None)
+
+
 def _run_on_ray(
     function: Callable[[Item], Result], items: Sequence[Item], on_loss: Callable[[Item, Exception], Result] | None
 ) -> Generator[tuple[Item, Result]]:
@@ -73,7 +107,8 @@ def _run_on_ray(
             ray.init("local", include_dashboard=False, **quiet)
     try:
         gpus = min(1, ray.cluster_resources().get("GPU", 0))
-        run = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=3)(function)
+        # Ray takes functions only, no other callables such as partial ones.
+        run: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=3)(lambda item: function(item))
         running = {run.remote(item): item for item in items}
         while running:
             (done, *_), _ = ray.wait(list(running))

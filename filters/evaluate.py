@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,13 +15,14 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import check_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.html import html_table
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
@@ -38,7 +40,13 @@ BASELINES = {
 }
 """Estimators that every filter must beat: name -> meaning."""
 
+BLOCK = 64
+"""Episodes that a filter runs over at a time. It determines the memory, and the random numbers of particle filters."""
+
 FloatArray64 = NDArray[np.float64]
+
+Member = TypeVar("Member", bound=tuple[Any, ...])
+"""Number and episode, and perhaps more."""
 
 Run = tuple[Tensor, Tensor]
 """Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU; of one trajectory without N."""
@@ -117,7 +125,9 @@ def evaluate(
     start_offset: StartOffset = NO_OFFSET,
     baselines: bool = False,
     modalities: bool = False,
-    progress: Callable[[float], None] | None = None,
+    engine: Engine = "local",
+    workers: int = 1,
+    progress: Progress = None,
 ) -> Metrics:
     """Runs the filter over whole episodes, each from its first belief (``rollout.first_belief``).
 
@@ -128,34 +138,30 @@ def evaluate(
         baselines: whether to evaluate ``BASELINES`` as well, with the same starts, faults and random numbers.
         modalities: whether to evaluate the single-modality updates and standalone filters as well, in the same way.
             An external filter runs without information of the others' sensors (``external/ablation.py``).
+        engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
 
     Raises:
-        BadInput: there is no episode, or episodes, faults or modality do not fit the filter's task.
+        BadInput: there is no episode; episodes, faults or modality do not fit the filter's task; or there are several
+            workers for an external filter that has no build function.
     """
-    device = torch.device("cpu") if isinstance(filter_, ExternalFilter) else next(filter_.parameters()).device
-    offsets = torch.from_numpy(start_offset.vectors(filter_.task, episodes, seed)).to(device)
-    variances = torch.from_numpy(start_offset.variances(filter_.task)).to(device)
-    episodes = [faults.apply(episode, seed) for episode in episodes]
-    if start_offset:
-        episodes = [without_start_offset(episode) for episode in episodes]
-    steps = Steps.from_episodes(filter_.task, episodes, device)
-    groups: dict[int, list[int]] = {}
-    for number, length in enumerate(steps.length.tolist()):
-        groups.setdefault(length, []).append(number)
+    offsets = torch.from_numpy(start_offset.vectors(filter_.task, episodes, seed))
+    members = list(zip(range(len(episodes)), episodes, offsets, strict=True))
+    block_runs = partial(
+        _block_runs,
+        filter_,
+        faults=faults,
+        only=only,
+        particles=particles,
+        seed=seed,
+        start_offset=start_offset,
+        baselines=baselines,
+        modalities=modalities,
+    )
     runs: dict[str, dict[int, Run]] = {}
-    for done, (length, members) in enumerate(sorted(groups.items()), 1):
-        if isinstance(filter_, ExternalFilter):
-            start = shifted(filter_.start([episodes[i] for i in members]), offsets[members], variances)
-            results = _external_runs(filter_, [episodes[i] for i in members], start, only, seed, modalities)
-        else:
-            batch = steps.windows(steps.first[members], length)
-            start = offset_start(filter_, batch, offsets[members], variances)
-            results = _filter_runs(filter_, batch, start, only, particles, seed, baselines, modalities)
+    for block, results in run_blocks(block_runs, blocks_of(members), engine, workers, progress):
         for name, (error, covariance) in results.items():
-            by_episode = runs.setdefault(name, {})
-            by_episode |= {number: (error[:, i], covariance[:, i]) for i, number in enumerate(members)}
-        if progress is not None:
-            progress(done / len(groups))
+            pairs = zip(torch.from_numpy(error).unbind(1), torch.from_numpy(covariance).unbind(1), strict=True)
+            runs.setdefault(name, {}).update(zip((number for number, *_ in block), pairs, strict=True))
     pooled = {name: _pool(filter_.task, [by[i] for i in range(len(by))], episodes) for name, by in runs.items()}
     names = filter_.task.modalities if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
     return replace(
@@ -164,6 +170,50 @@ def evaluate(
         updates={name: pooled[UPDATE.format(name)] for name in names if UPDATE.format(name) in pooled},
         standalone={name: pooled[STANDALONE.format(name)] for name in names if STANDALONE.format(name) in pooled},
     )
+
+
+def blocks_of(members: Sequence[Member]) -> list[list[Member]]:
+    """Blocks of members whose episodes have equal lengths, shortest first. Raises BadInput if there are none."""
+    if not members:
+        raise BadInput("no episodes: the data set's split is empty")
+    by_length: dict[int, list[Member]] = {}
+    for member in members:
+        by_length.setdefault(len(member[1]), []).append(member)
+    return [same[i : i + BLOCK] for _, same in sorted(by_length.items()) for i in range(0, len(same), BLOCK)]
+
+
+def _block_runs(
+    filter_: Filter | ExternalFilter,
+    block: Sequence[tuple[int, Episode, Tensor]],
+    progress: Progress,
+    *,
+    faults: Faults,
+    only: str | None,
+    particles: int,
+    seed: int,
+    start_offset: StartOffset,
+    baselines: bool,
+    modalities: bool,
+) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
+    """The runs over a block of equally long episodes, each with the offset of its start, as arrays for other processes.
+
+    Arguments as for ``evaluate``.
+    """
+    device = torch.device("cpu") if isinstance(filter_, ExternalFilter) else next(filter_.parameters()).device
+    offsets = torch.stack([offset for *_, offset in block]).to(device)
+    variances = torch.from_numpy(start_offset.variances(filter_.task)).to(device)
+    episodes = [faults.apply(episode, seed) for _, episode, _ in block]
+    if start_offset:
+        episodes = [without_start_offset(episode) for episode in episodes]
+    steps = Steps.from_episodes(filter_.task, episodes, device)
+    if isinstance(filter_, ExternalFilter):
+        start = shifted(filter_.start(episodes), offsets, variances)
+        runs = _external_runs(filter_, episodes, start, only, seed, modalities)
+    else:
+        batch = steps.windows(steps.first, len(episodes[0]))
+        start = offset_start(filter_, batch, offsets, variances)
+        runs = _filter_runs(filter_, batch, start, only, particles, seed, baselines, modalities, progress)
+    return {name: (error.numpy(), covariance.numpy()) for name, (error, covariance) in runs.items()}
 
 
 def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: int) -> Run:
@@ -181,6 +231,7 @@ def _filter_runs(
     seed: int,
     baselines: bool = False,
     modalities: bool = False,
+    progress: Progress = None,
 ) -> dict[str, Run]:
     """The runs of the filter and, if requested, of its baselines and modalities, from the same start."""
     evidence = filter_.encode(batch)
@@ -190,7 +241,7 @@ def _filter_runs(
     if baselines and not isinstance(filter_, SequenceModel):
         by_name[DYNAMICS] = evidence.select_models(torch.zeros_like(evidence.observation[..., 0], dtype=torch.bool))
     runs = {}
-    for name, selected in by_name.items():
+    for done, (name, selected) in enumerate(by_name.items(), 1):
         generator = torch.Generator(batch.states.device).manual_seed(seed)
         result = rollout(filter_, selected, start, generator, particles, updates=modalities and name == FILTER)
         runs[name] = _si_run(filter_, batch, result.estimate)
@@ -198,6 +249,8 @@ def _filter_runs(
             updates = zip(result.updates.mean.unbind(2), result.updates.covariance.unbind(2), strict=True)
             for model, moments in zip(filter_.names, updates, strict=True):
                 runs[UPDATE.format(model)] = _si_run(filter_, batch, Gaussian(*moments))
+        if progress is not None:
+            progress(done / len(by_name))
     mean = filter_.statistics.state_to_si(start.mean)
     return runs | {STAY: _stay(filter_.task, mean.cpu(), batch.states.cpu())}
 

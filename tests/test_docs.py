@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 import beliefscope as bs
 from beliefscope import __version__
-from beliefscope.filters.checkpoint import shipped
+from beliefscope.filters.checkpoint import PRETRAINED, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.palette import COLOURS
 
@@ -78,6 +78,14 @@ def test_every_diagnostic_has_limits_and_a_remedy() -> None:
         assert section.index("**How it can mislead.**") < section.index("**What to do.**")
 
 
+def test_false_alarms_of_every_trained_filter_are_documented() -> None:
+    text = (ROOT / "docs" / "diagnostics.md").read_text()
+    table = text.split("| filter | false alarms |")[1].split("\n\n")[0]
+    rates = dict(re.findall(r"^\| ([\w-]+) \| ([\d.]+) % \|", table, re.MULTILINE))
+    assert sorted(rates) == sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
+    assert max(map(float, rates.values())) <= 5.0, "no alarm in 95 % of the samples"
+
+
 def test_python_reference_is_complete() -> None:
     text = (ROOT / "docs" / "python_reference.md").read_text()
     names = re.findall(r"^::: (\S+)\.(\w+)$", text, re.MULTILINE)
@@ -91,20 +99,42 @@ def test_command_line_reference_is_current() -> None:
     assert (ROOT / "docs" / "cli.md").read_text() == tool["reference"](), "run python tools/cli_reference.py"
 
 
-@pytest.mark.long
-def test_site_is_built_without_warnings(tmp_path: Path) -> None:
-    """The site loads nothing from other hosts."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The documentation site, built without warnings."""
     pytest.importorskip("mkdocs")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path]
-    done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True
-    )
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    pages = [page.read_text() for page in tmp_path.rglob("*.html")]
+    return folder
+
+
+@pytest.mark.long
+def test_site_loads_nothing_from_other_hosts(site: Path) -> None:
+    pages = [page.read_text() for page in site.rglob("*.html")]
     assert len(pages) > 30
     assert not [
         p for page in pages for p in re.findall(r'<(?:script|img|link rel="stylesheet")[^>]+"https?://[^"]+"', page)
     ]
+
+
+@pytest.mark.long
+@pytest.mark.browser
+def test_site_is_searched_from_the_disk(site: Path, chromium: str) -> None:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_context(offline=True).new_page()
+        page.goto((site / "tutorials" / "inspect_a_run.html").as_uri())
+        page.keyboard.press("s")
+        page.keyboard.type("Shapley")
+        result = page.locator(".md-search-result__link").first
+        result.wait_for(timeout=30_000)
+        assert "diagnostics.html" in str(result.get_attribute("href"))
+        browser.close()
 
 
 def test_files_in_the_architecture_exist() -> None:

@@ -6,7 +6,7 @@
 
 An HTML comment behind the numbers names their command, and where its output has them:
 
-    The sample set has 140 episodes.<!-- claim: beliefscope info door.h5 --json - => $.episodes -->
+    evaluated on 64 episodes<!-- claim: beliefscope evaluate door --filter image-ekf --json - => $.episodes -->
     errors of 1.9 and 3.5 cm<!-- claim: python bench/x.py => x: ([\\d.]+), y: ([\\d.]+) ± 0.2 -->
 
 After ``=>`` are paths into a JSON document, separated by commas, each with an optional factor

@@ -90,7 +90,7 @@ def choices(checkpoint: Checkpoint) -> Choices:
             modules.append(ModuleInfo(node.name, node.kind, node.description, node.parameters, node.depth, **sizes))
     parameters = [name for name, _ in filter_.named_parameters()]
     trained = {name: set(select_parameters(filter_, [name])) for name in presets(filter_)}
-    slices = [*fault_slices(checkpoint.task, filter_.names).values()]
+    slices = fault_slices(checkpoint.task, filter_.names)
     slices += [s for s in standard_slices(checkpoint.task) if s != CLEAN and set(s.only) <= set(filter_.names)]
     return Choices(
         None,

@@ -10,44 +10,46 @@ from dataclasses import replace
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.module_selection import presets
 from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.filters.finetuning.slices import FAULT_SLICES, fault_slices
+from beliefscope.filters.finetuning.slices import FAULT_SLICES, NOISY_IMAGES, fault_slices
 
 RELIABILITY = FineTune(train=("reliability-only",), steps=150, rate=5e-4)
 
 CLEAN_WEIGHT = 0.97
-"""Of filters with images. Errors with an occluded image are so much larger than clean ones that they would outweigh
-clean data at equal weights."""
+"""Of filters with images. Errors with faulty images are so much larger than clean ones that they would outweigh clean
+data at equal weights."""
 
 
 def default_settings(filter_: Filter) -> FineTune:
-    """Settings chosen on validation episodes, on data with a fault of the filter's first modality (``fault_slices``).
+    """Settings chosen on validation episodes, on data with a fault of the filter's sensors (``fault_slices``).
 
     Without such a fault: the whole filter on clean data.
     """
-    for modality, slice_ in fault_slices(filter_.task, filter_.names).items():
-        settings = replace(RELIABILITY, mix=((slice_, 1.0),))
+    offered = fault_slices(filter_.task, filter_.names)
+    if not offered:
+        return FineTune()
+    slice_ = offered[0]
+    modality = FAULT_SLICES[slice_]
+    architecture = filter_.architecture
+    settings = RELIABILITY
+    # Particle filters, and filters with a weight model, can learn to distrust an image. Others must learn to read it.
+    distrusts = architecture.kind == "pf" or (modality == "image" and architecture.fusion == "crossmodal")
+    if not distrusts or "reliability-only" not in presets(filter_):
+        settings = replace(settings, train=(f"{modality}-only",), rate=FineTune.rate)
         if modality == "image":
-            settings = replace(settings, clean_weight=CLEAN_WEIGHT)
-        elif filter_.architecture.kind != "pf":
-            settings = replace(settings, train=("haptics-only",), rate=FineTune.rate)
-        known = set(settings.train) <= set(presets(filter_))
-        return settings if known else replace(settings, train=(f"{modality}-only",))
-    return FineTune()
+            slice_ = NOISY_IMAGES
+    if modality == "image":
+        settings = replace(settings, clean_weight=CLEAN_WEIGHT)
+    return replace(settings, mix=((slice_, 1.0),))
 
 
 def reason(filter_: Filter) -> str:
-    """Why these are the defaults, or that none were found, and what to try then."""
+    """Why these are the defaults, and what to try if they have no effect."""
     settings = default_settings(filter_)
-    for slice_, _ in settings.mix:
-        fault = f"Shipped filters were not trained with the sensor fault \u201c{slice_.name}\u201d"
-        crossmodal, kind = filter_.architecture.fusion == "crossmodal", filter_.architecture.kind
-        if slice_ == FAULT_SLICES["image"] and kind != "pf" and not crossmodal:
-            return (
-                f"{fault}. No settings were found that improve this filter there without loss on clean data: compare "
-                "the result before you save it, and try other modules or faults."
-            )
-        return (
-            f"{fault}, which multiplies their error; by default, the modules of \u201c{settings.train[0]}\u201d learn "
-            "from data with this fault. If this brings no change, try other modules or faults."
-        )
-    return ""
+    if not settings.mix:
+        return ""
+    ((slice_, _),) = settings.mix
+    return (
+        f"Shipped filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which multiplies their "
+        f"error; by default, the modules of \u201c{settings.train[0]}\u201d learn from data with this fault. If this "
+        "brings no change, try other modules or faults."
+    )

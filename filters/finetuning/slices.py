@@ -158,17 +158,18 @@ def standard_slices(task: Task) -> tuple[Slice, ...]:
     return tuple(slice_ for slice_ in slices if _fits(slice_, task))
 
 
-FAULT_SLICES = {
-    "image": Slice("image occluded", Faults.parse("image_occluded=12")),
-    "haptics": Slice("haptics noisy", Faults.parse("force_noise=5,contact_flipped=0.3")),
-}
-"""Modality -> slice of all steps with a fault that the training data lack."""
+OCCLUDED_IMAGES = Slice("image occluded", Faults.parse("image_occluded=12"))
+NOISY_IMAGES = Slice("image noisy", Faults.parse("image_noise=40"))
+NOISY_HAPTICS = Slice("haptics noisy", Faults.parse("force_noise=5,contact_flipped=0.3"))
+
+FAULT_SLICES = {OCCLUDED_IMAGES: "image", NOISY_IMAGES: "image", NOISY_HAPTICS: "haptics"}
+"""Slice of all steps with a fault that the training data lack -> modality."""
 
 
-def fault_slices(task: Task, models: Sequence[str]) -> dict[str, Slice]:
-    """The ``FAULT_SLICES`` of the modalities that a filter's models use and whose sensors the task has."""
-    used = dict.fromkeys(modality for model in models for modality in model.split("+"))
-    return {name: FAULT_SLICES[name] for name in used if name in FAULT_SLICES and _fits(FAULT_SLICES[name], task)}
+def fault_slices(task: Task, models: Sequence[str]) -> list[Slice]:
+    """The ``FAULT_SLICES`` whose modalities a filter's models use and whose sensors the task has."""
+    used = {modality for model in models for modality in model.split("+")}
+    return [slice_ for slice_, modality in FAULT_SLICES.items() if modality in used and _fits(slice_, task)]
 
 
 def fault_slice(faults: Faults) -> Slice:
@@ -178,7 +179,7 @@ def fault_slice(faults: Faults) -> Slice:
 
 def parse_slices(texts: Iterable[str], fault_sets: Iterable[str], task: Task) -> list[Slice]:
     """Slices from their text, and slices of all steps with faults, given as text or file."""
-    named = (*standard_slices(task), *fault_slices(task, tuple(task.modalities)).values())
+    named = (*standard_slices(task), *fault_slices(task, tuple(task.modalities)))
     slices = [Slice.parse(text, named) for text in texts]
     for text in fault_sets:
         faults = read_faults(text, task)

@@ -76,7 +76,7 @@ class Criterion:
 
     def slices(self, task: Task, models: Sequence[str], trained: Sequence[Slice]) -> list[Slice]:
         """Slices to evaluate in addition to the standard ones: those trained on, and that of the criterion."""
-        added = [s for s in fault_slices(task, models).values() if s.name == self.slice]
+        added = [s for s in fault_slices(task, models) if s.name == self.slice]
         return [*trained, *(s for s in added if s.name not in {other.name for other in trained})]
 
     def sentence(self, task: Task) -> str:
@@ -91,7 +91,7 @@ class Criterion:
 def criterion_slices(task: Task, models: Sequence[str]) -> list[Slice]:
     """Slices that a criterion can name besides those trained on."""
     standard = [s for s in standard_slices(task) if not s.only or (len(models) > 1 and set(s.only) <= set(models))]
-    return [*standard, *fault_slices(task, models).values()]
+    return [*standard, *fault_slices(task, models)]
 
 
 def measures(task: Task) -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import with_unit
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Engine, Progress
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.finetuning.slices import Slice, standard_slices
 from beliefscope.inspect.compare.effects import LEVEL, Difference, Regression, differences, find_regressions
@@ -211,7 +212,9 @@ def compare_checkpoints(
     slices: Sequence[Slice] = (),
     particles: int = 300,
     seed: int = 0,
-    progress: Callable[[float], None] | None = None,
+    engine: Engine = "local",
+    workers: int = 1,
+    progress: Progress = None,
 ) -> CheckpointComparison:
     """Compare two filters of one task: checkpoints or external filters.
 
@@ -221,6 +224,7 @@ def compare_checkpoints(
     Args:
         episodes: indices in ``data``; by default the held-out episodes of a ``Dataset``, otherwise all.
         slices: slices to evaluate in addition to the standard ones.
+        engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
         progress: called with the completed fraction, 0..1.
 
     Raises BadInput for checkpoints that cannot be compared, slices that do not fit, and as ``evaluate`` does.
@@ -239,7 +243,16 @@ def compare_checkpoints(
         episodes = data if isinstance(data, Mapping) else range(len(data))
     indices = tuple(episodes)
     members = [data[index] for index in indices]
-    sums = sum_episodes(pair, selected, members, particles=particles, seed=seed, progress=progress)
+    sums = sum_episodes(
+        pair,
+        selected,
+        members,
+        particles=particles,
+        seed=seed,
+        engine=engine,
+        workers=workers,
+        progress=progress,
+    )
     counts = sums.sums[:, 0, :, 0]
     finetuned = base_of(after.record).get("hash") == before.hash
     return CheckpointComparison(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.engine import Engine, one_thread, run_all
+from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Score, Survey, scores_of
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -33,13 +33,13 @@ def survey_of(
     particles: int = 300,
     engine: Engine = "local",
     workers: int = 1,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> Survey:
     """Run a filter over episodes of a data set, many at once.
 
     Args:
         by: a score that must apply to the filter.
-        engine, workers: where to run, as for ``filters.engine.run_all``. The values do not depend on them.
+        engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
 
     Raises BadInput after the first episode if ``by`` does not apply, as ``trace``, and for several workers with an
     external filter that has no build function.
@@ -50,20 +50,8 @@ def survey_of(
         try_score(by, checkpoint, data, indices[:1], **settings)
     blocks = [indices[i : i + BLOCK] for i in range(0, len(indices), BLOCK)]
     scores: list[EpisodeScores] = []
-
-    def advance(share: float = 0.0) -> None:
-        """Report the finished episodes and a share of the next block."""
-        if progress is not None:
-            progress((len(scores) + share * min(BLOCK, len(indices) - len(scores))) / len(indices))
-
-    if engine == "local" and workers == 1:
-        with one_thread():
-            for block in blocks:
-                scores += _scores(checkpoint, data, settings, block, advance)
-    else:
-        for _, finished in run_all(partial(_scores, checkpoint, data, settings), blocks, engine, workers):
-            scores += finished
-            advance()
+    for _, finished in run_blocks(partial(_scores, checkpoint, data, settings), blocks, engine, workers, progress):
+        scores += finished
     return Survey.from_episodes(scores)
 
 
@@ -72,7 +60,7 @@ def _scores(
     data: Episodes,
     settings: Mapping[str, Any],
     indices: Sequence[int],
-    progress: Callable[[float], None] | None = None,
+    progress: Progress,
 ) -> list[EpisodeScores]:
     runs = trace_all(checkpoint, data, indices, **settings, progress=progress)
     return [EpisodeScores.from_trace(run) for run in runs]

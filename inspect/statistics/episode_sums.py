@@ -17,7 +17,8 @@ from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import with_floor
-from beliefscope.filters.evaluate import external_run
+from beliefscope.filters.engine import Engine, Progress, run_blocks
+from beliefscope.filters.evaluate import blocks_of, external_run
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
@@ -25,8 +26,6 @@ from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.statistics.calibration import LEVELS, gaussian_level
 from beliefscope.inspect.statistics.measures import Array
-
-Progress = Callable[[float], None] | None
 
 SMALLEST = 1e-9
 """m, rad: lower limit of errors before taking the logarithm."""
@@ -122,7 +121,6 @@ def _mean(sums: Array, column: int) -> Array:
         return sums[..., column] / sums[..., 0]
 
 
-@torch.no_grad()
 def sum_episodes(
     filters: Sequence[Checkpoint],
     slices: Sequence[Slice],
@@ -130,41 +128,70 @@ def sum_episodes(
     *,
     particles: int = 300,
     seed: int = 0,
-    progress: Callable[[float], None] | None = None,
+    engine: Engine = "local",
+    workers: int = 1,
+    progress: Progress = None,
 ) -> EpisodeSums:
     """Run filters of one task over complete episodes as ``evaluate`` does, once per condition.
 
-    All filters draw the same random numbers. Steps of the task's warm-up are not counted. Raises BadInput for episodes
-    that do not fit the task.
+    All filters draw the same random numbers. Steps of the task's warm-up are not counted.
+
+    Args:
+        engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
+
+    Raises BadInput for episodes that do not fit the task, and as ``evaluate`` does.
     """
-    task = filters[0].task
-    n = len(task.components)
-    sums = np.zeros((len(episodes), len(filters), len(slices), n + 4 + len(LEVELS)))
+    sums = np.zeros((len(episodes), len(filters), len(slices), _width(filters[0].task)))
     distance = {condition(slice_): [np.zeros((len(filters), len(e))) for e in episodes] for slice_ in slices}
+    function = partial(_sum_block, filters, slices, particles, seed)
+    for block, (block_sums, distances) in run_blocks(
+        function, blocks_of(list(enumerate(episodes))), engine, workers, progress
+    ):
+        numbers = [number for number, _ in block]
+        sums[numbers] = block_sums
+        for condition_, values in distances.items():
+            for number, row in zip(numbers, values, strict=True):
+                distance[condition_][number][:] = row
+    return EpisodeSums(sums, distance)
+
+
+@torch.no_grad()
+def _sum_block(
+    filters: Sequence[Checkpoint],
+    slices: Sequence[Slice],
+    particles: int,
+    seed: int,
+    block: Sequence[tuple[int, Episode]],
+    progress: Progress,
+) -> tuple[Array, dict[Condition, Array]]:
+    """``EpisodeSums`` of equally long episodes: (N, F, S, Q), and condition -> (N, F, T)."""
+    task, episodes = filters[0].task, [episode for _, episode in block]
+    length, n = len(episodes[0]), len(task.components)
+    sums = np.zeros((len(block), len(filters), len(slices), _width(task)))
+    distance = {condition(slice_): np.zeros((len(block), len(filters), length)) for slice_ in slices}
     by_faults: dict[str, list[int]] = {}
     for s, slice_ in enumerate(slices):
         by_faults.setdefault(str(slice_.faults), []).append(s)
-    by_length: dict[int, list[int]] = {}
-    for number, episode in enumerate(episodes):
-        by_length.setdefault(len(episode), []).append(number)
-    total, done = len(distance) * len(filters) * len(episodes), 0
+    total, done, first = len(distance) * len(filters), 0, task.first_counted(length)
     for faults, fault_slices in by_faults.items():
         faulty = slices[fault_slices[0]].apply_faults(episodes, seed)
         steps = Steps.from_episodes(task, faulty)
-        for length, members in sorted(by_length.items()):
-            batch, first = steps.windows(steps.first[members], length), task.first_counted(length)
-            for f, filter_ in enumerate(filters):
-                run = _runner(filter_, [faulty[number] for number in members], batch, particles, seed)
-                for only in dict.fromkeys(slices[s].only for s in fault_slices):
-                    run_slices = [s for s in fault_slices if slices[s].only == only]
-                    share = _scaled_progress(progress, done, len(members), total)
-                    columns = _columns(task, *run(slices[run_slices[0]], share))
-                    for s in run_slices:
-                        sums[members, f, s] = _sum_steps(columns[first:], slices[s].mask(batch)[first:])
-                    for i, number in enumerate(members):
-                        distance[faults, only][number][f] = np.sqrt(columns[:, i, n + 1])
-                    done += len(members)
-    return EpisodeSums(sums, distance)
+        batch = steps.windows(steps.first, length)
+        for f, filter_ in enumerate(filters):
+            run = _runner(filter_, faulty, batch, particles, seed)
+            for only in dict.fromkeys(slices[s].only for s in fault_slices):
+                run_slices = [s for s in fault_slices if slices[s].only == only]
+                columns = _columns(task, *run(slices[run_slices[0]], _scaled_progress(progress, done, total)))
+                for s in run_slices:
+                    sums[:, f, s] = _sum_steps(columns[first:], slices[s].mask(batch)[first:])
+                distance[faults, only][:, f] = np.sqrt(columns[..., n + 1]).T
+                done += 1
+    return sums, distance
+
+
+def _width(task: Task) -> int:
+    """Number Q of columns of ``EpisodeSums.sums``."""
+    return len(task.components) + 4 + len(LEVELS)
 
 
 def _runner(
@@ -237,5 +264,5 @@ def _sum_steps(columns: Array, mask: Tensor) -> Array:
     return np.where(mask.numpy()[..., None], columns, 0.0).sum(0)
 
 
-def _scaled_progress(progress: Progress, done: int, size: int, total: int) -> Progress:
-    return None if progress is None else lambda share: progress((done + share * size) / total)
+def _scaled_progress(progress: Progress, done: int, total: int) -> Progress:
+    return None if progress is None else lambda share: progress((done + share) / total)

@@ -231,7 +231,7 @@ def test_summary_and_zoom_of_a_step(open_page: Any) -> None:
     assert (
         page.page.locator("#step-summary")
         .text_content()
-        .endswith("although the error of the image-only update is 0.8 cm.")
+        .endswith("although the error of the image-only update is 0.76 cm.")
     )
     images = {"fit": page.maps()}
     for zoom in ("4", "1"):

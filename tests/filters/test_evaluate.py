@@ -75,6 +75,26 @@ def test_consistency_is_null_without_a_covariance() -> None:
     json.dumps(document, allow_nan=False)
 
 
+@pytest.mark.slow
+def test_metrics_do_not_depend_on_the_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three blocks, of two lengths; the particle filter draws random numbers."""
+    monkeypatch.setattr("beliefscope.filters.evaluate.BLOCK", 2)
+    with open_dataset(sample_path("push")) as dataset:
+        episodes = [shortened(dataset[i], 36 if i == 0 else 40) for i in range(4)]
+    filter_ = load_checkpoint(shipped("push", "crossmodal-pf")).filter
+    shares: list[float] = []
+    one, two = (
+        evaluate(filter_, episodes, particles=20, baselines=True, modalities=True, workers=n, progress=shares.append)
+        for n in (1, 2)
+    )
+    assert one.to_dict() == two.to_dict()
+    np.testing.assert_array_equal(one.squares, two.squares)
+    end = shares.index(1.0)
+    assert shares[: end + 1] == sorted(shares[: end + 1]), "progress of one process"
+    assert sorted(shares[-3:]) == shares[-3:]
+    assert shares[-1] == 1.0
+
+
 def test_nees_bounds_contain_95_percent_of_consistent_filters() -> None:
     low, high = nees_bounds(3, 14)
     errors = np.random.default_rng(0).standard_normal((20_000, 14, 3))

@@ -92,7 +92,7 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.equal(finding(run(14), 0, HEALTHY).step, 8);
   const plain = finding(run(11), 0, null);
   assert.equal(plain.headline, 'Largest error at step 10.');
-  assert.match(plain.evidence, /error 1\.2 cm; largest deviation 5\.0σ in x: overconfident/);
+  assert.match(plain.evidence, /error 1\.23 cm; largest deviation 5\.0σ in x: overconfident/);
   assert.deepEqual([plain.tone, plain.step], ['bad', 10]);
   const healthy = finding(run(11), 0, HEALTHY);
   assert.equal(healthy.headline, 'Healthy: all is normal.');

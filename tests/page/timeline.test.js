@@ -177,11 +177,15 @@ test('the summary of a step names error, deviation and dominant modality', () =>
   assert.equal(first.tone, 'warn');
   assert.equal(
     first.text,
-    'Fused estimate: error 5.0 cm; largest deviation 3.0σ in hinge x: larger than predicted. ' +
+    'Fused estimate: error 5.00 cm; largest deviation 3.0σ in hinge x: larger than predicted. ' +
       'Dominated by image (70 % in hinge x).',
   );
   const second = stepSummary(trace, 1, 0);
   assert.match(second.text, /Dominated by image \(100 % in hinge x\)/);
+  const truth = { shape: [2, 3], values: [0.0001, 0, 0, 0, 0, 0] };
+  const close = { shape: [2, 3], values: [0, 0, 0, 0, 0, 0] };
+  const small = stepSummary(makeTrace({ ...FUSION, truth, estimate_mean: close }), 0, 0);
+  assert.match(small.text, /^Fused estimate: error 0\.01 cm/, 'not 0.0 cm');
 });
 
 test('the summary explains an uninformative dominant modality', () => {

@@ -16,6 +16,8 @@ from beliefscope.recordings.report.command_lines import serve_command
     after=opt.argument("AFTER", "As BEFORE."),
     every=opt.flag("Compare on all episodes, not only the held-out ones.", "--all"),
     task=opt.option("TASK", "Task of both filters. Required for two names."),
+    engine=opt.ENGINE,
+    workers=opt.WORKERS,
     output=opt.option("DIR", "New folder for change.json, change.svg and change.md.", "-o"),
 )
 def change(
@@ -28,6 +30,8 @@ def change(
     slices: list[str] | None = None,
     particles: int = 300,
     seed: int = 0,
+    engine: opt.Engine = "local",
+    workers: int = 1,
     output: Path | None = None,
 ) -> console.Result:
     """Report improvements and regressions between filters.
@@ -67,6 +71,8 @@ def change(
             slices=selection,
             particles=particles,
             seed=seed,
+            engine=engine,
+            workers=workers,
             progress=advance,
         )
         data_hash = episodes.hash

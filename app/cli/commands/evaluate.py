@@ -11,8 +11,17 @@ from beliefscope.app.cli import options as opt
     start_offset=opt.option(
         "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg."
     ),
+    engine=opt.ENGINE,
+    workers=opt.WORKERS,
 )
-def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", align: bool = False) -> console.Result:
+def evaluate(
+    runs: opt.Runs,
+    only: str | None = None,
+    start_offset: str = "",
+    align: bool = False,
+    engine: opt.Engine = "local",
+    workers: int = 1,
+) -> console.Result:
     """Measure the accuracy of a filter on held-out episodes.
 
     Uses the test episodes; if there are none, the validation episodes or all. Each run starts at the true state with
@@ -30,6 +39,7 @@ def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", al
       beliefscope evaluate door --filter crossmodal-pf
       beliefscope evaluate door --filter crossmodal-pf --start-offset 3cm,20deg
       beliefscope evaluate door --filter crossmodal-pf --faults blackout=0.8 --json -
+      beliefscope evaluate door --filter mine.safetensors --data door.h5 --workers 8
       beliefscope evaluate push-real --filter crossmodal-pf --data mit_push/val
       beliefscope evaluate door --filter crossmodal-pf --faults delay=haptics:steps=5 --only haptics
     """
@@ -56,6 +66,8 @@ def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", al
             start_offset=offset,
             baselines=True,
             modalities=only is None,
+            engine=engine,
+            workers=workers,
             progress=advance,
         ).to_dict()
     document = {

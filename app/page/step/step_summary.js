@@ -54,7 +54,7 @@ export function stepSummary(trace, step, component) {
  */
 function accuracy(trace, step) {
   const name = trace.fuses ? 'Fused estimate' : 'Estimate';
-  const error = `${name}: error ${withUnit(fixed(trace.error('fused', 'main')?.[step], 1), trace.mainUnit)}`;
+  const error = `${name}: error ${withUnit(fixed(trace.error('fused', 'main')?.[step], 2), trace.mainUnit)}`;
   const deviation = trace.largestDeviation(step);
   if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
   const { sigmas, component } = deviation;
@@ -93,7 +93,7 @@ function moreAccurateModality(dominant, trace, step, tone) {
   const gain = tone === 'good' ? MIN_GAIN.consistent : MIN_GAIN.other;
   if (!best || best.name === dominant) return '';
   if (!(best.error < Math.min(error - gain, MAX_RATIO * error))) return '';
-  return `the error of the ${updateLabel(best.name)} is ${withUnit(fixed(best.error, 1), trace.mainUnit)}`;
+  return `the error of the ${updateLabel(best.name)} is ${withUnit(fixed(best.error, 2), trace.mainUnit)}`;
 }
 
 /**

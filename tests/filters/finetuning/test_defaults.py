@@ -31,10 +31,8 @@ def test_defaults_train_a_model_of_the_filter_on_a_fault_of_its_sensors(task: st
     ((slice_, _),) = settings.mix
     (preset,) = settings.train
     modality = input_modalities(filter_)[0]
-    expected = {"lstm": "image-only", "transformer": "image-only", "haptics-ekf": "haptics-only"}.get(
-        name, "reliability-only"
-    )
-    assert preset == expected
+    distrusting = name.endswith("-pf") or name in ("crossmodal-ekf", "crossmodal-ukf")
+    assert preset == ("reliability-only" if distrusting else f"{modality}-only")
     assert preset in presets(filter_)
     assert 0 < len(select_parameters(filter_, settings.train)) <= len(list(filter_.parameters()))
     keys = {key for fault in slice_.faults for key in fault.keys(filter_.task)}

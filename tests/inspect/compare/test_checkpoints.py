@@ -210,6 +210,13 @@ def test_numbers_equal_evaluate(data: Dataset) -> None:
     assert not result.regressions()
 
 
+def test_values_do_not_depend_on_the_number_of_processes(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("beliefscope.filters.evaluate.BLOCK", 2)
+    members = {index: episode_of(data, index, 40) for index in EPISODES[:5]}
+    one, two = (compare_checkpoints(PF, EKF, members, particles=20, workers=n).to_dict() for n in (1, 2))
+    assert one == two
+
+
 def test_interval_coverage() -> None:
     """95 % intervals for pairs of episodes with a known ratio of expected squared errors."""
     rng, task = np.random.default_rng(0), EKF.task
