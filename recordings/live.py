@@ -372,8 +372,7 @@ def _unused_path(folder: Path, name: str) -> Path:
 def _tensors(values: Any) -> Any:
     """NumPy arrays and numbers as tensors, including those in a dictionary or pair."""
     if isinstance(values, Mapping):
-        kept = (*MEASUREMENTS, "extra")
-        return {name: value if name in kept else _tensors(value) for name, value in values.items()}
+        return {name: value if name in (*MEASUREMENTS, "extra") else _tensors(value) for name, value in values.items()}
     if isinstance(values, tuple):
         return tuple(map(_tensors, values))
     return values if isinstance(values, Tensor) else torch.from_numpy(np.array(values))

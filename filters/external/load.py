@@ -200,8 +200,7 @@ class ExternalFilter(Checkpoint):
         """Values of all steps; checked at once, and step by step only if one of them is invalid."""
         sizes = {"n": len(self._task.components)}
         try:
-            leading = (len(record.steps), count)
-            return check_values(record.stacked(), leading, sizes, f"{self.source} over all steps")
+            return check_values(record.stacked(), (len(record.steps), count), sizes, f"{self.source} over all steps")
         except (BadInput, RuntimeError):  # torch.stack refuses different shapes
             self._check_steps(record.steps, count)
             raise
