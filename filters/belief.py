@@ -107,7 +107,7 @@ class Evidence:
         return self.with_log_weights(log_weights)
 
     def with_log_weights(self, log_weights: Tensor) -> Evidence:
-        """The same evidence with other log beta (T, N, K, W), of which absent models have no share."""
+        """The same evidence with other log beta (T, N, K, W); absent models stay excluded."""
         evidence = replace(self, log_weights=log_weights)
         return evidence if self.present is None else evidence.select_models(self.present)
 
