@@ -113,6 +113,8 @@ def with_functions(task: Task, source: Task) -> Task:
 
 def difference(task: Task, other: Task) -> str:
     """The first difference of ``other`` in the name and the arrays of episodes; empty if there is none."""
+    if task is other:
+        return ""
     for name in LAYOUT:
         expected, value = (_plain(getattr(t, name)) for t in (task, other))
         if value != expected:

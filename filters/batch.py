@@ -27,6 +27,8 @@ class Batch:
         controls: (T, N, c). states: (T, N, n). contact: (T, N) bool.
         previous: (N, n) true state one step before the first (of step 0 if the trajectory starts there).
         start: (N, n) mean of the first belief; None: ``previous``.
+        present: (T, N, number of the task's modalities) bool, whether any sensor of a modality has a reading
+            (``Task.masks``); None: all have one.
     """
 
     observations: Mapping[str, Tensor]
@@ -35,6 +37,7 @@ class Batch:
     contact: Tensor
     previous: Tensor
     start: Tensor | None = None
+    present: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.states)
@@ -56,6 +59,7 @@ class Steps:
     first: Tensor
     length: Tensor
     start_offset: Tensor
+    present: Tensor | None = None
 
     @classmethod
     def from_episodes(cls, task: Task, episodes: Sequence[Episode], device: torch.device | str = "cpu") -> Steps:
@@ -77,6 +81,7 @@ class Steps:
             first=length.cumsum(0) - length,
             length=length,
             start_offset=torch.from_numpy(np.stack([start_offset(task, e) for e in episodes])).to(device),
+            present=_join([_presence(task, e) for e in episodes], device) if task.masks else None,
         )
 
     def windows(self, starts: Tensor, steps: int) -> Batch:
@@ -92,6 +97,7 @@ class Steps:
             contact=self.contact[index],
             previous=previous,
             start=previous + at_start.unsqueeze(-1) * self.start_offset[episode],
+            present=None if self.present is None else self.present[index],
         )
 
     def sample(self, count: int, steps: int, generator: torch.Generator) -> Batch:
@@ -179,6 +185,11 @@ def _modality_array(episode: Episode, keys: Sequence[str]) -> np.ndarray:
     if len(arrays) == 1:
         return arrays[0] if arrays[0].ndim == 3 else arrays[0].astype(np.float32)
     return np.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1).astype(np.float32)
+
+
+def _presence(task: Task, episode: Episode) -> np.ndarray:
+    """(T, number of modalities) bool, see ``Batch.present``."""
+    return np.stack([np.any([episode.present(key) for key in keys], axis=0) for keys in task.modalities.values()], 1)
 
 
 def _join(arrays: Sequence[np.ndarray], device: torch.device | str) -> Tensor:

@@ -104,19 +104,25 @@ class Evidence:
             return self
         log_weights = torch.full_like(self.log_weights, -torch.inf)
         log_weights[..., k, :] = 0.0
-        return replace(self, log_weights=log_weights)
+        return self.with_log_weights(log_weights)
+
+    def with_log_weights(self, log_weights: Tensor) -> Evidence:
+        """The same evidence with other log beta (T, N, K, W); absent models stay excluded."""
+        evidence = replace(self, log_weights=log_weights)
+        return evidence if self.present is None else evidence.select_models(self.present)
 
     def select_models(self, present: Tensor) -> Evidence:
         """The same evidence with only some of the models, as if the other sensors did not exist.
 
         EKF, UKF: an absent model does not update, and is excluded from the fusion. PF: its likelihood is excluded from
         the mixture. The other models' beta keeps its proportions; a model with beta zero counts as absent. If no model
-        is present, the belief is only predicted.
+        is present, the belief is only predicted. Models that are absent already stay absent.
 
         Args:
             present: (T, N, K) bool. If the evidence has N = 1, N may be any number: one trajectory per subset.
         """
         n = present.shape[1]
+        present = present if self.present is None else present & self.present
         subset = replace(self._map(lambda tensor: tensor.expand(-1, n, *tensor.shape[2:])), present=present)
         if subset.log_weights is None:
             return subset

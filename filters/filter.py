@@ -154,6 +154,20 @@ class Filter(nn.Module, ABC):
         """Observations by modality, standardised, float32."""
         return self.statistics.standardise_observations(batch.observations)
 
+    def with_readings(self, evidence: Evidence, batch: Batch) -> Evidence:
+        """The batch's evidence without models none of whose sensors has a reading (``Evidence.select_models``)."""
+        if batch.present is None:
+            return evidence
+        present = [self.has_reading(batch, name.split("+")) for name in self.names]
+        return evidence.select_models(torch.stack(present, dim=-1))
+
+    def has_reading(self, batch: Batch, modalities: Iterable[str]) -> Tensor:
+        """(T, N) bool: steps at which any sensor of these modalities has a reading (``Batch.present``)."""
+        if batch.present is None:
+            return torch.ones_like(batch.contact)
+        order = list(self.task.modalities)
+        return batch.present[..., [order.index(modality) for modality in modalities]].any(-1)
+
     def process_noise(self, change: Tensor) -> Tensor:
         """Root of Q's diagonal (n,) or (..., n), which may depend on the predicted change (..., n)."""
         return self.dynamics.noise

@@ -95,4 +95,5 @@ def _without(batch: Batch, filter_: Filter, has: Tensor) -> Batch:
         contact=expand(batch.contact),
         previous=batch.previous.expand(len(has), -1),
         start=None if batch.start is None else batch.start.expand(len(has), -1),
+        present=None if batch.present is None else expand(batch.present),
     )

@@ -33,11 +33,12 @@ from beliefscope.filters.external.adapter import (
     MEASUREMENTS,
     Values,
     check_values,
+    copied,
     derived,
     model_names,
     named_values,
-    stacked,
 )
+from beliefscope.filters.external.step_values import stacked
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter
@@ -186,7 +187,7 @@ class LiveRecorder:
         row = _Row(
             values
             if isinstance(values, StepTrace)
-            else _with_batch_axis(named_values(_tensors(values), "the filter", self._task)),
+            else _with_batch_axis(copied(named_values(_tensors(values), "the filter", self._task))),
             {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in arrays.items()},
             np.array(np.zeros(self._task.control_size) if control is None else control, np.float32),
             self._task.states(np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32)),
@@ -371,8 +372,7 @@ def _unused_path(folder: Path, name: str) -> Path:
 def _tensors(values: Any) -> Any:
     """NumPy arrays and numbers as tensors, including those in a dictionary or pair."""
     if isinstance(values, Mapping):
-        kept = (*MEASUREMENTS, "extra")
-        return {name: value if name in kept else _tensors(value) for name, value in values.items()}
+        return {name: value if name in (*MEASUREMENTS, "extra") else _tensors(value) for name, value in values.items()}
     if isinstance(values, tuple):
         return tuple(map(_tensors, values))
     return values if isinstance(values, Tensor) else torch.from_numpy(np.array(values))

@@ -8,6 +8,7 @@ import json
 import re
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import load_trace, trace
@@ -182,3 +183,28 @@ def test_invalid_tasks_are_rejected(
     with pytest.raises(BadInput, match=message):
         load_task(spec)
     assert before == TASKS
+
+
+def test_study_of_a_user_task_without_images(folder: Path, tmp_path: Path) -> None:
+    script, data = tmp_path / "sound.py", tmp_path / "sound.h5"
+    script.write_text(
+        "from dataclasses import replace\n"
+        "from own_task import TASK\n"
+        "TASK = replace(TASK, name='sound', observations={'distances': (2,), 'loud': (1,)},\n"
+        "               modalities={'near': ('distances',), 'level': ('loud',)})\n"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLE.parent))
+        task = load_task(f"{script}:TASK")
+        with open_dataset(folder / "own.h5") as episodes:
+            some = [episodes[i] for i in (0, 1, 8, 9)]
+        keys = task.observations
+        write_dataset(
+            data,
+            task,
+            (replace(e, task=task, observations={k: e.observations[k] for k in keys}) for e in some),
+        )
+        options = ("--data", f"sound={data}", "--filter", "lstm", "--seeds", 1, "--preset", "smoke")
+        document = result("study", "--task", f"{script}:TASK", *options, "-o", tmp_path / "study")
+    assert document["cells"] == {"sound/lstm/seed0": "finished"}
+    assert [row["blackout"] for row in document["rows"]] == [0.0, 0.0, None]  # both starts, and the training mean

@@ -1,19 +1,29 @@
-"""The gallery: the recorded ensemble reproduces its published numbers, and the recurrent filter learns."""
+"""The gallery: published numbers are reproduced, and the recurrent filter learns.
+
+KalmanNet4SensorFusion has no licence: its folder, with those of the packages that it requires, is named by
+BELIEFSCOPE_KALMANNET.
+"""
 
 from __future__ import annotations
 
 import runpy
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import load_trace, trace
+
+sys.path.insert(0, str(Path(__file__).parent / "filters" / "external"))
+from user_libraries import from_folder
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -42,3 +52,24 @@ def test_recurrent_gain_learns(monkeypatch: pytest.MonkeyPatch) -> None:
         assert set(quick(run)) == {"errors"}
         assert "gain" in run.extra
     assert errors[1] < errors[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "published"), [("test", 5.606), ("test_rtk", None)])
+def test_kalmannet_on_nclt(tmp_path: Path, run: Any, name: str, published: float | None) -> None:
+    folder = Path(from_folder("Net.models", "BELIEFSCOPE_KALMANNET").__file__ or "").parents[2]
+    script, data, path = EXAMPLES / "gallery" / "kalmannet_nclt.py", tmp_path / "nclt.h5", tmp_path / "nclt.trace"
+    example = runpy.run_path(str(script))
+    write_dataset(data, example["TASK"], example["episodes"](folder / "data" / "NCLT" / "processed" / f"{name}.pt"))
+    options = ("--data", data, "--filter", f"{script}:kalmannet", "--episode", 1, "-o", path)
+    assert run("trace", "nclt", *options)[0] == 0
+    errors: Any = quick(load_trace(path))["errors"]
+    per_axis = np.sqrt(np.square(errors.groups[0].rmse[:2]).mean())
+    (outage,) = errors.outages
+    assert (outage.modality, outage.dominant.low) == ("gps", 60.0)
+    if published is None:
+        assert errors.worse == ("gps",)  # RTK readings
+        assert outage.dominant.share > 0.7
+    else:
+        assert per_axis == pytest.approx(published, rel=0.01)  # nclt_predict.ipynb, 2012-11-16
+        assert errors.worse == ()

@@ -7,7 +7,7 @@ the units of their sensors.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -167,7 +167,7 @@ class Units:
 
 
 def named_values(output: Any, source: str, task: Task) -> Values:
-    """A filter's return value for a step or all steps, by name, as tensors on the CPU.
+    """A filter's return value for a step or all steps, by name, as tensors on the CPU that may share its memory.
 
     Means and particles may have quaternions (``Task.states``). Raises BadInput for unknown names, incomplete pairs and
     values that are no arrays.
@@ -186,11 +186,10 @@ def named_values(output: Any, source: str, task: Task) -> Values:
     if "estimate_mean" not in named:
         raise BadInput(f"{source} returns {', '.join(named) or 'nothing'}, but not estimate_mean")
     values: Values = {}
-    leading = np.shape(named["estimate_mean"])[:-1]
     for name, value in named.items():
         if isinstance(value, list | tuple) and name in MEASUREMENTS:
             parts = [None if part is None else _tensor(part, name, source) for part in value]
-            values[name] = _padded(parts, len(letters[name]) - 1, leading)
+            values[name] = _padded(parts, len(letters[name]) - 1, np.shape(named["estimate_mean"])[:-1])
         else:
             values[name] = _tensor(value, name, source)
     for pair in PAIRS:
@@ -205,15 +204,20 @@ def named_values(output: Any, source: str, task: Task) -> Values:
 
 
 def _tensor(value: Any, name: str, source: str) -> Tensor:
-    """A copy on the CPU, since the filter may modify its own in place."""
+    """A tensor on the CPU."""
     if isinstance(value, Tensor):
-        return value.detach().cpu().clone()
+        return value.detach().cpu() if value.requires_grad or not value.is_cpu else value
     is_scalar = name.startswith(EXTRA) or name == "accepted"
     if isinstance(value, np.ndarray | np.generic) or (is_scalar and isinstance(value, bool | int | float)):
-        array = np.array(value)
+        array = np.array(value)  # torch refuses some layouts of arrays, such as read-only ones and negative strides
         if array.dtype.kind in "biuf":
             return torch.from_numpy(array)
     raise BadInput(f"{source} returns {name} as a {type(value).__name__}, expected an array or a Tensor")
+
+
+def copied(values: Values) -> Values:
+    """Copies, since a filter may modify its own values in place."""
+    return {name: value.clone() for name, value in values.items()}
 
 
 def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -> Tensor:
@@ -229,25 +233,6 @@ def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -
             size = slice(part.shape[-1] if axes else None)
             values[(..., k, *(size,) * axes)] = part.double()
     return values
-
-
-def stacked(steps: Sequence[Values], channels: int = 0) -> Values:
-    """Values of T steps with a leading axis T, without values that some steps lack.
-
-    channels: smallest number m of the measurements' channels; they have the largest of all steps if that is larger.
-    """
-    common = [name for name in steps[0] if all(name in step for step in steps)]
-    return {name: torch.stack(_of_one_size([step[name] for step in steps], name, channels)) for name in common}
-
-
-def _of_one_size(values: list[Tensor], name: str, channels: int) -> list[Tensor]:
-    """The values of steps with different numbers m of channels, extended by NaN to the largest or ``channels``."""
-    axes = letters_of(name).count("m")
-    sizes = {channels, *(value.shape[-1] for value in values)} if axes else set()
-    if len(sizes) < 2:
-        return values
-    ends = [[0, max(sizes) - value.shape[-1]] * axes for value in values]
-    return [torch.nn.functional.pad(v, end, value=torch.nan) for v, end in zip(values, ends, strict=True)]
 
 
 def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str) -> Values:
@@ -276,12 +261,23 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
     return values
 
 
+BLOCK = 300_000
+"""Numbers of particles that are processed together: intermediate results fit the caches, and no memory is fresh."""
+
+
+def _blocks(particles: Tensor, *values: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """Blocks of steps of several values (T, ...)."""
+    rows = max(1, BLOCK // max(1, particles[0].numel()))
+    return zip(*(value.split(rows) for value in values), strict=True)
+
+
 def _posterior_is_of_one_model(values: Values) -> bool:
     """Whether the posterior weights are the prior ones times the likelihood of the only model, bit for bit."""
-    likelihood = values["log_likelihood"]
-    if likelihood.shape[-2] != 1:
+    if values["log_likelihood"].shape[-2] != 1:
         return False
-    return torch.equal(values["log_weights"], values["prior_log_weights"] + likelihood.squeeze(-2))
+    names = ("log_weights", "prior_log_weights", "log_likelihood")
+    blocks = _blocks(values["particles"], *(values[name] for name in names))
+    return all(torch.equal(posterior, prior + likelihood.squeeze(-2)) for posterior, prior, likelihood in blocks)
 
 
 def _is_finite(value: Tensor) -> bool:
@@ -291,7 +287,8 @@ def _is_finite(value: Tensor) -> bool:
 
 def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
     """Mean and covariance as ``moments``; of rotations, their mean and the covariance of the differences from it."""
-    linear = moments(particles, log_weights)
+    parts = [moments(*block) for block in _blocks(particles, particles, log_weights)]
+    linear = Gaussian(torch.cat([part.mean for part in parts]), torch.cat([part.covariance for part in parts]))
     if not task.rotations:
         return linear
     states, weights, mean = particles.double().numpy(), log_weights.double().exp().numpy(), linear.mean.numpy().copy()
@@ -305,7 +302,8 @@ def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
 def derived(values: Values, task: Task) -> Values:
     """Adds derived values: moments of the particles, and each measurement model's own posterior.
 
-    The effective weight of a single measurement model is always one, and removed.
+    Normalises the logarithms of weights in place. The effective weight of a single measurement model is always one, and
+    removed.
     """
     if "effective_weights" in values and values["effective_weights"].shape[-2] < 2:
         values = {name: value for name, value in values.items() if name != "effective_weights"}
@@ -315,8 +313,8 @@ def derived(values: Values, task: Task) -> Values:
     has_likelihood = {"log_likelihood", "prior_log_weights"} <= values.keys()
     one = has_likelihood and _posterior_is_of_one_model(values)
     for name in ("log_weights", "prior_log_weights"):
-        if name in values:
-            values[name] = torch.log_softmax(values[name], dim=-1)
+        for (weights,) in _blocks(particles, values[name]) if name in values else ():
+            weights.copy_(torch.log_softmax(weights, dim=-1))
     posterior = _moments(task, particles, values["log_weights"]) if one or "estimate_covariance" not in values else None
     if posterior is not None:
         values.setdefault("estimate_covariance", posterior.covariance)

@@ -20,6 +20,9 @@ from beliefscope.filters.external.adapter import Adapter
 
 CPU = torch.device("cpu")
 
+UNBOUND = 256
+"""Steps whose views of the inputs exist at the same time."""
+
 DT = "dt"
 """Key under which a filter receives the durations of irregular steps."""
 
@@ -74,17 +77,17 @@ def _inputs(
     adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device
 ) -> tuple[Any, Any]:
     filter_ = adapter.module
+    if device.type == "cpu" and isinstance(filter_, nn.Module):
+        return adapter.inputs(dict(observations), controls)
     converted = {key: _argument(filter_, value, device) for key, value in observations.items()}
     return adapter.inputs(converted, _argument(filter_, controls, device))
 
 
-def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:
-    """Starts the filter at a belief (N, n), (N, n, n), or at its own; returns the result of ``initialize_beliefs``."""
-    if has_own_start(filter_):
-        return filter_.initialize_beliefs()
+def initialize(filter_: Any, *belief: Tensor) -> Any:
+    """Starts the filter at a belief (N, n), (N, n, n), or without one at its own; its result."""
     device = device_of(filter_)
-    arguments = {"mean": mean, "covariance": covariance}
-    return filter_.initialize_beliefs(**{name: _argument(filter_, v, device) for name, v in arguments.items()})
+    arguments = zip(("mean", "covariance"), belief, strict=False)
+    return filter_.initialize_beliefs(**{name: _argument(filter_, value, device) for name, value in arguments})
 
 
 def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
@@ -108,6 +111,14 @@ def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tu
     return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
 
+def steps_of(observations: Mapping[str, Tensor], controls: Tensor) -> Iterator[tuple[dict[str, Tensor], Tensor]]:
+    """Observations and controls (T, ...) of each step. They are unbound in blocks, which is faster than indexing."""
+    for start in range(0, len(controls), UNBOUND):
+        block = slice(start, start + UNBOUND)
+        for control, *row in zip(*(v[block].unbind() for v in (controls, *observations.values())), strict=True):
+            yield dict(zip(observations, row, strict=True)), control
+
+
 def _function(filter_: Any) -> Any:
     """A module is called, so that its hooks run; another object's ``forward``, or else itself."""
     return filter_ if isinstance(filter_, nn.Module) else getattr(filter_, "forward", filter_)
@@ -128,13 +139,21 @@ def seeded(seed: int, filter_: Any) -> Iterator[None]:
     """Seeds the global generators of torch and NumPy; restores them afterwards."""
     device = device_of(filter_)
     state = np.random.get_state()  # noqa: NPY002 - filters of other projects use the global generator
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        np.random.seed(seed % 2**32)  # noqa: NPY002
-        try:
-            yield
-        finally:
-            np.random.set_state(state)  # noqa: NPY002
+    generators = [torch.default_generator]
+    if device.type == "cuda":
+        generators.append(
+            torch.cuda.default_generators[torch.cuda.current_device() if device.index is None else device.index]
+        )
+    states = [generator.get_state() for generator in generators]
+    for generator in generators:
+        generator.manual_seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        for generator, own in zip(generators, states, strict=True):
+            generator.set_state(own)
+        np.random.set_state(state)  # noqa: NPY002
 
 
 def snapshot(filter_: Any, source: str) -> Any:

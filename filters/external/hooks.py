@@ -26,6 +26,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+RESAMPLED = "resampled"
+"""Name of the particles (N, M, n) after a step, among the values of ``Capture.step``."""
+
 
 @dataclass(frozen=True)
 class Call:
@@ -69,7 +72,8 @@ class Capture:
     def step(self, mean: Tensor) -> dict[str, Tensor]:
         """The values of the step that estimated ``mean`` (N, n), by the names of ``Trace``; clears the recorded calls.
 
-        Shapes are those of a trace, with N in place of T. Values that could not be read are missing.
+        Shapes are those of a trace, with N in place of T. Values that could not be read are missing; others may share
+        the filter's memory.
         """
         if not self._has_values:
             return {}
@@ -115,7 +119,7 @@ class Capture:
         call = self._calls.get(model)
         if call is None:
             return {}
-        states, fused, (prior,) = _copy(call.inputs.get("states")), call.output, call.before
+        states, fused, (prior,) = _read(call.inputs.get("states")), call.output, call.before
         if not isinstance(states, Tensor) or states.ndim != 3 or not fused.shape == prior.shape == states.shape[:2]:
             return {}  # called in chunks, or with other states than the particles
         values = {
@@ -128,11 +132,9 @@ class Capture:
         self.models = tuple(outputs) if len(models) > 1 else ()
         if outputs and all(output.shape == fused.shape for output in outputs.values()):
             values["log_likelihood"] = torch.stack(list(outputs.values()), dim=1)
-        after = _copy(self._filter.particle_states)
+        after = _read(self._filter.particle_states)
         if after.shape == states.shape:
-            ancestors = _first_equal(after, states)
-            if (ancestors < states.shape[1]).all():
-                values["ancestors"] = ancestors
+            values[RESAMPLED] = after
         return values
 
     def _gaussians(self) -> dict[str, Tensor]:
@@ -241,68 +243,13 @@ def _stack(values: dict[str, Tensor], name: str, beliefs: list[tuple[Tensor, ...
         )
 
 
+def _read(value: Any) -> Any:
+    """A detached tensor on the CPU, which may share the filter's memory."""
+    return value.detach().cpu() if isinstance(value, Tensor) else value
+
+
 def _copy(value: Any) -> Any:
     """A detached copy of a tensor or tuple of tensors on the CPU, since the filter may modify its own in place."""
     if isinstance(value, tuple):
         return tuple(_copy(item) for item in value)
     return value.detach().cpu().clone() if isinstance(value, Tensor) else value
-
-
-def _first_equal(after: Tensor, before: Tensor) -> Tensor:
-    """(N, M after): index of the first of the rows ``before`` (N, M, n) that equals each row of ``after``.
-
-    M where there is none.
-    """
-    return torch.stack([_matches(a, b) for a, b in zip(after, before, strict=True)])
-
-
-def _matches(after: Tensor, before: Tensor) -> Tensor:
-    """As ``_first_equal``, of one trajectory: rows are found in a table by a hash of their bits, and then compared.
-
-    Rows that share an entry with another row are left to the next table, with another hash.
-    """
-    result = torch.full((len(after),), len(before))
-    rows, wanted, stored, sought = torch.arange(len(before)), torch.arange(len(after)), before, after
-    salt = 0
-    while len(rows) and len(wanted):
-        salt += 1
-        bits, index = (SLOTS * len(rows)).bit_length(), torch.arange(len(rows))
-        slots = _row_hashes(stored, bits, salt)
-        table = torch.full((2**bits,), len(rows)).scatter_reduce_(0, slots, index, "amin")
-        entry = table.index_select(0, _row_hashes(sought, bits, salt))
-        candidate = entry.clamp(max=len(rows) - 1)
-        found = (entry < len(rows)) & _equal_rows(stored.index_select(0, candidate), sought)
-        result[wanted] = torch.where(found, rows.index_select(0, candidate), len(before))
-        first = table.index_select(0, slots)
-        hidden = (first != index).nonzero().flatten()
-        behind = _equal_rows(stored.index_select(0, first.index_select(0, hidden)), stored.index_select(0, hidden))
-        hidden, missing = hidden[~behind], (~found).nonzero().flatten()
-        rows, stored = rows.index_select(0, hidden), stored.index_select(0, hidden)
-        wanted, sought = wanted.index_select(0, missing), sought.index_select(0, missing)
-    return result
-
-
-def _equal_rows(a: Tensor, b: Tensor) -> Tensor:
-    """(M,): whether rows (M, n) are equal."""
-    result = a[:, 0] == b[:, 0]
-    for x, y in zip(a.unbind(1)[1:], b.unbind(1)[1:], strict=True):
-        result &= x == y
-    return result
-
-
-SLOTS = 8
-"""Smallest number of entries of the table by row."""
-
-HASH = 0x9E3779B97F4A7C15
-"""Odd multiplier of the hash: 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
-
-
-def _row_hashes(rows: Tensor, bits: int, salt: int) -> Tensor:
-    """(M,) hashes of that many bits of rows (M, n); equal rows have equal hashes, also with 0.0 and -0.0."""
-    words = (rows + 0.0).view(torch.int64 if rows.dtype == torch.float64 else torch.int32)
-    factors = torch.tensor([_signed(pow(HASH, salt + i, 2**64)) for i in range(rows.shape[1])])
-    return ((words * factors).sum(-1) >> (64 - bits)).add_(2 ** (bits - 1))
-
-
-def _signed(value: int) -> int:
-    return value - 2**64 if value >= 2**63 else value

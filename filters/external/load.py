@@ -39,10 +39,10 @@ from beliefscope.filters.external.adapter import (
     Units,
     Values,
     check_values,
+    copied,
     derived,
     model_names,
     named_values,
-    stacked,
 )
 from beliefscope.filters.external.calls import (
     call,
@@ -55,15 +55,14 @@ from beliefscope.filters.external.calls import (
     restore,
     seeded,
     snapshot,
+    steps_of,
 )
 from beliefscope.filters.external.fingerprint import fingerprint
 from beliefscope.filters.external.hooks import Capture
+from beliefscope.filters.external.step_values import StepValues, with_ancestors
 from beliefscope.filters.external.weights import load_weights, pretrained_std
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import START_VARIANCE
-
-NO_BELIEF = (torch.zeros(0), torch.zeros(0))
-"""Arguments of ``initialize`` for a filter that supplies its own initial belief."""
 
 
 class ExternalFilter(Checkpoint):
@@ -131,7 +130,7 @@ class ExternalFilter(Checkpoint):
     def _own_start(self, count: int) -> Gaussian:
         n = len(self._task.components)
         with self._errors_at("initialize_beliefs"):
-            belief = initialize(self.adapter.module, *NO_BELIEF)
+            belief = initialize(self.adapter.module)
             values = {} if belief is None else named_values(belief, self.source, self._task)
             values = {name: value.expand(count, *value.shape[-len(SHAPES[name]) :]) for name, value in values.items()}
         values = self._units.to_si(check_values(values, (count,), {"n": n}, f"{self.source} at initialize_beliefs"))
@@ -187,23 +186,23 @@ class ExternalFilter(Checkpoint):
                 values = self._at_once(observations, controls)
                 progress(1.0)
                 return values, models
-            steps: list[Values] = []
+            record = StepValues(len(controls))
             try:
                 for values, models in self._steps(observations, controls, start):  # noqa: B007
-                    steps.append(values)
-                    progress(len(steps) / len(controls))
+                    record.append(values)
+                    progress(len(record.steps) / len(controls))
             except BadInput:
-                self._check_steps(steps, len(episodes))  # an invalid value is the likely cause
+                self._check_steps(record.steps, len(episodes))  # an invalid value is the likely cause
                 raise
-            return self._stacked(steps, len(episodes)), models
+            return self._stacked(record, len(episodes)), models
 
-    def _stacked(self, steps: list[Values], count: int) -> Values:
+    def _stacked(self, record: StepValues, count: int) -> Values:
         """Values of all steps; checked at once, and step by step only if one of them is invalid."""
         sizes = {"n": len(self._task.components)}
         try:
-            return check_values(stacked(steps), (len(steps), count), sizes, f"{self.source} over all steps")
+            return check_values(record.stacked(), (len(record.steps), count), sizes, f"{self.source} over all steps")
         except (BadInput, RuntimeError):  # torch.stack refuses different shapes
-            self._check_steps(steps, count)
+            self._check_steps(record.steps, count)
             raise
 
     def _check_steps(self, steps: Sequence[Values], count: int) -> None:
@@ -224,9 +223,9 @@ class ExternalFilter(Checkpoint):
         observations, controls = inputs_of(self._task, [episode], dtype_of(self.adapter.module))
         with torch.no_grad(), seeded(seed, self.adapter.module):
             sizes = {"n": len(self._task.components)}
-            for t, (step, models) in enumerate(self._steps(observations, controls, self.start([episode]))):
-                check_values(step, (1,), sizes, f"{self.source} at step {t}")
-                yield self._units.to_si(step), self._names({n: v[None] for n, v in step.items()}, models)
+            for t, (values, models) in enumerate(self._steps(observations, controls, self.start([episode]))):
+                step = check_values(with_ancestors(values), (1,), sizes, f"{self.source} at step {t}")
+                yield self._units.to_si(copied(step)), self._names({n: v[None] for n, v in step.items()}, models)
 
     def own_states(self, states: Tensor, dtype: torch.dtype) -> Tensor:
         """States (C, n) in SI units, in the filter's own."""
@@ -240,7 +239,7 @@ class ExternalFilter(Checkpoint):
     def step(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
         """Returned values of one more step from the filter's state, (N, ...), SI units. Raises BadInput as ``run``."""
         with torch.no_grad(), self._errors_at("one step"):
-            output = self._call(observations, controls, device_of(self.adapter.module))
+            output = copied(self._call(observations, controls, device_of(self.adapter.module)))
         sizes = {"n": len(self._task.components)}
         return self._units.to_si(check_values(output, (len(controls),), sizes, self.source))
 
@@ -261,18 +260,21 @@ class ExternalFilter(Checkpoint):
         recorded = filter_ if isinstance(filter_, nn.Module) and self.adapter.batched else None
         device = device_of(filter_)
         with Capture(recorded) as capture:
-            for t in range(len(controls)):
-                with self._errors_at(f"step {t}"):
-                    inputs = {key: value[t] for key, value in observations.items()}
-                    output = self._call(inputs, controls[t], device)
+            for t, (inputs, control) in enumerate(steps_of(observations, controls)):
+                try:
+                    output = self._call(inputs, control, device)
                     values = capture.step(output["estimate_mean"]) | output
+                except BadInput:
+                    raise
+                except Exception as error:
+                    raise self._error(f"step {t}", error) from error
                 yield values, capture.models
 
     def _initialize(self, start: Gaussian) -> None:
         filter_ = self.adapter.module
         if has_own_start(filter_):
             with self._errors_at("initialize_beliefs"):
-                initialize(filter_, *NO_BELIEF)
+                initialize(filter_)
             return
         if start.covariance.isnan().any():
             raise BadInput(
@@ -296,7 +298,7 @@ class ExternalFilter(Checkpoint):
 
     def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
         with self._errors_at("all steps"):
-            output = self._call(observations, controls, device_of(self.adapter.module))
+            output = copied(self._call(observations, controls, device_of(self.adapter.module)))
         return check_values(
             output, controls.shape[:2], {"n": len(self._task.components)}, f"{self.source} over all steps"
         )
@@ -309,8 +311,12 @@ class ExternalFilter(Checkpoint):
         except BadInput:
             raise
         except Exception as error:
-            message = (str(error).strip().splitlines() or ["no message"])[0]
-            raise BadInput(f"{self.source} fails at {where}: {type(error).__name__}: {message}") from error
+            raise self._error(where, error) from error
+
+    def _error(self, where: str, error: Exception) -> BadInput:
+        """An exception of the module as BadInput with the location."""
+        message = (str(error).strip().splitlines() or ["no message"])[0]
+        return BadInput(f"{self.source} fails at {where}: {type(error).__name__}: {message}")
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)

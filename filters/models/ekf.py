@@ -97,12 +97,13 @@ class ExtendedKalmanFilter(Filter):
     def encode(self, batch: Batch) -> Evidence:
         observations = self.observations(batch)
         z, noise = zip(*(self.virtual_sensors[m](observations) for m in self.names), strict=True)
-        return Evidence(
+        evidence = Evidence(
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(z, dim=2),
             noise=torch.stack(noise, dim=2),
             log_weights=self.log_weights(batch),
         )
+        return self.with_readings(evidence, batch)
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
         return shared(belief)

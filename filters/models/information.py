@@ -129,12 +129,13 @@ class InformationFilter(ExtendedKalmanFilter):
     def encode(self, batch: Batch) -> Evidence:
         observations = self.observations(batch)
         z, noise = zip(*(self.sense(name, observations) for name in self.names), strict=True)
-        return Evidence(
+        evidence = Evidence(
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(z, dim=2),
             noise=torch.stack(noise, dim=2),
             log_weights=self.log_weights(batch),
         )
+        return self.with_readings(evidence, batch)
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
         """The joint Gaussian (N, n (1 + K)) of the state and the biases, which are independent of it."""

@@ -104,12 +104,13 @@ class MixtureParticleFilter(ParticleFilter):
     def encode(self, batch: Batch) -> Evidence:
         observations = self.observations(batch)
         parts = [self.measurement_model(m).observation_part(observations) for m in self.names]
-        return Evidence(
+        evidence = Evidence(
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(parts, dim=2),
             noise=None,
             log_weights=self.log_weights(batch),
         )
+        return self.with_readings(evidence, batch)
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
         def model_likelihood(k: int, states: Tensor) -> Tensor:

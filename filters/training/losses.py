@@ -42,14 +42,24 @@ def sensor_likelihood(filter_: InformationFilter, name: str, batch: Batch) -> Te
     z, noise = filter_.sense(name, filter_.observations(batch))
     variance = noise.square() / (1.0 + noise.square())
     error = z / (1.0 + noise.square()) - true_states(filter_, batch)
-    return 0.5 * (error.square() / variance + variance.log()).mean()
+    return 0.5 * with_readings(filter_, name, batch, error.square() / variance + variance.log()).mean()
+
+
+def with_readings(filter_: Filter, name: str, batch: Batch, values: Tensor) -> Tensor:
+    """Values (T, N, ...) at the steps with a reading of a measurement model's sensors; all of them without any."""
+    at = filter_.has_reading(batch, name.split("+"))
+    return values if at.all() or not at.any() else values[at]
 
 
 def likelihood(filter_: Filter, model: MeasurementModel, batch: Batch, noise: torch.Generator) -> Tensor:
     """Loss of a measurement model: ``log_density`` for steps with a visible image, ``contrast`` for all others."""
-    part = model.observation_part(filter_.observations(batch)).flatten(0, 1)
-    truth = true_states(filter_, batch).flatten(0, 1)
-    visible = image_visible(batch, model.encoders.by_modality).flatten()
+    modalities = list(model.encoders.by_modality)
+
+    def used(values: Tensor) -> Tensor:
+        return with_readings(filter_, "+".join(modalities), batch, values).reshape(-1, *values.shape[2:])
+
+    part, truth = used(model.observation_part(filter_.observations(batch))), used(true_states(filter_, batch))
+    visible = used(image_visible(batch, modalities))
     total = torch.zeros((), device=truth.device)
     if bool(visible.any()):
         total = total + visible.float().mean() * log_density(model, part[visible], truth[visible], noise)

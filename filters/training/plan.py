@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.faults import Blackout
+from beliefscope.datasets.task import Task
 
 Report = Callable[[str, int, int, float], None]
 """Progress callback, called with the stage's name, steps done, total steps, and the loss."""
@@ -14,7 +16,7 @@ BLACKOUTS = (0.0, 0.4, 0.8)
 """Probabilities of an image blackout: one is drawn for each training window."""
 
 EVALUATED_BLACKOUTS = (*BLACKOUTS, 0.95)
-"""Probabilities of an image blackout at which a trained filter is evaluated."""
+"""Probabilities of an image blackout at which a trained filter is evaluated; see ``evaluated_blackouts``."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,11 @@ PLANS = {
         batch=4,
     ),
 }
+
+
+def evaluated_blackouts(task: Task) -> tuple[float, ...]:
+    """``EVALUATED_BLACKOUTS``; only 0 for a task without the sensor ``image``, which the fault ``blackout`` changes."""
+    return EVALUATED_BLACKOUTS if Blackout.sensor in task.observations else EVALUATED_BLACKOUTS[:1]
 
 
 def parse_blackouts(text: str) -> tuple[float, ...]:

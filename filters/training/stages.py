@@ -292,7 +292,7 @@ class Trainer:
                 batch = self.shifted(batch)
             if isinstance(module, VirtualSensor):
                 error = module(self.filter.observations(batch))[0] - losses.true_states(self.filter, batch)
-                return error.square().mean()
+                return losses.with_readings(filter_, name, batch, error.square()).mean()
             return losses.likelihood(self.filter, module, batch, self.noise)
 
         # Without weight decay, a model without images memorises the training trajectories.

@@ -33,7 +33,7 @@ from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.names import is_code, is_path
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.filters.start_offset import STUDY_OFFSET
-from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report
+from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report, evaluated_blackouts
 from beliefscope.filters.training.study_table import OFFSET, TRUTH, Document, Row, rows_of, to_csv, to_markdown
 from beliefscope.filters.training.train import measure, train, versions
 
@@ -99,7 +99,8 @@ class Cell:
                     checkpoint = self.path(folder, ".safetensors").read_bytes()
                     if hashlib.sha256(checkpoint).hexdigest() != document["checkpoint_hash"]:
                         return None
-                if not {f"{blackout:g}" for blackout in BLACKOUTS} <= document[TRUTH].keys():
+                evaluated = {*BLACKOUTS} & {*evaluated_blackouts(self.definition)}
+                if not {f"{blackout:g}" for blackout in evaluated} <= document[TRUTH].keys():
                     return None
                 to_markdown(rows_of({self: document}))  # fails for an incomplete document
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError):

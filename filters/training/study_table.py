@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import BASELINES, nees_bounds
 from beliefscope.filters.start_offset import STUDY_OFFSET
-from beliefscope.filters.training.plan import EVALUATED_BLACKOUTS
+from beliefscope.filters.training.plan import evaluated_blackouts
 
 TRIVIAL = "training mean"
 """In place of a filter's name: the predictor that always returns the mean of the training states."""
@@ -96,7 +96,9 @@ def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
         finished = [d for members in requested.values() for d in members if d is not None and "error" not in d]
         for key in (OFFSET, TRUTH):
             blackouts = [
-                b for b in EVALUATED_BLACKOUTS if not finished or any(f"{b:g}" in d.get(key, {}) for d in finished)
+                b
+                for b in evaluated_blackouts(definition)
+                if not finished or any(f"{b:g}" in d.get(key, {}) for d in finished)
             ]
             for name, members in requested.items():
                 rows += [_row(definition, name, key, blackout, members) for blackout in blackouts]

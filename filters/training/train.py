@@ -14,7 +14,7 @@ import torch
 from beliefscope import __version__
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
 from beliefscope.filters.data_check import summarise
@@ -24,7 +24,7 @@ from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.information_pf import with_particles
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset
-from beliefscope.filters.training.plan import BLACKOUTS, EVALUATED_BLACKOUTS, PLANS, Plan, Report
+from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Plan, Report, evaluated_blackouts
 from beliefscope.filters.training.resume import Partial, SharedModules, cache_key
 from beliefscope.filters.training.stages import Trainer
 
@@ -146,19 +146,19 @@ def versions() -> dict[str, str]:
 def measure(
     filter_: Filter | ExternalFilter, episodes: Sequence[Episode], start_offset: StartOffset = NO_OFFSET
 ) -> dict[str, Any]:
-    """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``, ``"0.95"``).
+    """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``, ``"0.95"``); without images ``"0"``.
 
     ``fused``: of the filter, with its ``baselines``, which a blackout does not change, and its single-modality
     ``updates``; a modality's name: of its standalone filter.
     """
     several = len(filter_.task.modalities if isinstance(filter_, ExternalFilter) else filter_.names) > 1
     results: dict[str, Metrics] = {}
-    for blackout in EVALUATED_BLACKOUTS:
+    for blackout in evaluated_blackouts(filter_.task):
         first = next(iter(results.values()), None)
         result = evaluate(
             filter_,
             episodes,
-            faults=Faults.parse(f"blackout={blackout}"),
+            faults=Faults.parse(f"blackout={blackout}") if blackout else NO_FAULTS,
             start_offset=start_offset,
             baselines=first is None,
             modalities=several,

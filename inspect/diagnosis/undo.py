@@ -195,7 +195,7 @@ def change_beta(setting: Setting, change: Callable[[Tensor], Tensor]) -> Setting
         logit = 2.0 * MAX_LOGIT * torch.atanh((odds / (2.0 * MAX_LOGIT)).clamp(-0.9999, 0.9999))
         odds = 2.0 * MAX_LOGIT * torch.tanh(change(logit) / (2.0 * MAX_LOGIT))
         log_weights = torch.stack([torch.nn.functional.logsigmoid(odds), torch.nn.functional.logsigmoid(-odds)], -2)
-        return replace(evidence, log_weights=log_weights)
+        return evidence.with_log_weights(log_weights)
 
     return _with_evidence(setting, changed)
 

@@ -132,6 +132,7 @@ class SingleStep:
                 states=expand(batch.states),
                 contact=expand(batch.contact),
                 previous=batch.previous.expand(count, -1),
+                present=None if batch.present is None else expand(batch.present),
             )
         )[-1:]
         for edit in self._edits:

@@ -56,10 +56,10 @@ def run_external(
             of single modalities.
         provenance: trace fields that identify the run.
     """
-    values, modalities = external.run([seen or episode], provenance["seed"], progress)
+    start = external.start([episode])
+    values, modalities = external.run([seen or episode], provenance["seed"], progress, start)
     if seen is not None:
         modalities, values = (), {name: v for name, v in values.items() if not letters_of(name).startswith("K")}
-    start = external.start([episode])
     arrays = {name: np.ascontiguousarray(value[:, 0].numpy()) for name, value in values.items()}
     settings: dict[str, Any] = {"torch": torch.__version__, "source": external.source}
     if "particles" in arrays:

@@ -45,7 +45,7 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
     if filter_:
         checkpoint = open_filter(first.task, filter_)
         if checkpoint.hash != first.checkpoint_hash:
-            own = "; a filter that Python built has another hash than its build function" if is_code(filter_) else ""
+            own = ": its code has changed, or Python built the filter of the trace" if is_code(filter_) else ""
             raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}{own}")
         return checkpoint
     try:

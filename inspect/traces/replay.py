@@ -243,12 +243,12 @@ class Replay:
         manual = torch.tensor([edit.weights.get(name, torch.nan) for name in names]).unsqueeze(-1)
         automatic = manual.isnan()
         remainder = max(0.0, 1.0 - sum(edit.weights.values()))
-        others = (beta * automatic).sum(-2, keepdim=True)
+        others = (beta * automatic).sum(-2, keepdim=True).clamp_min(torch.finfo(beta.dtype).tiny)  # 0 if absent
         if not automatic.any() and remainder > 1e-6:
             raise BadInput(f"weights of all modalities sum to {1.0 - remainder:g}; they must sum to 1")
         log_weights = evidence.log_weights.clone()
         log_weights[span] = torch.where(automatic, remainder * beta / others, manual).log()
-        return replace(evidence, log_weights=log_weights)
+        return evidence.with_log_weights(log_weights)
 
 
 def repeat_belief(belief: Belief, count: int) -> Belief:

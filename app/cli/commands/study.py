@@ -52,6 +52,7 @@ def study(
       beliefscope study --task door --filter lstm --filter mine.safetensors --filter own_filter.py:build -o study
       beliefscope study --data push-real=mit_push --data door=door.h5 --preset full --engine ray -o /lab/study
     """
+    from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.training.study import run_cells, run_local, study_cells
     from beliefscope.filters.training.study_table import to_markdown
     from beliefscope.recordings.study_figures import write_study
@@ -59,7 +60,8 @@ def study(
     opt.check_folder(output, "output")
     opt.check_output(output / "table.md" if output.is_dir() else output)
     paths = opt.key_values(data or (), "--data", "TASK=FILE, such as door=door.h5")
-    files = {name: Path(path) for name, path in paths.items()}
+    sources = {load_task(task).name: task for task in tasks or ()}
+    files = {sources.get(name, name): Path(path) for name, path in paths.items()}
     for name, path in files.items():
         if tasks and name not in tasks:
             raise BadInput(f"--data '{name}={path}' is for task {name!r}, but the study is of {', '.join(tasks)}")
