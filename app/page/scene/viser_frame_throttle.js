@@ -1,7 +1,7 @@
 /**
  * Throttles viser's animation frames. A plain script that runs in the frame of the 3D scene before viser.
  *
- * The frame shares its thread with the page. Without a GPU each rendering blocks both for 0.3 s, and viser renders
+ * The frame shares its thread with the page. Without a GPU each rendering can block both for 0.1 s, and viser renders
  * once a second even without changes. Renderings are therefore timed, and where they are slow the page can set a
  * pause between them: `frameThrottle.pause`.
  */
