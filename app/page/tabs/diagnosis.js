@@ -178,7 +178,7 @@ export class Diagnosis {
       {},
       create('h4', { textContent: cause.cause }),
       bar,
-      create('output', { textContent: probability.toFixed(2) }),
+      create('output', { textContent: `probability ${probability.toFixed(2)}` }),
       create('div', { className: 'details' }, ...lines),
     );
   }
