@@ -86,7 +86,7 @@ def job_running(page: Page) -> None:
 
 
 VIEWS: dict[str, Callable[[Page], None]] = {
-    "diagnosis": tab("diagnosis", "diagnosis.dataset.state === 'ready'"),
+    "diagnosis": tab("diagnosis", "!['loading', 'active'].includes(diagnosis.dataset.state)"),
     "failures": tab("failures", state("#failures"), "Search for failures"),
     "compare": tab("compare", state("#compare .result"), "Compare"),
     "study": tab("study", state("#study")),
