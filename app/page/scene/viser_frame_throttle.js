@@ -6,7 +6,7 @@
  * pause between them: `frameThrottle.pause`.
  */
 (() => {
-  const SLOW = 60; // ms from a rendering to the next frame; less counts as fast
+  const SLOW = 40; // ms from a rendering to the next frame; less counts as fast
   const MAX_COST = 600; // ms; the first rendering takes longer than the following ones
   const PAUSE_TIMEOUT = 1000; // ms until an endless pause ends unless it is renewed
   const requestFrame = window.requestAnimationFrame.bind(window);
