@@ -2,14 +2,19 @@
 
 python bench/screens.py FOLDER
 python bench/screens.py FOLDER --view study --view keys --size 1024x768 --theme dark
+python bench/screens.py FOLDER --read-only
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
+import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +31,26 @@ LONG = "a-filter-trained-on-the-third-floor-with-the-new-camera-v12b"
 TIMEOUT = 120_000  # ms
 SETTLE = 1200  # ms for animations to end
 
-LINKS = {"first": "", "bad-link": "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp"}
-"""View -> address that opens it: the first visit, and a selection that does not exist."""
+FROZEN = "faults=image_frozen%3Afrom%3D30&step=60"
+LINKS = {
+    "first": "",
+    "push-field": f"?task=push-field&filter=information-ekf&{FROZEN}",
+    "door-field": f"?task=door-field&filter=information-ekf&{FROZEN}",
+    "push": f"?task=push&filter=crossmodal-ekf&{FROZEN}",
+    "comparison": "?task=door&filter=crossmodal-pf&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
+    "no-weights": "?task=push&filter=feature-ekf",
+    "external": "?task=door&filter=hand-on-arc&step=29",
+    "live": "?data=live:go",
+    "bad-link": "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp",
+}
+"""View -> address that opens it: the first visit, an injected fault on each task, a comparison run, a
+filter without weights, one without an image, a run in progress, and a selection that does not exist."""
+
+PENDING = {
+    "loading": lambda route: None,
+    "error": lambda route: route.fulfill(status=500, json={"error": "The filter failed: out of memory."}),
+}
+"""View -> answer of the server to a request for a trace."""
 
 
 def tab(name: str, ready: str = "true", press: str = "") -> Callable[[Page], None]:
@@ -52,12 +75,22 @@ def state(panel: str) -> str:
     return f"document.querySelector('{panel}').dataset.state === 'ready'"
 
 
+def job_running(page: Page) -> None:
+    """Start a search for failures, which no other view has started, and open the list of jobs."""
+    faults = f"force_bias%3D{time.time() % 5:.4f}"
+    page.goto(
+        f"{page.url.partition('?')[0]}?task=push&filter=unimodal-ekf&faults={faults}&tab=failures", timeout=TIMEOUT
+    )
+    page.locator("#failures").get_by_role("button", name="Search for failures", exact=True).click(timeout=TIMEOUT)
+    page.evaluate("document.querySelector('#jobs-button').click()")
+
+
 VIEWS: dict[str, Callable[[Page], None]] = {
-    "diagnosis": tab("diagnosis", "diagnosis.dataset.state === 'ready'"),
+    "diagnosis": tab("diagnosis", "!['loading', 'active'].includes(diagnosis.dataset.state)"),
     "failures": tab("failures", state("#failures"), "Search for failures"),
     "compare": tab("compare", state("#compare .result"), "Compare"),
     "study": tab("study", state("#study")),
-    "rerun": tab("rerun", "['ready', 'error'].includes(document.querySelector('#rerun').dataset.state)"),
+    "rerun": tab("rerun", "document.querySelector('#rerun').dataset.state !== 'loading'"),
     "layers": tab("scene", state("#scene"), "Layers…"),
     "maps-options": click("#maps-view"),
     "report": click("#report"),
@@ -65,8 +98,12 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "jobs": click("#jobs-button"),
     "commands": click("#find"),
     "maps-several": click("#maps-tiles input[value=several]"),
+    "job": job_running,
 }
 """View -> function that opens it; every tab is a view as well."""
+
+READ_ONLY_VIEWS = ("first", "diagnosis", "diagnostics", "finetune", "rerun", "recordings", "bad-link")
+"""Views of a read-only server: the others need a computation."""
 
 
 def close(page: Page) -> None:
@@ -96,19 +133,45 @@ def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, views: li
     for name, link in LINKS.items():
         if not views or name in views:
             page.goto(url + link, timeout=TIMEOUT)
-            page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=TIMEOUT)
-            page.wait_for_timeout(2 * SETTLE)
+            page.wait_for_function("() => window.beliefscope?.stats.useful", timeout=TIMEOUT)
+            page.wait_for_timeout(3 * SETTLE)
             page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
+    for name, answer in PENDING.items():
+        if not views or name in views:
+            page.route("**/api/trace/**", answer)
+            page.goto(f"{url}?task=push&step=20", timeout=TIMEOUT)
+            page.wait_for_timeout(3 * SETTLE)
+            page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
+            page.unroute("**/api/trace/**")
     page.close()
+
+
+@contextmanager
+def live_run(workspace: Path) -> Iterator[None]:
+    """Run a filter with one step per second while the screenshots are taken."""
+    options = ["--filter", "crossmodal-ekf", "--rate", "1", "--name", "go", "--workspace", str(workspace)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "beliefscope", "live", "door", *options], stderr=subprocess.DEVNULL
+    )
+    try:
+        while not (workspace / "live" / "go.live").exists() and process.poll() is None:
+            time.sleep(0.1)
+        yield
+    finally:
+        process.kill()
+        process.wait()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--view", action="append", default=[], help="a tab or one of " + ", ".join([*VIEWS, *LINKS]))
+    parser.add_argument(
+        "--view", action="append", default=[], help="a tab or one of " + ", ".join([*VIEWS, *LINKS, *PENDING])
+    )
     parser.add_argument("--size", action="append", choices=SIZES)
     parser.add_argument("--theme", action="append", choices=THEMES)
     parser.add_argument("--url", help="of a running server")
+    parser.add_argument("--read-only", action="store_true", help="of a read-only server")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as files, sync_playwright() as playwright:
@@ -122,9 +185,15 @@ def main() -> None:
         if args.url:
             shoot_all(args.url)
             return
+        if args.read_only:
+            with serving("--read-only") as server:
+                args.view = args.view or list(READ_ONLY_VIEWS)
+                shoot_all(server.url)
+            return
         filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(files) / f"{LONG}.safetensors")
         data = shutil.copy(sample_path("door"), Path(files) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
-        with serving("--filter", str(filter_), "--data", str(data)) as server:
+        workspace = Path(files) / "workspace"
+        with live_run(workspace), serving("--filter", str(filter_), "--data", str(data), workspace=workspace) as server:
             shoot_all(server.url)
 
 

@@ -46,6 +46,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "groups": np.stack(list(groups.values()), axis=1) if groups else None,
         "effective_sample_size": trace.effective_sample_size,
         "blackout": measures.blackout(trace) if camera_images(trace) is not None else None,
+        "faulty": _faulty(trace),
     }
     arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
     arrays |= {f"extra/{name}": values for name, values in trace.extra.items()}
@@ -58,6 +59,15 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
             buffers.append(np.ascontiguousarray(array, dtype="<f4").tobytes())
             offset += len(buffers[-1])
     return descriptions, b"".join(buffers)
+
+
+def _faulty(trace: Trace) -> NDArray[np.bool_] | None:
+    """(T,) steps within the span of an injected fault. None if that is every step or none."""
+    at = np.arange(len(trace))
+    faulty = np.zeros(len(trace), bool)
+    for fault in trace.faults:
+        faulty |= (at >= fault.from_) & (at < (len(trace) if fault.to is None else fault.to))
+    return faulty if faulty.any() and not faulty.all() else None
 
 
 def camera_images(trace: Trace) -> NDArray[np.uint8] | None:

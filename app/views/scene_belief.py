@@ -13,7 +13,15 @@ from viser import ViserServer
 from beliefscope.app.protocol.messages import SceneLayers
 from beliefscope.app.protocol.trace_format import scene_layers
 from beliefscope.app.runs.traced_run import TracedRun
-from beliefscope.app.views.scene_context import SMALL_LABEL, CameraView, FloorMap, ForceArrow, RobotScene, add_grid
+from beliefscope.app.views.scene_context import (
+    SHADING,
+    SMALL_LABEL,
+    CameraView,
+    FloorMap,
+    ForceArrow,
+    RobotScene,
+    add_grid,
+)
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.task import Outline, Task
 from beliefscope.inspect.figures.scene_belief import DISC_SPACING, DrawnBelief, rgb
@@ -24,8 +32,8 @@ from beliefscope.inspect.trace import Trace
 
 POLE_RADIUS = 0.005  # m
 FLOOR_MAP_HEIGHT = 0.003  # m above the floor
+AMBIENT_LIGHT = 1.0  # intensity, in place of the environment map
 EDGE_OFFSET = 0.002  # m from the surfaces of an object to the edges of its outline
-NO_SHADOW: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 class Pole:
@@ -34,7 +42,7 @@ class Pole:
     def __init__(self, server: ViserServer, path: str, text: str, height: float, radius: float, color: RGB) -> None:
         """text: of the label; without a label if empty."""
         self._height = height
-        self._pole = server.scene.add_cylinder(f"{path}/pole", radius, height, color=color, cast_shadow=False)
+        self._pole = server.scene.add_cylinder(f"{path}/pole", radius, height, color=color, **SHADING)
         self._label: Any = None
         if text:
             self._label = server.scene.add_label(f"{path}/label", text, anchor="bottom-center", **SMALL_LABEL)
@@ -82,13 +90,15 @@ class BeliefScene:
         server.scene.set_up_direction("+z")
         server.scene.world_axes.visible = False
         server.scene.configure_default_lights(cast_shadow=False)
+        # viser's environment map takes a second to prepare without a GPU, during which the scene is invisible.
+        server.scene.configure_environment_map(None)
+        server.scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
         paths = {"replay": "/bodies", "objects": "/objects", "estimates": "/estimates", "force": "/force"}
         self._roots: dict[str, list[Any]] = {
             layer: [server.scene.add_frame(path, show_axes=False)] for layer, path in paths.items()
         }
         if self._replay is not None:
             self._robot = RobotScene(server, self._replay)
-            self._roots["replay"].append(self._robot.fixed_bodies)
         elif self._task.floor is not None:
             add_grid(server, self._task, trace)
         available: set[str] = set(scene_layers(self._task, trace, no_maps(run.checkpoint, trace)))
@@ -192,7 +202,7 @@ class BeliefScene:
             batched_opacities=np.array([0.45 if name == "fused" else 0.3 for name in names], np.float32),
             side="double",
             lod="off",
-            **NO_SHADOW,
+            **SHADING,
         )
 
     def _add_outlines(self, outline: Outline) -> list[Any]:
@@ -207,9 +217,9 @@ class BeliefScene:
             if name == "fused":
                 path, (x, y, z) = f"/objects/{name}/{outline.shape}", map(float, outline.size)
                 if outline.shape == "cylinder":
-                    scene.add_cylinder(path, x / 2, z, color=color, opacity=0.25, **NO_SHADOW)
+                    scene.add_cylinder(path, x / 2, z, color=color, opacity=0.25, **SHADING)
                 else:
-                    scene.add_box(path, color, (x, y, z), opacity=0.25, **NO_SHADOW)
+                    scene.add_box(path, color, (x, y, z), opacity=0.25, **SHADING)
         return frames
 
 

@@ -15,12 +15,24 @@ from viser.transforms import SO3
 from beliefscope.app.protocol.messages import SceneLayers
 from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.datasets.simulation.replay import Replay
+from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
-from beliefscope.inspect.figures.scene_shapes import DISC, FAN, RGB, Array, framed, grid, map_pixels, movable_meshes
+from beliefscope.inspect.figures.scene_shapes import (
+    DISC,
+    FAN,
+    Array,
+    ColoredMesh,
+    body_meshes,
+    framed,
+    grid,
+    map_pixels,
+)
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
+# Three times as fast as viser's standard material where the browser renders in software.
+SHADING: dict[str, Any] = {"material": "toon5", "cast_shadow": False, "receive_shadow": False}
 SMALL_LABEL: dict[str, Any] = {"font_screen_scale": 0.7, "depth_test": False}
 RING_DISTANCE = 0.05  # m between the rings of the force arrow
 MAX_RINGS = 6
@@ -30,7 +42,6 @@ IMAGE_SCALE = 4  # enlargement, so that the browser's smoothing keeps pixels dis
 TRANSLUCENT_OPACITY = 0.35
 TRANSLUCENT_GRAY = 150  # minimum of each color channel; darker surfaces would vanish against a dark background
 
-MUJOCO_PLANE = 0  # mjtGeom.mjGEOM_PLANE
 GRAY = (125, 125, 125)
 _TICKS = np.arange(-1.0, 1.01, 0.25)
 FLOOR_LINES = np.array(
@@ -144,9 +155,8 @@ class ForceArrow:
             batched_colors=np.array(color, np.uint8) // 2,
             side="double",
             lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
             visible=False,
+            **SHADING,
         )
         self._label: Any = server.scene.add_label(
             "/force/label", "", anchor="bottom-center", visible=False, **SMALL_LABEL
@@ -202,56 +212,42 @@ def _turned(direction: Array) -> Array:
 
 
 class RobotScene:
-    """The robot and its environment below ``/bodies`` and ``/fixed_bodies``.
+    """The robot and its environment below ``/bodies``.
 
-    The robot's hand and the objects are separate meshes, which can be translucent so that they do not hide the map.
-
-    Attributes:
-        fixed_bodies: handle of the root of all bodies that do not move.
+    The robot's hand and the objects can be translucent so that they do not hide the map.
     """
 
     def __init__(self, server: ViserServer, replay: Replay) -> None:
-        self._add_translucent_bodies(server, replay.model)
-        from mjviser import ViserMujocoScene  # imports trimesh, which takes a second
-
-        self._robot = ViserMujocoScene(server, replay.model, num_envs=1)
-        self._robot.camera_tracking_enabled = False
-        self.fixed_bodies = self._robot.fixed_bodies_frame
-        for sites in self._robot.site_handles_by_group.values():
-            sites.visible = False
-        # The infinite floor takes 1.5 s per frame without a GPU, more than everything else. Lines take almost nothing.
-        model = replay.model
-        for geom in np.flatnonzero((model.geom_type == MUJOCO_PLANE) & (model.geom_bodyid == 0)):
-            server.scene.remove_by_name(f"/fixed_bodies/world/{model.geom(geom).name}")
+        model, parts = replay.model, body_meshes(replay.model)
+        movable = hand_bodies(model) | object_bodies(model)
+        self._frames = {
+            body: server.scene.add_frame(f"/bodies/{model.body(body).name or body}", show_axes=False)
+            for body in {part.body for part in parts}
+        }
+        self._movable: list[tuple[Any, ColoredMesh]] = []
+        for i, part in enumerate(parts):
+            path = f"{self._frames[part.body].name}/{i}"
+            opacity = part.opacity if part.opacity < 1.0 else None
+            mesh = server.scene.add_mesh_simple(
+                path, part.vertices, part.faces, color=part.color, opacity=opacity, **SHADING
+            )
+            if movable[part.body]:
+                self._movable.append((mesh, part))
         server.scene.add_line_segments(
             "/floor", FLOOR_LINES, GRAY, thickness=1.0, thickness_units="screen", position=(0.4, 0.0, 0.0)
         )
 
-    def _add_translucent_bodies(self, server: ViserServer, model: Any) -> None:
-        """Add meshes of the hand and the objects, and hide these bodies in the ``mujoco.MjModel``."""
-        parts = movable_meshes(model)
-        self._frames = {
-            body: server.scene.add_frame(f"/bodies/{name or body}", show_axes=False)
-            for body, name in {part.body: part.name for part in parts}.items()
-        }
-        self._meshes: list[tuple[Any, RGB]] = []
-        for i, part in enumerate(parts):
-            path = f"{self._frames[part.body].name}/{i}"
-            mesh = server.scene.add_mesh_simple(path, part.vertices, part.faces, color=part.color, cast_shadow=False)
-            self._meshes.append((mesh, part.color))
-        model.geom_rgba[np.isin(model.geom_bodyid, list(self._frames)), 3] = 0.0
-
     def move(self, positions: Array, rotations: Array) -> None:
         """Move all bodies: (B, 3) m and (B, 3, 3), one step of ``Replay``."""
-        self._robot.update_from_arrays(positions[None], rotations[None])
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = positions[body], SO3.from_matrix(rotations[body]).wxyz
 
     def set_translucent(self, translucent: bool) -> None:
-        """Make the hand and the objects translucent or opaque."""
-        for mesh, color in self._meshes:
-            mesh.opacity = TRANSLUCENT_OPACITY if translucent else None
-            mesh.color = tuple(max(TRANSLUCENT_GRAY, channel) for channel in color) if translucent else color
+        """Make the hand and the objects translucent, or as opaque as in the model."""
+        for mesh, part in self._movable:
+            opacity = min(part.opacity, TRANSLUCENT_OPACITY) if translucent else part.opacity
+            mesh.opacity = opacity if opacity < 1.0 else None
+            mesh.color = tuple(max(TRANSLUCENT_GRAY, channel) for channel in part.color) if translucent else part.color
 
 
 def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:

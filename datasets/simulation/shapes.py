@@ -20,6 +20,7 @@ _BALL = np.concatenate([np.cos(slope) * _RIM + [0.0, 0.0, np.sin(slope)] for slo
 _BALL = np.concatenate([_BALL, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
 _BOX = np.array([[bit >> axis & 1 for axis in range(3)] for bit in range(8)]) * 2.0 - 1.0
 _UP = np.array([0.0, 0.0, 1.0])
+_TERRAIN = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Shape:
 
 
 def shapes(model: Any, visual: bool = True) -> list[Shape]:
-    """All shapes of a model (``mujoco.MjModel``) except planes.
+    """All shapes of a model (``mujoco.MjModel``) except planes and height fields.
 
     Args:
         visual: return the displayed shapes; otherwise the shapes in the task's camera images.
@@ -50,7 +51,7 @@ def shapes(model: Any, visual: bool = True) -> list[Shape]:
         kind, body = int(model.geom_type[geom]), int(model.geom_bodyid[geom])
         hidden = model.geom_group[geom] >= HIDDEN_GROUP
         displayed_only = model.geom_group[geom] == VISUAL_GROUP
-        if kind == mujoco.mjtGeom.mjGEOM_PLANE or (hidden if visual else displayed_only):
+        if kind in _TERRAIN or (hidden if visual else displayed_only):
             continue
         points, faces = _points(model, geom, kind)
         turn = np.zeros(9)

@@ -75,7 +75,7 @@ KINDS = {
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),
     "black": ("share of steps without an image", False, 0.02),
-    "frozen": ("share of repeated images", False, 0.02),
+    "frozen": ("share of repeated readings", False, 0.02),
     "sharpness": ("sharpness", True, 0.05),
     "brightness": ("exposure relative to healthy images", True, 0.03),
     "occlusion": ("share of occluded pixels", False, 0.01),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.simulation.shapes import Shape, hand_bodies, object_bodies, shapes
+from beliefscope.datasets.simulation.shapes import Shape, shapes
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.meshes import mesh_of
 from beliefscope.inspect.likelihood import COARSE, LikelihoodMap
@@ -109,27 +109,25 @@ def grid(task: Task, trace: Trace) -> Grid:
 
 @dataclass(frozen=True)
 class ColoredMesh:
-    """Shapes of one color of a body, in the body's frame. vertices: (V, 3) m. faces: (F, 3)."""
+    """Shapes of one color of a body, in the body's frame. vertices: (V, 3) m. faces: (F, 3). opacity: 0..1."""
 
     body: int
-    name: str
     color: RGB
+    opacity: float
     vertices: Array
     faces: Array
 
 
-def movable_meshes(model: Any) -> list[ColoredMesh]:
-    """Meshes of the hand and the objects of a ``mujoco.MjModel``, one for each body and color."""
-    bodies = object_bodies(model) | hand_bodies(model)
+def body_meshes(model: Any) -> list[ColoredMesh]:
+    """Meshes of all bodies of a ``mujoco.MjModel``, one for each body and color."""
     meshes = []
-    parts = sorted((shape for shape in shapes(model) if bodies[shape.body]), key=_body_and_color)
-    for (body, rgba), group in groupby(parts, key=_body_and_color):
+    for (body, rgba), group in groupby(sorted(shapes(model), key=_body_and_color), key=_body_and_color):
         solids = [mesh_of(shape) for shape in group]
         offsets = np.cumsum([0, *(len(part.vertices) for part in solids)])
         faces = np.concatenate([part.faces + offset for part, offset in zip(solids, offsets, strict=False)])
         red, green, blue = (round(255.0 * channel) for channel in rgba[:3])
         vertices = np.concatenate([part.vertices for part in solids])
-        meshes.append(ColoredMesh(body, model.body(body).name, (red, green, blue), vertices, faces))
+        meshes.append(ColoredMesh(body, (red, green, blue), rgba[3], vertices, faces))
     return meshes
 
 

@@ -26,6 +26,8 @@ VIEWING_DISTANCE, REACHES = 1.2, 2.2
 the second times the distance of the farthest true state or hand from the centre."""
 EYE_HEIGHT = 2.2
 """Height of the eye above a point cloud, in extents, so that all of it is in view."""
+COLOR_NAMES = {"image": "blue", "haptics": "amber"}
+"""Modality -> name of its color in ``recordings.schema``."""
 BACKGROUND = [16, 17, 24]
 """RGB, dark in every theme of the viewer, so that empty cells of a map look empty."""
 
@@ -138,8 +140,14 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     if "contact" in task.covariates:
         rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=_linked()))
         shares.append(1.2)
-    titles = {"weights": "Fusion weights beta", "effective_weights": "Effective weights"}
-    fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in titles.items() if getattr(trace, name) is not None]
+    titles = {"weights": "Beta", "effective_weights": "Effective weights"}
+    # A legend would hide the lines of a low plot: the first title names the colors, if they have common names.
+    named = set(trace.modalities) <= COLOR_NAMES.keys()
+    colors = ", ".join(f"{name} {COLOR_NAMES[name]}" for name in trace.modalities if named)
+    available = [name for name in titles if getattr(trace, name) is not None]
+    if available and colors:
+        titles[available[0]] += f": {colors}"
+    fusion = [_plot(name, titles[name], (-0.05, 1.05), legend=not named) for name in available]
     if fusion:
         rows.append(rrb.Tabs(*fusion, active_tab=0))
         shares.append(2.5)
@@ -147,7 +155,8 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     rows.append(rrb.Tabs(*(_estimate(trace, task, component, growing) for component in task.components), active_tab=0))
     shares.append(2.5)
     main = task.main_error
-    errors = [_plot("errors/position", with_unit(f"{main.title} error", main.unit))]
+    title = with_unit(f"{main.title} error", main.unit)
+    errors = [_plot("errors/position", f"{title}: fused red" if named else title, legend=not named)]
     errors += [
         _plot(f"errors/{c.name}", f"Error of {c.name} (deg)")
         for c in angles(task)
@@ -172,7 +181,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
         margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
     name = with_unit(component.label, component.shown[0])
-    if i == 0:  # a legend of all modalities with their bands would hide the lines
+    if i == 0:  # without a legend, as above
         name += ": truth green, fused red"
     return _plot(f"states/{component.name}", name, limits, legend=False)
 

@@ -354,3 +354,34 @@ def test_page_reconnects_to_a_restarted_server(open_page: Any, start_server: Any
     page.settle(6)
     disconnections = [line for line in page.errors if "ERR_CONNECTION_REFUSED" in line or "WebSocket" in line]
     page.errors[:] = [line for line in page.errors if line not in disconnections]
+
+
+CUT = """(selects) => selects.filter((select) => {
+  const width = select.offsetWidth;
+  Object.assign(select.style, { flex: 'none', maxWidth: 'none' });
+  const isCut = select.offsetWidth > width + 1;
+  Object.assign(select.style, { flex: '', maxWidth: '' });
+  return isCut;
+}).map((select) => select.id)"""
+"""Returns the names of the select elements that are narrower than their selected names."""
+
+
+def test_a_failed_run_is_reported_in_every_panel_and_names_are_whole(open_page: Any) -> None:
+    page = open_page(size=(1280, 720))
+    names = page.page.locator(".pickers select:visible")
+    assert [name.input_value() for name in names.all()][:2] == ["door", "crossmodal-pf"]
+    assert names.evaluate_all(CUT) == []
+    page.page.set_viewport_size({"width": 1024, "height": 768})
+    assert names.evaluate_all(CUT) == ["episode"], "the episode's properties are cut first"
+    tabs = page.page.locator("#views .tabs")
+    assert tabs.evaluate("(tabs) => tabs.scrollWidth <= tabs.clientWidth")
+    answer = {"status": 500, "json": {"error": "The filter failed"}}
+    page.page.route("**/api/trace/**", lambda route: route.fulfill(**answer))
+    page.page.locator("#filter").select_option("crossmodal-ekf")
+    page.until("() => document.querySelector('#scene').dataset.state === 'error'")
+    for panel in ("#scene", "#heatmaps", "#timeline .body"):
+        assert page.page.locator(f"{panel} > .note").first.inner_text() == "The filter failed."
+    page.errors[:] = [line for line in page.errors if "status of 500" not in line]
+    page.page.unroute("**/api/trace/**")
+    page.page.locator("#filter").select_option("crossmodal-pf")
+    page.until("() => document.querySelector('#scene').dataset.state !== 'error'")

@@ -134,7 +134,7 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     assert page.page.evaluate("() => document.activeElement.ariaLabel") == "Move estimate down"
     assert not page.violations("#chart-menu")
     page.page.keyboard.press("Escape")
-    page.until(f"() => ({titles})().join() === 'Hinge,Weight,Particles,NEES/n'")
+    page.until(f"() => ({titles})().join() === 'Hinge,Effective,Particles,NEES/n'")
     heights = "() => [...document.querySelectorAll('#tracks .track')].map((row) => row.offsetHeight)"
     before = page.page.evaluate(heights)
     page.page.locator(".track-splitter").nth(1).focus()
@@ -144,11 +144,11 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     assert page.state["step"] == 44
     page.until("() => location.search.includes('charts=estimate')")
     third = open_page("?" + page.page.url.partition("?")[2])
-    assert third.page.evaluate(titles) == ["Hinge", "Weight", "Particles", "NEES/n"]
+    assert third.page.evaluate(titles) == ["Hinge", "Effective", "Particles", "NEES/n"]
     assert np.allclose(third.page.evaluate(heights), after, atol=1)
     third.page.locator("#charts").click()
     third.page.get_by_role("button", name="Reset charts and heights").click()
-    third.until(f"() => ({titles})().join() === 'Weight,Hinge,Particles'")
+    third.until(f"() => ({titles})().join() === 'Effective,Hinge,Particles'")
 
 
 def test_event_marks_and_comparison_run(open_page: Any) -> None:

@@ -180,9 +180,9 @@ test('the colour bar names its quantity, its unit, and scales that differ', () =
   assert.deepEqual(labels('normalised', 'own'), {
     low: '0',
     high: '1',
-    label: 'likelihood relative to each peak',
+    label: 'of each peak',
   });
-  assert.equal(labels('normalised', 'same').label, 'likelihood relative to the highest peak');
+  assert.equal(labels('normalised', 'same').label, 'of the highest peak');
   assert.deepEqual(labels('log', 'same'), {
     low: '≤−38',
     high: '2',

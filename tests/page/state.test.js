@@ -19,7 +19,7 @@ test('an empty link selects the first of everything', () => {
   assert.equal(state.angle, null);
   assert.equal(
     permalink(state),
-    '?task=door&filter=crossmodal-pf&data=door&episode=9&step=2&component=hinge_x&weights=raw&track=error&tab=scene',
+    '?task=door&filter=crossmodal-pf&data=door&episode=9&step=2&component=hinge_x&weights=effective&track=error&tab=scene',
   );
 });
 

@@ -3,7 +3,7 @@ import test from 'node:test';
 
 import { cssVariable } from '../../app/page/core/palette.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
-import { chartData, valueRange } from '../../app/page/timeline/chart.js';
+import { chartData, shadeIntervals, valueRange } from '../../app/page/timeline/chart.js';
 import { secondsAxis } from '../../app/page/timeline/step_axis.js';
 import { formatValue } from '../../app/page/timeline/legend.js';
 import {
@@ -208,4 +208,48 @@ test("a filter's own scalars are charts", () => {
   const missing = { ...state, track: 'extra/other' };
   assert.equal(tracks(trace, missing)[2].note, 'None: this filter does not report it.');
   assert.deepEqual(trackOptions(trace, 'extra/other').at(-1), ['extra/other', 'other']);
+});
+
+/** Texts and filled rectangles that `shadeIntervals` draws over 100 steps of 10 px. @param {object} shading */
+function shaded(shading) {
+  const [texts, rows] = [[], []];
+  const tile = { beginPath() {}, moveTo() {}, lineTo() {}, stroke() {} };
+  const style = { getPropertyValue: (/** @type {string} */ name) => name };
+  Object.assign(globalThis, { devicePixelRatio: 1, getComputedStyle: () => style });
+  globalThis.document ??= { createElement: () => ({ getContext: () => tile }) };
+  const ctx = {
+    save() {},
+    restore() {},
+    fillRect: (x, y, width, height) => rows.push([x, y, width, height]),
+    measureText: (text) => ({ width: 5 * text.length }),
+    fillText: (text, x, y) => texts.push([text, x, y]),
+    createPattern: () => null,
+  };
+  const plot = {
+    ctx,
+    bbox: { left: 0, top: 0, width: 1000, height: 80 },
+    valToPos: (step) => 10 * step,
+  };
+  shadeIntervals(plot, { contact: [], blackout: [], edits: [], ...shading }, true);
+  return { texts, rows };
+}
+
+test('injected faults are labelled, below the labels of outages', () => {
+  const run = makeTrace(
+    { ...FUSION, faulty: { shape: [2], values: [0, 1] } },
+    { faults: 'image_frozen:from=1,force_bias:x=5:from=1' },
+  );
+  assert.deepEqual([...run.faulty], [0, 1]);
+  assert.equal(run.faultLabel, 'injected: image frozen, force bias');
+  assert.deepEqual([...makeTrace(FUSION).faulty], [0, 0]);
+  const fault = { faulty: [[30, 99]], faultLabel: run.faultLabel };
+  const { texts, rows } = shaded(fault);
+  assert.deepEqual(rows[0], [295, 0, 700, 4], 'a line at the top edge');
+  assert.equal(texts[0][0], 'injected: image frozen, force bias');
+  const both = shaded({ ...fault, blackout: [[0, 20]] }).texts;
+  assert.deepEqual(
+    both.map(([text]) => text),
+    ['no image', 'injected: image frozen, force bias'],
+  );
+  assert.ok(both[1][2] > both[0][2], 'in a row of its own');
 });

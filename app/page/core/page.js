@@ -287,6 +287,7 @@ export class Page {
     const loading = (this.#loading = new AbortController());
     [this.#trace, this.#failed] = [null, false];
     this.clock.show(null);
+    this.scene.failure = '';
     this.diagnosis.show(null);
     this.finding.show(null);
     const loadingState = startLoading();
@@ -300,7 +301,9 @@ export class Page {
       if (loading.signal.aborted) return;
       this.#failed = true;
       document.documentElement.classList.add('started');
-      this.finding.fail(showError(error));
+      const text = showError(error);
+      this.scene.failure = text;
+      this.finding.fail(text);
     }
   }
 

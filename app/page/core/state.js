@@ -20,7 +20,7 @@ import { displayName } from './units.js';
  * @property {number | null} angle SI, value of the only component off the maps; null for the true value
  * @property {string} tab one of `TABS`
  * @property {string} component state component of the charts
- * @property {string} weights `raw` for the fusion weights beta, or `effective`
+ * @property {string} weights `effective` or `raw` for the fusion weights beta
  * @property {string} track lowest chart: a key of `TRACKS`, or a column of a filter's own scalars
  * @property {string} charts of the timeline from top to bottom (chart_list.js), empty for the default
  * @property {string} window visible steps such as 20-60, empty for all
@@ -84,7 +84,7 @@ export const TABS = [
 const CHOICES = {
   ...SCENE_CHOICES,
   tab: ['scene', ...TABS],
-  weights: ['raw', 'effective'],
+  weights: ['effective', 'raw'],
   track: Object.keys(TRACKS),
   time: ['steps', 'seconds'],
   over: ['episode', 'held-out'],

@@ -54,6 +54,8 @@ export class Trace {
     this.contact = new Float32Array();
     /** Whether an image of each step is blacked out. @type {Series} */
     this.blackout = new Float32Array();
+    /** Whether a fault was injected at each step; zero if at all steps. @type {Series} */
+    this.faulty = new Float32Array();
     this.#update();
   }
 
@@ -404,9 +406,16 @@ export class Trace {
     return this.#cache.get(key);
   }
 
+  /** Names of the injected faults: `injected: image frozen`. */
+  get faultLabel() {
+    const names = this.header.faults.split(',').map((fault) => fault.split(/[:=]/)[0]);
+    return `injected: ${names.join(', ').replaceAll('_', ' ')}`;
+  }
+
   #update() {
     this.contact = this.#slice('contact') ?? new Float32Array(this.steps);
     this.blackout = this.#slice('blackout') ?? new Float32Array(this.steps);
+    this.faulty = this.#slice('faulty') ?? new Float32Array(this.steps);
   }
 }
 

@@ -26,7 +26,7 @@ import { openView } from './api.js';
 const FINE_DELAY = 120; // ms after the last change of the cursor
 const RESPONSE_TIMEOUT = 10_000; // ms
 /** Pause between renderings of a slow 3D scene, as a multiple of their duration. */
-const PACE = { scrubbing: Infinity, playing: 3, idle: 0 };
+const PACE = { scrubbing: Infinity, playing: 1, idle: 0 };
 const RETRY_DELAY = { first: 500, max: 8000 }; // ms
 
 export class ViewSocket {

@@ -138,7 +138,7 @@ export function colourScale(quantity, scale, range, layers, reference) {
   const own = range !== 'same';
   if (!reference && !log) {
     const peak = own ? 'each peak' : 'the highest peak';
-    return { low: '0', high: '1', label: `${quantity} relative to ${peak}` };
+    return { low: '0', high: '1', label: `of ${peak}` };
   }
   const ends = layers.map(({ shade, peak }) => {
     const shown = log && own ? { ...shade, low: shade.low - peak, high: 0 } : shade;

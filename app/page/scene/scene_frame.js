@@ -14,8 +14,11 @@ const NO_SCENE =
  * @property {((slow: boolean) => void) | null} changed called after each rendering
  */
 
+const STARTING = 'Starting the 3D scene …';
+
 export class SceneFrame {
   #host;
+  #failure = '';
   #frame = document.createElement('iframe');
 
   /** @param {HTMLElement} host */
@@ -29,7 +32,14 @@ export class SceneFrame {
         };
     });
     this.#frame.title = '3D scene: robot, true state and estimates';
-    setPanelState(host, 'loading', 'Starting the 3D scene …');
+    setPanelState(host, 'loading', STARTING);
+  }
+
+  /** Why the selected run cannot be displayed; empty if it can. */
+  set failure(/** @type {string} */ text) {
+    if (text) setPanelState(this.#host, 'error', text);
+    else if (this.#failure) setPanelState(this.#host, 'loading', STARTING);
+    this.#failure = text;
   }
 
   /**
@@ -38,7 +48,7 @@ export class SceneFrame {
    * @param {Promise<unknown>} ready when loading may start: it delays other parts of the page
    */
   async open(url, ready) {
-    setPanelState(this.#host, 'loading', 'Starting the 3D scene …');
+    if (!this.#failure) setPanelState(this.#host, 'loading', STARTING);
     await ready;
     if (this.#frame.isConnected) {
       this.#frame.contentWindow?.location.replace(url); // without a history entry

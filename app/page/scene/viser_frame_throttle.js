@@ -1,12 +1,12 @@
 /**
  * Throttles viser's animation frames. A plain script that runs in the frame of the 3D scene before viser.
  *
- * The frame shares its thread with the page. Without a GPU each rendering blocks both for 0.3 s, and viser renders
+ * The frame shares its thread with the page. Without a GPU each rendering can block both for 0.1 s, and viser renders
  * once a second even without changes. Renderings are therefore timed, and where they are slow the page can set a
  * pause between them: `frameThrottle.pause`.
  */
 (() => {
-  const SLOW = 60; // ms from a rendering to the next frame; less counts as fast
+  const SLOW = 40; // ms from a rendering to the next frame; less counts as fast
   const MAX_COST = 600; // ms; the first rendering takes longer than the following ones
   const PAUSE_TIMEOUT = 1000; // ms until an endless pause ends unless it is renewed
   const requestFrame = window.requestAnimationFrame.bind(window);

@@ -178,7 +178,7 @@ export class Diagnosis {
       {},
       create('h4', { textContent: cause.cause }),
       bar,
-      create('output', { textContent: probability.toFixed(2) }),
+      create('output', { textContent: `probability ${probability.toFixed(2)}` }),
       create('div', { className: 'details' }, ...lines),
     );
   }
@@ -212,7 +212,7 @@ function stateOf(entry) {
 /** @param {Result} result */
 function aboutOf({ episodes, healthy_episodes: healthy, alarm_rate: rate }) {
   const text = `${episodes} ${episodes === 1 ? 'episode' : 'episodes'} against ${healthy} healthy ones`;
-  return `${text}; a healthy filter is accused with a probability of ${percent(rate)}.`;
+  return `${text}; probability of a false alarm ${percent(rate)}.`;
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */

@@ -112,7 +112,14 @@ export class Rerun {
     } catch (error) {
       if (this.#source !== source) return;
       this.#source = null;
-      setPanelState(this.#host, 'error', `Rerun cannot display this: ${messageOf(error)}`);
+      // A read-only server cannot write the recording of a run: that is no failure.
+      const isExpected = source === this.#trace && !html('#read-only').hidden;
+      const text = messageOf(error);
+      setPanelState(
+        this.#host,
+        isExpected ? 'empty' : 'error',
+        isExpected ? text : `Rerun cannot display this: ${text}`,
+      );
     }
   }
 

@@ -30,7 +30,7 @@ import { STEPS } from './step_axis.js';
  * @property {string} [note] text in place of a chart
  *
  * @typedef {[first: number, last: number]} Interval of steps
- * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[], failure?: Interval[], repair?: Interval[], label?: string}} Shading label: of the shaded steps
+ * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[], failure?: Interval[], repair?: Interval[], faulty?: Interval[], label?: string, faultLabel?: string}} Shading faulty: with injected faults; label: of the shaded steps
  *
  * @typedef {object} Frame
  * @property {number} width px
@@ -50,6 +50,7 @@ export const FONT = `${scaled(10)}px system-ui, sans-serif`;
 export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
 const BLACKOUT_HEIGHT = scaled(8); // px
 const STRIP_HEIGHT = scaled(12); // px, of the labelled strips for contact and blackout over areas
+const AREA_GRID_OPACITY = 0.3; // of the grid over areas
 const COMPARISON_OPACITY = 0.65;
 const COMPARISON_WIDTH = 1.25; // px
 const LINE_HEIGHT = 4; // px, of a failure and its repair
@@ -76,9 +77,12 @@ export function seriesStyle({ name, comparison = false }) {
  * @returns {uPlot}
  */
 export function chart(parent, track, shading, frame) {
+  const hasAreas = track.series.some(({ stacked }) => stacked);
+  const grid = hasAreas ? translucent(colour('surface'), AREA_GRID_OPACITY) : colour('grid');
+  const shade = (/** @type {uPlot} */ plot) => shadeIntervals(plot, shading, hasAreas, axis);
   const axisStyle = {
     stroke: colour('muted'),
-    grid: { stroke: colour('grid'), width: 1, show: !track.note },
+    grid: { stroke: grid, width: 1, show: !track.note },
     ticks: { stroke: colour('grid'), size: 4, width: 1 },
     font: FONT,
   };
@@ -107,23 +111,17 @@ export function chart(parent, track, shading, frame) {
           ...axisStyle,
           size: GUTTER.left,
           gap: 3,
-          space: scaled(20),
+          space: scaled(14),
           ...valueAxis(track, axisStyle),
         },
       ],
       ...lines(track),
       hooks: {
-        drawClear: [
-          (plot) => drawStack(plot, track, axis),
-          (plot) =>
-            shadeIntervals(
-              plot,
-              shading,
-              track.series.some(({ stacked }) => stacked),
-              axis,
-            ),
+        drawClear: [hasAreas ? (plot) => drawStack(plot, track, axis) : shade],
+        drawAxes: [
+          (plot) => void (bounds && shadeBounds(plot, bounds)),
+          ...(hasAreas ? [shade] : []), // above the grid, which would cross the labels
         ],
-        drawAxes: [(plot) => void (bounds && shadeBounds(plot, bounds))],
       },
     },
     chartData(track, frame.steps, axis),
@@ -268,14 +266,15 @@ function extremesOf({ name, values, sigma }, first, last) {
 }
 
 /**
- * Shades contact and interventions, hatches blackouts along the top edge, and underlines a failure and its repair.
+ * Shades contact and interventions, hatches blackouts along the top edge, marks injected faults and underlines a
+ * failure and its repair.
  * @param {uPlot} plot
  * @param {Shading} shading
  * @param {boolean} [hasAreas] whether areas fill the chart, whose colours a band for contact would change: it is a strip
  * @param {StepAxis} [axis]
  */
 export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
-  const { contact, blackout, edits, failure = [], repair = [] } = shading;
+  const { contact, blackout, edits, failure = [], repair = [], faulty = [] } = shading;
   const { ctx, bbox } = plot;
   /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] @param {number} [top] */
   const shade = (intervals, fill, height = bbox.height, top = bbox.top) => {
@@ -287,6 +286,7 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
       if (right > left) ctx.fillRect(left, top, Math.max(right - left, 1), height);
     }
   };
+  const line = LINE_HEIGHT * devicePixelRatio;
   ctx.save();
   shade(edits, translucent(colour('accent'), 0.12));
   if (hasAreas) {
@@ -296,11 +296,15 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
     labelIntervals(plot, axis, contact, shading.label ?? '', bottom, colour('surface'), null);
     shade(blackout, hatching(ctx), strip);
     labelIntervals(plot, axis, blackout, 'no image', bbox.top, colour('ink'), colour('surface'));
+    shade(faulty, colour('bad'), line);
+    const top = bbox.top + (blackout.length ? strip : 0);
+    const { faultLabel = '' } = shading;
+    labelIntervals(plot, axis, faulty, faultLabel, top, colour('bad'), colour('surface'));
   } else {
     shade(contact, colour('contact-band'));
     shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
+    shade(faulty, colour('bad'), line / 2);
   }
-  const line = LINE_HEIGHT * devicePixelRatio;
   shade(failure, colour('bad'), line, bbox.top + bbox.height - line);
   shade(repair, colour('accent'), line, bbox.top + bbox.height - 2 * line);
   ctx.restore();

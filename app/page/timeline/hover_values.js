@@ -58,7 +58,9 @@ export class HoverValues {
    */
   move(trace, step, { x, y, width, height }) {
     const groups = trace.groups.filter((name) => trace.group(name)[step]);
-    const states = [...groups, ...(trace.blackout[step] ? ['image blackout'] : [])];
+    const states = [...groups];
+    if (trace.blackout[step]) states.push('image blackout');
+    if (trace.faulty[step]) states.push(trace.faultLabel);
     const time = `step ${step} · ${trace.timeText(step)}`;
     this.#title.textContent = [time, ...states].join(' · ');
     for (const { text, track, index } of this.#cells)

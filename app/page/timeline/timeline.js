@@ -395,6 +395,8 @@ export class Timeline {
       contact: intervals(this.#trace.group(this.#group.value)),
       label: this.#group.value,
       blackout: intervals(this.#trace.blackout),
+      faulty: intervals(this.#trace.faulty),
+      faultLabel: this.#trace.faultLabel,
       edits: this.#activeComparison?.edits ?? [],
     });
   }
@@ -428,6 +430,7 @@ export class Timeline {
     const groups = trace.groups.filter((name) => trace.group(name)[step]);
     parts.push(...groups.map((name) => (name === 'contact' ? 'in contact' : name)));
     if (trace.blackout[step]) parts.push('image blacked out');
+    if (trace.faulty[step]) parts.push(trace.faultLabel);
     return parts.join(', ');
   }
 

@@ -93,6 +93,7 @@ export function connectPickers(catalog, store, dialog, findEpisode) {
     if (!isComplete(set)) options.unshift([FIND, `Find one of ${set.count} episodes…`]);
     fill(episode, options);
     episode.value = String(index);
+    episode.title = selectedLabel(episode); // where the picker is narrow
   };
   episode.addEventListener('change', () => {
     if (episode.value !== FIND)
@@ -109,6 +110,7 @@ export function connectPickers(catalog, store, dialog, findEpisode) {
     data.value = state.data;
     if (['task', 'data', 'episode'].some((key) => changed.has(key))) showEpisodes();
     speed.value = String(state.speed);
+    for (const select of [filter, data]) select.title = selectedLabel(select);
   };
   show(store.state);
   store.listen(show);
@@ -127,6 +129,9 @@ const byName = (list, name) => list.find((entry) => entry.name === name);
  * @returns {Option[]}
  */
 const names = (list) => list.map(({ name }) => [name, name]);
+
+/** @param {HTMLSelectElement} select */
+const selectedLabel = (select) => select.selectedOptions[0]?.label ?? '';
 
 /**
  * Returns the filters of a task for a data set. A filter that is known only from a live run has only that run's data.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from beliefscope.app.protocol.trace_format import columns, header
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -75,3 +77,23 @@ def test_nees_bounds_contain_95_percent_for_a_consistent_filter() -> None:
     samples = (np.random.default_rng(0).normal(size=(20_000, 3)) ** 2).mean(axis=1)
     inside = ((samples > low) & (samples < high)).mean()
     assert inside == pytest.approx(0.95, abs=0.005)  # the standard deviation is 0.0015
+
+
+@pytest.mark.parametrize(
+    ("faults", "steps"),
+    [
+        ("", None),
+        ("blackout=0.4", None),  # at every step
+        ("image_frozen:from=30:to=40", (30, 40)),
+        ("force_bias=5:from=90,image_noise=40:from=95", (90, 100)),
+        ("image_noise=40:from=500", None),  # after the end
+    ],
+)
+def test_steps_with_injected_faults(faults: str, steps: tuple[int, int] | None) -> None:
+    run, _, _ = shipped_run("crossmodal-ekf")
+    _, values, _ = read(replace(run, faults=Faults.parse(faults)))
+    if steps is None:
+        assert "faulty" not in values
+    else:
+        at = np.arange(len(run))
+        np.testing.assert_array_equal(values["faulty"], (at >= steps[0]) & (at < steps[1]))

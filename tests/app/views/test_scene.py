@@ -13,11 +13,11 @@ from beliefscope.app.views.scene_context import IMAGE_DISTANCE, MAX_RINGS, ring_
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.replay import replay, replay_model
-from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies
+from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies, shapes
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.figures.scene_belief import DrawnBelief, camera_axis
-from beliefscope.inspect.figures.scene_shapes import LOG_RANGE, OUTLINE_EDGES, map_pixels
+from beliefscope.inspect.figures.scene_shapes import LOG_RANGE, OUTLINE_EDGES, body_meshes, map_pixels
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.particles import modality_shares
 from beliefscope.inspect.palette import colour_table
@@ -74,6 +74,23 @@ def test_hand_and_objects_are_separate_bodies(task: str, bodies: set[str]) -> No
         "finger_left",
         "finger_right",
     }
+
+
+@pytest.mark.parametrize("task", ["door", "push"])
+def test_every_displayed_shape_is_in_a_mesh_of_its_body(task: str) -> None:
+    with open_dataset(sample_path(task)) as data:
+        model = replay_model(TASKS[task], data[0])
+    displayed, meshes = shapes(model), body_meshes(model)
+    assert {f"link{i}" for i in range(8)} < {shape.name for shape in displayed}
+    assert {part.body for part in meshes} == {shape.body for shape in displayed}
+    for body in {part.body for part in meshes}:
+        drawn = np.concatenate([part.vertices for part in meshes if part.body == body])
+        expected = np.concatenate([shape.points for shape in displayed if shape.body == body])
+        # Vertices are float32 values below 3 m, accurate to 1 micrometre.
+        np.testing.assert_allclose(drawn.min(axis=0), expected.min(axis=0), atol=1e-6)
+        np.testing.assert_allclose(drawn.max(axis=0), expected.max(axis=0), atol=1e-6)
+    assert all(part.faces.max() < len(part.vertices) for part in meshes)
+    assert {part.opacity for part in meshes} == {float(shape.rgba[3]) for shape in displayed}
 
 
 def test_map_colors_match_the_page(maps: LikelihoodMap) -> None:
