@@ -72,7 +72,7 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         responses=IN_PROGRESS,
     )
     def trace_header(selection: RequestedRunOrComparison) -> Any:
-        return finished_run(store, selection).header() | {"filter": selection.filter}
+        return finished_run(store, selection).header | {"filter": selection.filter}
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns", response_class=Response, responses=IN_PROGRESS)
     def trace_columns(selection: RequestedRunOrComparison, request: Request) -> Response:

@@ -135,7 +135,7 @@ def header(
     no_maps: str | None,
     missing: Mapping[Quantity, str],
 ) -> dict[str, Any]:
-    """Metadata of a trace, as in ``responses.TraceHeader``.
+    """Metadata of a trace, as in ``api.models.traces.TraceHeader``.
 
     Args:
         no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.

@@ -78,6 +78,7 @@ class GrowingRun(TracedRun):
         """Compute the map from this step alone, without encoding the images of all earlier steps."""
         return replace(compute_map(MapEngine(self.checkpoint, self.at(step)[0]), 0, size, options), step=step)
 
+    @property
     def header(self) -> dict[str, Any]:
         """Description of the run for the page. Each block of steps describes its own columns."""
         missing = missing_quantities(self.checkpoint, self._last)

@@ -83,15 +83,13 @@ class TracedRun:
         return no_maps(self.checkpoint, self.trace)
 
     @cached_property
-    def data_warning(self) -> str | None:
-        """How the episode differs from the filter's training data, in one line; None if it does not."""
-        return data_warning(self.checkpoint, [self.trace.episode], self.trace.faults)
-
     def header(self) -> dict[str, Any]:
         """Description of the trace for the page."""
-        missing = missing_quantities(self.checkpoint, self.trace)
-        description = header(self.trace, self.columns[0], self.checkpoint.task, self.no_maps, missing)
-        return description | {"data_warning": self.data_warning, "no_diagnosis": no_diagnosis(self.checkpoint)}
+        checkpoint, trace = self.checkpoint, self.trace
+        missing = missing_quantities(checkpoint, trace)
+        description = header(trace, self.columns[0], checkpoint.task, self.no_maps, missing)
+        warning = data_warning(checkpoint, [trace.episode], trace.faults)
+        return description | {"data_warning": warning, "no_diagnosis": no_diagnosis(checkpoint)}
 
     @cached_property
     def columns(self) -> tuple[list[dict[str, Any]], bytes]:
