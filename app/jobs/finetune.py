@@ -18,7 +18,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from beliefscope.filters.engine import one_thread
-from beliefscope.filters.finetuning.finetune import finetune
+from beliefscope.filters.finetuning.finetune import Callbacks, finetune
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.report import curve_values, no_change
 from beliefscope.filters.finetuning.settings import FineTune
@@ -68,9 +68,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 data_hash=data_hash,
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
-                report=on_step,
-                on_validation=on_validation,
-                on_resume=log.resume,
+                callbacks=Callbacks(on_step, on_validation, log.resume),
                 partial=folder / "finetuned.partial",
             )
             log.write()

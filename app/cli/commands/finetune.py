@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.finetune import FineTuned
+    from beliefscope.filters.finetuning.finetune import Callbacks
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
     from beliefscope.inspect.compare.success import Success
@@ -98,6 +99,8 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.filters.finetuning.finetune import finetune as tune
+    from beliefscope.filters.finetuning.settings import parse_rates
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -108,21 +111,29 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
+    rate, own_rates = parse_rates(rates or ())
     settings = replace(
         _modules_and_data(base, train or (), freeze or (), slices or (), fault_sets or (), events or ()),
         length=length,
+        rate=rate,
+        rates=own_rates,
         l2_sp=l2_sp,
         calibrate=calibrate,
         patience=patience,
         success=Criterion.parse(success) if success else None,
         seed=seed,
     )
-    settings = _changed(settings, clean_weight, steps, rates or ())
+    given = {"clean_weight": clean_weight, "steps": steps}
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    partial = output.with_name(f"{output.name}.partial")
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command, members = finetune_command(target, filter, data, settings), list(episodes)
+        source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
-            return _external(base, members, settings, output, episodes.hash, command)
-        tuned = _run(base, members, settings, _partial(output), log, rerun, data_hash=episodes.hash, command=command)
+            return _external(base, members, output, source)
+        with _progress(base, partial, log, rerun) as callbacks:
+            tuned = tune(base, members, callbacks=callbacks, **source)
+        assert tuned is not None, "runs without a stop callback always complete"
         profile = measure_profile(tuned.filter, base.name, members, command)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
@@ -131,60 +142,44 @@ def finetune(
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
 
 
-def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, rates: Sequence[str]) -> FineTune:
-    """The settings with the values that are given, and with learning rates."""
-    from beliefscope.filters.finetuning.settings import parse_rates
-
-    rate, own_rates = parse_rates(rates)
-    weight = settings.clean_weight if clean_weight is None else clean_weight
-    steps = settings.steps if steps is None else steps
-    return replace(settings, clean_weight=weight, steps=steps, rate=rate, rates=own_rates)
-
-
-def _partial(output: Path) -> Path:
-    """File from which an interrupted run resumes."""
-    return output.with_name(f"{output.name}.partial")
-
-
-def _external(
-    base: ExternalFilter, episodes: list[Episode], settings: FineTune, output: Path, data_hash: str, command: str
-) -> console.Result:
-    """Fine-tune the module of an external filter on its own loss."""
-    from beliefscope.filters.external.load import load_external
-    from beliefscope.filters.external.weights import save_weights
-    from beliefscope.filters.finetuning.external import finetune_external, loss_of
+@contextmanager
+def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: str = "") -> Iterator[Callbacks]:
+    """Progress bars and logs of a fine-tuning."""
     from beliefscope.filters.finetuning.finetune import Callbacks
-    from beliefscope.filters.finetuning.report import error_summary
+    from beliefscope.filters.finetuning.report import curve_values, error_summary
+    from beliefscope.recordings.rerun_log.training_curves import log_curves
 
     validations: list[Validation] = []
-    partial = _partial(output)
-    with console.bars() as update:
+    with console.bars() as update, log_curves(log, viewer, console.note) as write:
+
+        def on_validation(validation: Validation) -> None:
+            validations.append(validation)
+            write(validation.step, {**curve_values(validation), "score": validation.score})
 
         def report(step: int, count: int, loss: float) -> None:
             errors = error_summary(base.task.main_error, validations[0], validations[-1])
             update("Fine-tuning", step / count, f"loss {loss:.3g}; {errors}")
 
-        result = finetune_external(
-            base,
-            loss_of(base.source),
-            episodes,
-            data_hash=data_hash,
-            settings=settings,
-            command=command,
-            callbacks=Callbacks(
-                report,
-                validations.append,
-                lambda step: console.note(f"resuming after step {step}, from {partial.name}"),
-                lambda: False,
-            ),
-            partial=partial,
-        )
+        def on_resume(step: int) -> None:
+            console.note(f"resuming after step {step}, from {partial.name}")
+
+        yield Callbacks(report, on_validation, on_resume)
+
+
+def _external(base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any]) -> console.Result:
+    """Fine-tune the module of an external filter on its own loss. source: other arguments of ``finetune_external``."""
+    from beliefscope.filters.external.load import load_external
+    from beliefscope.filters.external.weights import save_weights
+    from beliefscope.filters.finetuning.external import finetune_external, loss_of
+
+    with _progress(base, source["partial"]) as callbacks:
+        result = finetune_external(base, loss_of(base.source), episodes, callbacks=callbacks, **source)
     assert result is not None, "runs without a stop callback always complete"
     tensors, record = result
     save_weights(tensors, output)
-    source = f"{base.source.partition('@')[0]}@{output}"
-    digest = load_external(source, base.task).hash
-    lines = [*_summary(record), "", f"beliefscope change {base.source} {source} --task {base.task.name}"]
+    tuned = f"{base.source.partition('@')[0]}@{output}"
+    digest = load_external(tuned, base.task).hash
+    lines = [*_summary(record), "", f"beliefscope change {base.source} {tuned} --task {base.task.name}"]
     return opt.checkpoint_result(output, base.task.name, base.name, digest, record, lines)
 
 
@@ -244,36 +239,3 @@ def _summary(record: dict[str, Any]) -> list[str]:
         "",
         unchanged if frozen["tensors"] else "No tensor was frozen.",
     ]
-
-
-def _run(
-    base: Any, episodes: list[Any], settings: FineTune, partial: Path, log: Path | None, viewer: str, **source: Any
-) -> FineTuned:
-    """Fine-tune with progress bars and logs. source: hash of the data and command line, for the record."""
-    from beliefscope.filters.finetuning.finetune import finetune as tune
-    from beliefscope.filters.finetuning.report import curve_values, error_summary
-    from beliefscope.recordings.rerun_log.training_curves import log_curves
-
-    validations: list[Validation] = []
-    with console.bars() as update, log_curves(log, viewer, console.note) as write:
-
-        def on_validation(validation: Validation) -> None:
-            validations.append(validation)
-            write(validation.step, {**curve_values(validation), "score": validation.score})
-
-        def report(step: int, count: int, loss: float) -> None:
-            errors = error_summary(base.task.main_error, validations[0], validations[-1])
-            update("Fine-tuning", step / count, f"loss {loss:.3g}; {errors}")
-
-        tuned = tune(
-            base,
-            episodes,
-            settings=settings,
-            report=report,
-            on_validation=on_validation,
-            on_resume=lambda step: console.note(f"resuming after step {step}, from {partial.name}"),
-            partial=partial,
-            **source,
-        )
-    assert tuned is not None, "runs without a stop callback always complete"
-    return tuned
