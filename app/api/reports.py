@@ -32,9 +32,8 @@ MAX_EVENTS, MAX_TITLE = 20, 200
 class ReportRequest(RequestBody):
     """Body of ``POST /api/reports/...``; the same options as ``beliefscope report``.
 
-    Attributes:
-        events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF.
-        quantity: of the maps; the other one if the filter does not have it.
+    events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF. quantity:
+    of the maps; the other one if the filter does not have it.
     """
 
     events: list[NonNegativeInt] = Field(default=[], max_length=MAX_EVENTS)

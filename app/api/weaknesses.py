@@ -39,9 +39,8 @@ PHASE_SLICES = {
 class Weakness(Reply):
     """A weakness and the settings of a fine-tuning that addresses it.
 
-    Attributes:
-        source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
-        slices: those of the settings.
+    source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
+    slices: those of the settings.
     """
 
     source: Literal["diagnosis", "failures", "default"]

@@ -324,8 +324,7 @@ def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Data
 def open_trace(path: Path, task: str = "") -> Trace:
     """Read a trace from a trace file, a recording or a live file. Raises BadInput if it is not of the task.
 
-    Args:
-        task: name or ``path/to/file.py:NAME``, with its functions; by default the definition in the file, without.
+    task: name or ``path/to/file.py:NAME``, with its functions; by default the definition in the file, without.
     """
     from beliefscope.inspect.trace import load_trace
 

@@ -94,9 +94,7 @@ RECORD = TypeAdapter(Job)
 class Jobs:
     """The jobs of one server, including ended ones of earlier servers. Thread-safe.
 
-    Args:
-        folder: of the job folders; created on first use.
-        kinds: see ``KINDS``. max_running, max_waiting: limits.
+    folder: of the job folders; created on first use. kinds: see ``KINDS``. max_running, max_waiting: limits.
     """
 
     def __init__(
@@ -163,9 +161,8 @@ class Jobs:
     ) -> Job:
         """Queue a job, or return the existing one with the same kind and key if it is active or done.
 
-        Args:
-            arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
-            link: page address of the result. output_exists: False if files that the job wrote have been deleted.
+        arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
+        link: page address of the result. output_exists: False if files that the job wrote have been deleted.
 
         Raises BadInput for an unknown kind or a full disk, and QueueFull.
         """

@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 def permalink(task: Task, filter_: str, data: str, episode: int, step: int, faults: str = "", by: str = "error") -> str:
     """``?task=...&step=...``, identical to the address that the page itself shows.
 
-    Args:
-        filter_, data: names on the page. by: the score that ranks the page's failures; it also selects the track of
-            the timeline, the component or the kind of weights.
+    filter_, data: names on the page. by: the score that ranks the page's failures; it also selects the track of the
+    timeline, the component or the kind of weights.
     """
     query: dict[str, str | int] = {
         "task": task.name,

@@ -23,11 +23,7 @@ SENSORS = ("effector_position", "force")
 
 
 def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
-    """The trace's time series.
-
-    Returns:
-        Descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and the float32 buffer they refer to.
-    """
+    """The trace's time series: descriptions ``{"name", "shape", "offset"}``, offset in bytes, and one float32 buffer."""
     innovation, groups = virtual_innovations(trace), measures.shaded_groups(trace)
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {
@@ -137,8 +133,7 @@ def header(
 ) -> dict[str, Any]:
     """Metadata of a trace, as in ``api.models.traces.TraceHeader``.
 
-    Args:
-        no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
+    no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
     """
     components = [component_json(c) for c in task.components]
     return {

@@ -133,8 +133,7 @@ class LiveRuns:
     def traced_run(self, selection: Selection, filters: Mapping[str, Checkpoint]) -> TracedRun | None:
         """The live run, or None if the selection applies another filter, faults or an intervention to its episode.
 
-        Raises:
-            BadInput: the run does not exist or belongs to another task or episode.
+        Raises BadInput if the run does not exist or belongs to another task or episode.
         """
         run = self[selection.data.removeprefix(LIVE_PREFIX)]
         name, checkpoint = resolve_filter(run, filters)

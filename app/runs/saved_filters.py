@@ -48,8 +48,7 @@ def with_saved_filters(settings: Settings) -> Settings:
 def save_filter(store: TraceStore, new: SavedFilter) -> None:
     """Add a filter to the catalog and to the list. A default replaces the previous default of its task.
 
-    Raises:
-        BadInput: the checkpoint or the list cannot be read.
+    Raises BadInput if the checkpoint or the list cannot be read.
     """
     others = [saved for saved in _read(store.settings.workspace) if (saved.task, saved.name) != (new.task, new.name)]
     if new.default:

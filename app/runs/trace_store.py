@@ -119,9 +119,7 @@ class TraceStore:
     def request(self, selection: Selection) -> TracedRun:
         """The selected run; its computation is started if necessary.
 
-        Raises:
-            BadInput: part of the selection does not exist.
-            QueueFull: too many runs are waiting.
+        Raises BadInput if part of the selection does not exist, and QueueFull if too many runs are waiting.
         """
         if (live_run := self._live_run(selection)) is not None:
             return live_run

@@ -30,7 +30,6 @@ class TracedRun:
 
     Attributes:
         key: hash of everything the trace depends on: checkpoint, episode, seed, particles, faults, intervention.
-        checkpoint: the filter.
         future: the trace, or the error that ended its computation.
         progress: completed fraction, 0..1.
         scene_key: identifies what a 3D scene draws; equal for all states of a live run.

@@ -57,10 +57,8 @@ class WorkerProcess(subprocess.Popen[str]):
     def call(self, function: str, arguments: Mapping[str, Any], report: Report) -> Any:
         """Run a function and return its result. Call it from one thread at a time.
 
-        Raises:
-            BadInput: raised by the function.
-            WorkerDied: the process ended; the message describes how.
-            RuntimeError: any other error of the function.
+        Raises BadInput if the function does, RuntimeError for any other error of it, and WorkerDied, with a description,
+        if the process ended.
         """
         assert self.stdin is not None
         assert self.stdout is not None

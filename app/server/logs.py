@@ -25,8 +25,7 @@ REFUSALS = ("refused: ", "Invalid HTTP request", "Unsupported upgrade")
 class LineFormatter(logging.Formatter):
     """Formats one line per event.
 
-    Args:
-        json_lines: JSON objects ``{"time", "level", "event", ...}`` instead of text. secret: replaced by ``...``.
+    json_lines: JSON objects ``{"time", "level", "event", ...}`` instead of text. secret: replaced by ``...``.
     """
 
     def __init__(self, json_lines: bool, secret: str = "") -> None:

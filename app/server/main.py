@@ -68,10 +68,8 @@ log = logging.getLogger("beliefscope.app")
 def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, access: Access = OPEN) -> FastAPI:
     """The application. Its threads start and end with its lifespan.
 
-    Args:
-        warm: prepare the first page's trace and Rerun's viewer in the background at startup.
-        subprocess: run filters in a subprocess instead of a thread.
-        access: required token and permissions.
+    warm: prepare the first page's trace and Rerun's viewer in the background at startup. subprocess: run filters in a
+    subprocess instead of a thread. access: required token and permissions.
     """
     with contextlib.suppress(FileExistsError):  # reported by the code that needs the folder
         settings.workspace.mkdir(mode=0o700, parents=True)

@@ -87,9 +87,8 @@ class Reply:
 class Guard:
     """ASGI middleware that checks all requests and WebSockets and adds security headers to all responses.
 
-    Args:
-        hosts: allowed host names in addition to the loopback's, with any port (``ssh -L`` changes it).
-        access: required token and permissions. With a token, the Host may also be any IP address.
+    hosts: allowed host names in addition to the loopback's, with any port (``ssh -L`` changes it). access: required
+    token and permissions. With a token, the Host may also be any IP address.
     """
 
     def __init__(self, app: ASGIApp, hosts: Iterable[str] = (), access: Access = OPEN) -> None:

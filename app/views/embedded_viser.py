@@ -105,11 +105,8 @@ Handler = Callable[[_Connection], Awaitable[None]]
 class EmbeddedViser:
     """One viser server, reachable only through ``connect``.
 
-    Attributes:
-        server: the public viser API: ``scene``, ``gui``, ``flush()``.
-
-    Raises:
-        RuntimeError: the installed viser starts its socket server differently.
+    server: the public viser API: ``scene``, ``gui``, ``flush()``. Raises RuntimeError if the installed viser starts its
+    socket server differently.
     """
 
     def __init__(self) -> None:

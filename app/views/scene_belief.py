@@ -56,8 +56,7 @@ class Pole:
 class BeliefScene:
     """Scene nodes of one trace.
 
-    Attributes:
-        viewpoints: available viewpoints -> position (3,) of the eye and the point (3,) that it faces, m.
+    viewpoints: available viewpoints -> position (3,) of the eye and the point (3,) that it faces, m.
     """
 
     def __init__(
@@ -65,9 +64,8 @@ class BeliefScene:
     ) -> None:
         """Draw the first step.
 
-        Args:
-            trace: of the whole run or a part of it, to which the steps of ``move`` refer.
-            labels: whether the estimates have labels. The page has a legend instead, which nothing overlaps.
+        trace: of the whole run or a part of it, to which the steps of ``move`` refer. labels: whether the estimates
+        have labels. The page has a legend instead, which nothing overlaps.
         """
         self._server = server
         self._task = run.checkpoint.task

@@ -206,8 +206,7 @@ class RobotScene:
 
     The robot's hand and the objects are separate meshes, which can be translucent so that they do not hide the map.
 
-    Attributes:
-        fixed_bodies: handle of the root of all bodies that do not move.
+    fixed_bodies: handle of the root of all bodies that do not move.
     """
 
     def __init__(self, server: ViserServer, replay: Replay) -> None:

@@ -46,9 +46,7 @@ class Record:
 class Recording:
     """A file in its current state.
 
-    Attributes:
-        bytes, modified: size and time (s since 1970) of the file.
-        info: None while the file is being read.
+    bytes, modified: size and time (s since 1970) of the file. info: None while the file is being read.
     """
 
     name: str

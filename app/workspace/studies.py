@@ -37,9 +37,8 @@ def _rename(row: Any) -> Any:
 class Results(BaseModel):
     """Content of ``study.json``.
 
-    Attributes:
-        checkpoints: trained cell -> hash; missing in files of earlier versions. cells: cell -> state.
-        given: name -> checkpoint file or build function of each filter that was evaluated only.
+    checkpoints: trained cell -> hash; missing in files of earlier versions. cells: cell -> state. given: name ->
+    checkpoint file or build function of each filter that was evaluated only.
     """
 
     preset: str

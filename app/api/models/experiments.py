@@ -25,10 +25,8 @@ class SweepList(Reply):
 class ExperimentRow(Reply):
     """Results of a checkpoint over a data set in one phase.
 
-    Attributes:
-        checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it.
-        error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``.
-        provenance: JSON of the file beside the checkpoint.
+    checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
+    ``unit``, at ``worst_episode`` and ``worst_step``. provenance: JSON of the file beside the checkpoint.
     """
 
     name: str

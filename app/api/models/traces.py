@@ -55,9 +55,8 @@ class Column(Reply):
 class DisplayedSensor(Reply):
     """A sensor that is drawn.
 
-    Attributes:
-        channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point
-            cloud, whose extent is ``high`` in m; else 0.
+    channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point cloud,
+    whose extent is ``high`` in m; else 0.
     """
 
     name: str
