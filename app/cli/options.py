@@ -93,8 +93,6 @@ DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5")
 CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors")
 TRACE = output_file("RUN.trace", "Output trace file.", ".trace")
 FIGURE = output_file("FIGURE", "Output figure: .svg, .pdf or .png.")
-ENGINE = option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]').")
-WORKERS = option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1))
 TRACE_FILTER = option(
     "NAME|CHECKPOINT",
     "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
@@ -153,6 +151,14 @@ OPTIONS: dict[str, Any] = {
     "freeze": option("PATTERN", "Freeze these modules: dotted names, * matches any text. Repeatable."),
     "workspace": option("DIR", "Workspace folder for recordings and traces; created if missing."),
     "log": option("DIR", "Folder for TensorBoard logs."),
+    "every": flag("Use all episodes, not only the held-out ones.", "--all"),
+    "by": option(
+        "SCORE",
+        "Score: error (position), the name of an angle, nees, ess (effective sample size), disagreement (of the "
+        "modalities) or regret (of the fusion weights).",
+    ),
+    "engine": option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]')."),
+    "workers": option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1)),
     "align": flag("Move data of another frame by the constant offset that explains the difference.", "--align"),
     "json": option("-", "Print one JSON document instead of text: --json -", callback=_check_json),
 }
@@ -238,6 +244,10 @@ class Runs:
             return self.task
         with open_dataset(self.data) as data:
             return data.task if data.task.name == self.task else self.task
+
+    def settings(self, faults: Faults) -> dict[str, Any]:
+        """Arguments that all functions that run a filter over episodes have."""
+        return {"faults": faults, "seed": self.seed, "particles": self.particles}
 
     def episodes(self, task: Task) -> Dataset:
         """The dataset."""

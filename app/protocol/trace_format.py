@@ -23,7 +23,7 @@ SENSORS = ("effector_position", "force")
 
 
 def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
-    """The trace's time series: descriptions ``{"name", "shape", "offset"}``, offset in bytes, and one float32 buffer."""
+    """The trace's time series: descriptions ``{"name", "shape", "offset"}``, offset in bytes, and a float32 buffer."""
     innovation, groups = virtual_innovations(trace), measures.shaded_groups(trace)
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {

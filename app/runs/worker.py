@@ -57,8 +57,8 @@ class WorkerProcess(subprocess.Popen[str]):
     def call(self, function: str, arguments: Mapping[str, Any], report: Report) -> Any:
         """Run a function and return its result. Call it from one thread at a time.
 
-        Raises BadInput if the function does, RuntimeError for any other error of it, and WorkerDied, with a description,
-        if the process ended.
+        Raises BadInput if the function does, RuntimeError for any other error of it, and WorkerDied if the
+        process ended; it describes how.
         """
         assert self.stdin is not None
         assert self.stdout is not None

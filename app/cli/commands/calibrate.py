@@ -33,15 +33,8 @@ def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Resu
         held_out = data.held_out()
         fitted, tested = held_out[::2], held_out[1::2]
         check_level(level, len(fitted), len(tested))
-        traces = trace_all(
-            checkpoint,
-            data,
-            [*fitted, *tested],
-            faults=faults,
-            seed=runs.seed,
-            particles=runs.particles,
-            progress=advance,
-        )
+        settings = runs.settings(faults)
+        traces = trace_all(checkpoint, data, [*fitted, *tested], **settings, progress=advance)
         by_index = {trace.episode_index: trace for trace in traces}
         data_hash = data.hash
     report = fit([by_index[i] for i in fitted], [by_index[i] for i in tested], level, data_hash)

@@ -14,7 +14,6 @@ from beliefscope.recordings.report.command_lines import serve_command
         "Path of a .safetensors file, name of a built-in filter such as crossmodal-ekf, or path/to/file.py:build.",
     ),
     after=opt.argument("AFTER", "As BEFORE."),
-    every=opt.flag("Compare on all episodes, not only the held-out ones.", "--all"),
     task=opt.option("TASK", "Task of both filters. Required for two names."),
     output=opt.option("DIR", "New folder for change.json, change.svg and change.md.", "-o"),
 )

@@ -49,10 +49,8 @@ def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", al
         metrics = measure(
             checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
             held_out,
-            faults=faults,
+            **runs.settings(faults),
             only=only,
-            particles=runs.particles,
-            seed=runs.seed,
             start_offset=offset,
             baselines=True,
             modalities=only is None,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.finetune import Callbacks
+    from beliefscope.filters.finetuning.finetune import Callbacks, FineTuned
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
     from beliefscope.inspect.compare.success import Success
@@ -99,8 +99,6 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.finetune import finetune as tune
-    from beliefscope.filters.finetuning.settings import parse_rates
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -111,35 +109,39 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
-    rate, own_rates = parse_rates(rates or ())
     settings = replace(
         _modules_and_data(base, train or (), freeze or (), slices or (), fault_sets or (), events or ()),
         length=length,
-        rate=rate,
-        rates=own_rates,
         l2_sp=l2_sp,
         calibrate=calibrate,
         patience=patience,
         success=Criterion.parse(success) if success else None,
         seed=seed,
     )
-    given = {"clean_weight": clean_weight, "steps": steps}
-    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    settings = _changed(settings, clean_weight, steps, rates or ())
     partial = output.with_name(f"{output.name}.partial")
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command, members = finetune_command(target, filter, data, settings), list(episodes)
         source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source)
-        with _progress(base, partial, log, rerun) as callbacks:
-            tuned = tune(base, members, callbacks=callbacks, **source)
-        assert tuned is not None, "runs without a stop callback always complete"
+        tuned = _run(base, members, log, rerun, source)
         profile = measure_profile(tuned.filter, base.name, members, command)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
+
+
+def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, rates: Sequence[str]) -> FineTune:
+    """The settings with the values that are given, and with learning rates."""
+    from beliefscope.filters.finetuning.settings import parse_rates
+
+    rate, own_rates = parse_rates(rates)
+    weight = settings.clean_weight if clean_weight is None else clean_weight
+    steps = settings.steps if steps is None else steps
+    return replace(settings, clean_weight=weight, steps=steps, rate=rate, rates=own_rates)
 
 
 @contextmanager
@@ -164,6 +166,18 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: 
             console.note(f"resuming after step {step}, from {partial.name}")
 
         yield Callbacks(report, on_validation, on_resume)
+
+
+def _run(
+    base: Checkpoint, episodes: list[Episode], log: Path | None, viewer: str, source: Mapping[str, Any]
+) -> FineTuned:
+    """Fine-tune a filter of this project. source: other arguments of ``finetune``."""
+    from beliefscope.filters.finetuning.finetune import finetune as tune
+
+    with _progress(base, source["partial"], log, viewer) as callbacks:
+        tuned = tune(base, episodes, callbacks=callbacks, **source)
+    assert tuned is not None, "runs without a stop callback always complete"
+    return tuned
 
 
 def _external(base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any]) -> console.Result:
