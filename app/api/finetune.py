@@ -15,7 +15,7 @@ from fastapi.responses import JSONResponse
 from beliefscope.app.api.models.catalog import Progress
 from beliefscope.app.api.models.training import FineTuneDetails, FineTuneOffer, FineTuneRunInfo
 from beliefscope.app.api.traces import RequestedRun
-from beliefscope.app.api.weaknesses import Weakness, weaknesses
+from beliefscope.app.api.weaknesses import Weakness, weaknesses_of
 from beliefscope.app.jobs.finetune import catalog_name
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
@@ -42,7 +42,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/weaknesses/{task}/{filter}/{episode}", responses={202: {"model": Progress}})
     def get_weaknesses(selection: RequestedRun) -> list[Weakness]:
-        return weaknesses(store, jobs, selection)
+        return weaknesses_of(store, jobs, selection)
 
     @router.post("/api/finetune/{task}/{filter}", status_code=202)
     def start(task: str, filter: str, settings: Annotated[dict[str, Any], Body()], data: str = "") -> FineTuneRunInfo:

@@ -331,56 +331,6 @@ def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Data
     return data
 
 
-def open_trace(path: Path, task: str = "") -> Trace:
-    """Read a trace from a trace file, a recording or a live file. Raises BadInput if it is not of the task.
-
-    task: name or ``path/to/file.py:NAME``, with its functions; by default the definition in the file, without.
-    """
-    from beliefscope.inspect.trace import load_trace
-
-    return _open(_read_recording if path.suffix in (".rrd", ".live") else load_trace, path, task)
-
-
-def open_recording(path: Path, task: str = "") -> Trace:
-    """As ``open_trace``, only from a recording or a live file."""
-    return _open(_read_recording, path, task)
-
-
-def _open(read: Callable[[Path, Sequence[Task]], Trace], path: Path, name: str) -> Trace:
-    from beliefscope.datasets.catalog import load_task
-    from beliefscope.datasets.task_json import difference
-
-    given = [load_task(name)] if name else []
-    trace = read(path, given)
-    for task in given:
-        if other := difference(task, trace.task):
-            raise BadInput(f"{path} is of {other}, not of task {task.name!r}")
-    return trace
-
-
-def _read_recording(path: Path, given: Sequence[Task]) -> Trace:
-    """A separate process checks recordings first (Rerun may crash)."""
-    from beliefscope.inspect.traces.live_file import SUFFIX, load_live
-    from beliefscope.recordings.probe import RecordingProbe
-    from beliefscope.recordings.read import read_recording
-
-    if path.suffix == SUFFIX:
-        return load_live(path, given)
-    if path.is_file():
-        metadata = RecordingProbe()(path)
-        if metadata.problem and not metadata.application:
-            raise BadInput(f"{path}: {metadata.problem}")
-    return read_recording(path, given)
-
-
-def open_traces(paths: Sequence[Path], filter_: str, task: str = "") -> tuple[list[Trace], Checkpoint | None]:
-    """Read traces of one filter, and its checkpoint if available; see ``open_trace`` and ``checkpoint_of``."""
-    from beliefscope.inspect.traces.provenance import checkpoint_of
-
-    traces = [open_trace(path, task) for path in paths]
-    return traces, checkpoint_of(traces, paths, filter_)
-
-
 def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:
     """Description of a file created from a trace. extra: additional values of the JSON document."""
     from beliefscope.inspect.traces.provenance import describe

@@ -19,14 +19,11 @@ class Example:
 
     @property
     def task(self) -> str:
-        return self._value("task")
+        return parse_qs(self.link[1:])["task"][0]
 
     @property
     def filter(self) -> str:
-        return self._value("filter")
-
-    def _value(self, key: str) -> str:
-        return parse_qs(self.link.removeprefix("?"))[key][0]
+        return parse_qs(self.link[1:])["filter"][0]
 
 
 EXAMPLES = (

@@ -53,16 +53,13 @@ class GrowingRun(TracedRun):
         return self._run.reader.part(first, last)
 
     @cached_property
-    def _complete(self) -> Trace:
+    def trace(self) -> Trace:
+        """All steps in one trace."""
         return self._part(0, self._steps)
 
     def ready(self, timeout: float) -> bool:
         """Whether there is a step."""
         return self._steps > 0
-
-    def result(self, timeout: float | None = None) -> Trace:
-        """All steps in one trace."""
-        return self._complete
 
     def __len__(self) -> int:
         return self._steps

@@ -51,10 +51,6 @@ class TracedRun:
         self._cache: OrderedDict[tuple[int, int, MapOptions], EncodedMaps] = OrderedDict()
         self._cache_bytes = 0
 
-    def result(self, timeout: float | None = None) -> Trace:
-        """Wait for the trace. Raises the error of its computation, or TimeoutError of ``concurrent.futures``."""
-        return self.future.result(timeout)
-
     def ready(self, timeout: float) -> bool:
         """Whether the trace is complete within ``timeout`` s. Raises the error of its computation."""
         try:
@@ -65,8 +61,8 @@ class TracedRun:
 
     @property
     def trace(self) -> Trace:
-        """The trace; waits until it is complete."""
-        return self.result()
+        """The trace; waits until it is complete. Raises the error of its computation."""
+        return self.future.result()
 
     def __len__(self) -> int:
         """Number of steps."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from functools import lru_cache, wraps
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.catalog import TaskCatalog
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import read_faults
-from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.events import find_failures
@@ -34,9 +33,6 @@ MOST_EPISODES = 20
 """Episodes of one question; an answer must not take minutes."""
 
 MOST_EVENTS = 50
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 class Assistant:
@@ -83,9 +79,10 @@ class Assistant:
             if mask.any()
         }
         worst = np.argsort(-np.nan_to_num(error[:, -1]))[:3].tolist()
-        moments = [{"step": step, main.key: main.factor * error[step, -1]} for step in worst]
-        for moment in moments:
-            moment["link"] = self._link(run, filter, data, moment["step"])
+        moments = [
+            {"step": step, main.key: main.factor * error[step, -1], "link": self._link(run, filter, data, step)}
+            for step in worst
+        ]
         return as_json({"run": repr(run), "diagnosis": diagnosis, "phases": phases, "worst_moments": moments})
 
     def values(
@@ -102,12 +99,11 @@ class Assistant:
             layer: {"estimate": dict(zip(names, means[i], strict=True)), "sigma": dict(zip(names, std[i], strict=True))}
             for i, layer in enumerate(measures.layers(run))
         }
-        mask = np.arange(len(run)) == step
         return as_json(
             {
                 "truth": dict(zip(names, factors * run.episode.states[step], strict=True)),
                 "estimates": layers,
-                "effective_weights": self._weights(run, mask),
+                "effective_weights": self._weights(run, np.arange(len(run)) == step),
                 "groups": [name for name, group in measures.shaded_groups(run).items() if group[step]],
                 "blackout": bool(measures.blackout(run)[step]),
                 "link": self._link(run, filter, data, step),
@@ -168,10 +164,8 @@ class Assistant:
 
     def _run(self, task: str, filter_: str, episode: int, data: str, faults: str) -> Trace:
         catalog = self._catalog(task)
-        checkpoint: Checkpoint = catalog.filter(filter_)
-        injected = read_faults(faults, catalog.task)
-        source = catalog.episode(data, episode)
-        return trace(checkpoint, source, episode, self._seed, self._particles, injected)
+        checkpoint, injected = catalog.filter(filter_), read_faults(faults, catalog.task)
+        return trace(checkpoint, catalog.episode(data, episode), episode, self._seed, self._particles, injected)
 
     def _check_step(self, run: Trace, step: int) -> None:
         if not 0 <= step < len(run):
@@ -200,13 +194,13 @@ def build_server(assistant: Assistant) -> MCPServer:
     except ImportError:
         raise BadInput("beliefscope mcp needs the package mcp: pip install 'beliefscope[mcp]'") from None
 
-    def explained(question: Callable[P, R]) -> Callable[P, R]:
+    def explained(question: Callable[..., Any]) -> Callable[..., Any]:
         """The question, with the message of a BadInput as its answer; other exceptions are hidden from the client."""
 
         @wraps(question)
-        def ask(*args: P.args, **kwargs: P.kwargs) -> R:
+        def ask(**arguments: Any) -> Any:
             try:
-                return question(*args, **kwargs)
+                return question(**arguments)
             except BadInput as error:
                 raise ToolError(str(error)) from None
 

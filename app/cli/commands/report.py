@@ -58,6 +58,7 @@ def report(
       beliefscope report run.trace --event 35 --event 68 --all
     """
     from beliefscope.inspect.likelihood import no_maps
+    from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
     from beliefscope.recordings.report.folder import check_folder
     from beliefscope.recordings.report.pdf import browser, print_page
@@ -69,7 +70,7 @@ def report(
     files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
     if not files:
         raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
-    traces, checkpoint = opt.open_traces(files, filter, task)
+    traces, checkpoint = open_traces(files, filter, task)
     if quantity and checkpoint is not None and (reason := no_maps(checkpoint, traces[0], quantity)):
         raise BadInput(reason)
     steps = [parse_event(text, traces) for text in events or ()]
