@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Progress
@@ -98,11 +98,6 @@ def finished_run(store: TraceStore, selection: Selection) -> TracedRun:
     if not run.ready(TRACE_TIMEOUT):
         raise InProgress(run.progress)
     return run
-
-
-def in_progress(_: Request, error: Exception) -> Response:
-    """The response to a request that raises InProgress."""
-    return JSONResponse({"progress": error.args[0]}, 202)
 
 
 def _immutable(request: Request, run: TracedRun, part: str, content: Callable[[], bytes]) -> Response:

@@ -62,6 +62,8 @@ from beliefscope.recordings.web_viewer import WebViewer, installed
 __all__ = ["Settings", "create_app", "serve"]
 
 PAGE = Path(__file__).parents[1] / "page"
+ERRORS: tuple[type[Exception], ...] = (InProgress, BadInput, RequestValidationError, HTTPException, OSError)
+STATUS: dict[type[Exception], int] = {QueueFull: 429, NotFound: 404, NameTaken: 409}
 log = logging.getLogger("beliefscope.app")
 
 
@@ -127,12 +129,8 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         app.include_router(router)
     _add_files(app, viewer)
     app.add_middleware(Guard, hosts=settings.hosts, access=access)
-    for error, status in ((BadInput, 400), (QueueFull, 429), (NotFound, 404), (NameTaken, 409)):
-        app.add_exception_handler(error, _error_handler(status))
-    app.add_exception_handler(InProgress, traces.in_progress)
-    app.add_exception_handler(RequestValidationError, _validation_error)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(OSError, _file_error)
+    for error in ERRORS:
+        app.add_exception_handler(error, _error_response)
     return app
 
 
@@ -256,27 +254,22 @@ def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> No
                 log.warning("not prepared in advance: %s", error)
 
 
-def _error_handler(status: int) -> Callable[[Request, Exception], JSONResponse]:
-    return lambda _, error: JSONResponse({"error": str(error)}, status)
-
-
-def _validation_error(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    return JSONResponse({"error": describe_error(error)}, 422)
-
-
-def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    if error.status_code == 404 and "text/html" in request.headers.get("accept", ""):  # opened in a browser
-        return HTMLResponse(not_found_page(request.url.path), 404, POLICY)
-    return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
-
-
-def _file_error(_: Request, error: Exception) -> JSONResponse:
-    """Errors in the workspace that the user can fix, such as missing permissions."""
-    if not isinstance(error, OSError) or error.filename is None:
-        raise error
-    return JSONResponse({"error": f"{str(error.filename)!r} cannot be used: {error.strerror}."}, 400)
+def _error_response(request: Request, error: Exception) -> Response:
+    """The response to a request that raises one of ``ERRORS``."""
+    match error:
+        case InProgress():
+            return JSONResponse({"progress": error.args[0]}, 202)
+        case BadInput():
+            return JSONResponse({"error": str(error)}, STATUS.get(type(error), 400))
+        case RequestValidationError():
+            return JSONResponse({"error": describe_error(error)}, 422)
+        case HTTPException(status_code=404) if "text/html" in request.headers.get("accept", ""):  # opened in a browser
+            return HTMLResponse(not_found_page(request.url.path), 404, POLICY)
+        case HTTPException():
+            return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
+        case OSError() if error.filename is not None:  # the user can fix it, such as missing permissions
+            return JSONResponse({"error": f"{str(error.filename)!r} cannot be used: {error.strerror}."}, 400)
+    raise error
 
 
 def listen(host: str, port: int) -> socket.socket:
