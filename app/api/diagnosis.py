@@ -3,8 +3,6 @@
 The probable cause of a fault is preliminary from a trace and confirmed by a job; a job searches the smallest repair.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 from dataclasses import asdict

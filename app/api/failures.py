@@ -1,7 +1,5 @@
 """Routes under ``/api/failures``: failure events of a filter over a data set, found by a job."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path

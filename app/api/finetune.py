@@ -1,7 +1,5 @@
 """Routes under ``/api/finetune`` and ``/api/tuned``: options, runs and their results."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Routes under ``/api/jobs``."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 from fastapi import APIRouter

@@ -1,7 +1,5 @@
 """Routes under ``/api/lineage``: which checkpoints were fine-tuned from which."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 import zipfile

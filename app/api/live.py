@@ -4,8 +4,6 @@ A page requests the steps it does not have and the next ones once it has drawn t
 Neither the filter nor the server buffers anything for a page.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time

@@ -1,7 +1,5 @@
 """Routes under ``/api/reports``: reports of runs, written by jobs and kept in the workspace."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Annotated
 

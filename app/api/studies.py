@@ -1,7 +1,5 @@
 """Routes under ``/api/studies``: results of studies, and training of their unfinished cells."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Routes of the health check, the catalog and traces."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Weaknesses of a filter that fine-tuning can address, with settings."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Job that fine-tunes a checkpoint and compares the result with its base."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ A job is a function listed in ``KINDS``, with JSON arguments and a JSON result; 
 Its folder ``jobs/ID`` holds ``job.json``, ``log.txt`` and, once it is done, ``result.json``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

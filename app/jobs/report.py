@@ -1,7 +1,5 @@
 """Job that writes the report of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path

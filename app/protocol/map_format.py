@@ -1,7 +1,5 @@
 """Binary encoding of likelihood maps (docs/api.md): statistics, particles and cells."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Messages from the page over the socket of a view, as validated models (docs/api.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Protocol, get_args
 

@@ -1,7 +1,5 @@
 """Traces as the page reads them: a JSON header and little-endian float32 columns (docs/api.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

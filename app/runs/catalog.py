@@ -1,7 +1,5 @@
 """Catalog of filters and data sets by task: the user's own first, then the included ones."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress

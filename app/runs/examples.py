@@ -1,7 +1,5 @@
 """Examples that the page offers: runs that show one thing each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from urllib.parse import parse_qs

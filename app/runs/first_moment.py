@@ -1,7 +1,5 @@
 """Episode and step at which the page opens a data set."""
 
-from __future__ import annotations
-
 from weakref import WeakKeyDictionary
 
 import numpy as np

@@ -3,8 +3,6 @@
 A run is the only episode of the data set ``live:NAME``. The filter and its viewers communicate through the file alone.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Fine-tuned filters that are saved in a workspace and listed by its servers."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The traces of a server, each computed once on first request; and the catalog of filters and data sets."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import threading

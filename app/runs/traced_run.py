@@ -1,7 +1,5 @@
 """A filter run that is being computed or complete, and the values derived from its trace."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Training episodes of a fine-tuning: those of the data set, or simulated ones for a sample set that has none."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from contextlib import closing

@@ -6,8 +6,6 @@ Standard input carries calls of functions of the module, one JSON array a line; 
 outcome. Printed text goes to standard error.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -5,8 +5,6 @@ A script sends the token in the header ``Authorization: Bearer TOKEN`` of each r
 token, which thus appears in no bookmark or Referer. The cookie is valid until the server stops.
 """
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import secrets

@@ -4,8 +4,6 @@
 requests and failed jobs, ``error`` for server errors, with an id that the response contains, too.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re

@@ -1,7 +1,5 @@
 """The server: one port and one origin for the page, its data, the 3D scenes and Rerun's viewer."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

@@ -5,8 +5,6 @@ be known (against DNS rebinding), requests that can change something need the se
 the use of responses. If others can reach the server, requests must also be authenticated (``app/server/auth.py``).
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import re

@@ -4,8 +4,6 @@ The page has about fifty modules and no build step. So that browsers need not di
 time, the index lists all of them for preloading.
 """
 
-from __future__ import annotations
-
 import hashlib
 import mimetypes
 import posixpath

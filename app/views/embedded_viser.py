@@ -5,8 +5,6 @@ during construction, so that no port is opened, and connects it to Starlette Web
 It depends on viser's internals (the version is pinned); ``EmbeddedViser`` raises an error if they have changed.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Rerun's viewer and the 3D scene in a notebook."""
 
-from __future__ import annotations
-
 import io
 import os
 import tempfile

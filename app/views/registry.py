@@ -1,7 +1,5 @@
 """The open views of a server."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 

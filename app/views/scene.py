@@ -1,7 +1,5 @@
 """3D scene of one view: its viser server and the drawn run."""
 
-from __future__ import annotations
-
 import threading
 
 from beliefscope.app.protocol.messages import SceneLayers, Viewpoint

@@ -3,8 +3,6 @@
 Axes: x away from the robot, y to its left, z up, in m. Colors are those of the recordings (``recordings.schema``).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

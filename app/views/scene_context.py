@@ -1,7 +1,5 @@
 """Surroundings of the belief in the 3D scene: robot, floor map, camera, contact force."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from io import BytesIO
 from typing import Any

@@ -1,7 +1,5 @@
 """Scheduling of short computations for many clients on a few threads."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import threading

@@ -1,7 +1,5 @@
 """View: the cursor and 3D scene of one page, and the socket that connects them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

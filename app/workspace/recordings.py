@@ -4,8 +4,6 @@ Metadata is stored beside each file in ``.about/NAME.json``, and is valid as lon
 unchanged. Files without valid metadata are read one by one in the background.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import stat

@@ -1,7 +1,5 @@
 """Folders of studies: tables in ``study.json`` and the trained checkpoints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models of JSON responses: diagnosis."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from beliefscope.app.api.models.catalog import JobReply, Number, Reply, fields_of

@@ -1,7 +1,5 @@
 """Response models of sweeps."""
 
-from __future__ import annotations
-
 from beliefscope.app.api.models.catalog import Number, Reply
 
 

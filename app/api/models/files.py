@@ -1,7 +1,5 @@
 """Models of JSON responses: recordings and reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pydantic import ConfigDict, with_config

@@ -1,7 +1,5 @@
 """Models of JSON responses: traces, live runs and views."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 from beliefscope.app.api.models.catalog import Component, Reply, TaskInfo

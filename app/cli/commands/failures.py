@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 from beliefscope.datasets.errors import check_name
