@@ -9,15 +9,15 @@ from fastapi.responses import Response
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Progress
 from beliefscope.app.api.models.traces import TraceHeader
-from beliefscope.app.protocol.errors import InProgress
+from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
-from beliefscope.app.protocol.trace_format import displayed_sensors, sensor_pixels
 from beliefscope.app.runs import episode_list
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
 from beliefscope.datasets.faults.injection import Faults, fault_catalog
+from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
 
 TRACE_TIMEOUT = 0.25  # s that a request waits for a trace before it answers with the progress
 IN_PROGRESS: dict[int | str, dict[str, Any]] = {202: {"model": Progress}}
@@ -80,7 +80,10 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
     def trace_images(selection: RequestedRunOrComparison, request: Request, sensor: str = "") -> Response:
         run = finished_run(store, selection)
-        name = sensor or next((each["name"] for each in displayed_sensors(run.trace)), "")
+        names = [displayed["name"] for displayed in displayed_sensors(run.trace)]
+        name = sensor or next(iter(names), "")
+        if name not in names:
+            raise NotFound(f"Sensor {name!r} has no images. Available: {', '.join(names) or 'none'}.")
         pixels = sensor_pixels(run.trace, name)
         return _immutable(request, run, f"images {name}", pixels.tobytes)
 

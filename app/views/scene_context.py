@@ -11,7 +11,6 @@ from viser import ViserServer
 from viser.transforms import SO3
 
 from beliefscope.app.protocol.messages import SceneLayers
-from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.figures.force_arrow import MAX_RINGS, DrawnForce
@@ -19,6 +18,7 @@ from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
 from beliefscope.inspect.figures.scene_shapes import DISC, FAN, RGB, Array, framed, grid, map_pixels, movable_meshes
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.sensors import camera_images
 
 SMALL_LABEL: dict[str, Any] = {"font_screen_scale": 0.7, "depth_test": False}
 IMAGE_DISTANCE = 0.2  # of the way from the camera to its target
