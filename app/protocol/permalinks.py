@@ -36,6 +36,11 @@ def permalink(task: Task, filter_: str, data: str, episode: int, step: int, faul
     return "?" + urlencode(query, safe="*").replace("~", "%7E")
 
 
+def page_link(**state: str | int | None) -> str:
+    """The page's address with the parts of its state that are not empty."""
+    return "?" + urlencode({name: value for name, value in state.items() if value not in ("", None)})
+
+
 def comparison_permalink(link: str, event: Regression, filter_: str) -> str:
     """A permalink that adds a comparison run: the one of ``filter_``, which was better at this event.
 

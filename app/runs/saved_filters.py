@@ -53,7 +53,7 @@ def save_filter(store: TraceStore, new: SavedFilter) -> None:
         others = [replace(saved, default=saved.default and saved.task != new.task) for saved in others]
     path = Path(new.path)
     store.add_filter(new.task, new.name, load_checkpoint(path), path, first=new.default)
-    _write(store.settings.workspace, [new, *others])
+    write_record([new, *others], store.settings.workspace / FILE)
 
 
 def remove_filter(store: TraceStore, task: str, name: str) -> None:
@@ -61,7 +61,7 @@ def remove_filter(store: TraceStore, task: str, name: str) -> None:
     workspace = store.settings.workspace
     others = [saved for saved in _read(workspace) if (saved.task, saved.name) != (task, name)]
     store.remove_filter(task, name)
-    _write(workspace, others)
+    write_record(others, workspace / FILE)
 
 
 def _read(workspace: Path) -> list[SavedFilter]:
@@ -75,7 +75,3 @@ def _read(workspace: Path) -> list[SavedFilter]:
         raise BadInput(
             f"{str(path)!r} is damaged or was written by another version: move it away to start a new list"
         ) from None
-
-
-def _write(workspace: Path, filters: list[SavedFilter]) -> None:
-    write_record(filters, workspace / FILE)
