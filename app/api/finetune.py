@@ -18,13 +18,13 @@ from beliefscope.app.jobs.finetune import catalog_name
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.runs.training_data import simulated_episodes
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.finetuning.choices import choices
 from beliefscope.filters.finetuning.module_selection import select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.success import measures
+from beliefscope.filters.finetuning.training_data import simulated_episodes
 
 Action = Literal["promote", "save", "discard"]
 
@@ -49,7 +49,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         select_parameters(checkpoint.filter, tuning.train, tuning.freeze)
         tuning.check_fit(checkpoint.filter)
         data, episodes = store.dataset(task, data)
-        simulated_episodes(store.settings, data, episodes)
+        simulated_episodes(data, episodes, data not in store.settings.data)
         key = [filter, data, checkpoint.hash, episodes.hash, tuning.to_json(), store.settings.particles]
         id = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         run = runs.add(id, task, filter, data, tuning)
@@ -118,7 +118,7 @@ def _options(store: TraceStore, task: str, filter_: str, data: str) -> dict[str,
     name, episodes = store.dataset(task, data)
     titles = [{"name": key, "title": title} for key, title in measures(checkpoint.task).items()]
     try:
-        simulated = simulated_episodes(store.settings, name, episodes)
+        simulated = simulated_episodes(name, episodes, name not in store.settings.data)
     except BadInput as error:
         return options | {"why_not": options["why_not"] or str(error), "measures": titles, "simulated": 0}
     return options | {"measures": titles, "simulated": simulated}

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.points import extent_of, point_sensors, points_of
-from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.data import Trace
 
 
 def camera_images(trace: Trace) -> NDArray[np.uint8] | None:
