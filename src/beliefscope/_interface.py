@@ -19,7 +19,7 @@ from beliefscope.filters.evaluate import Metrics
 from beliefscope.filters.evaluate import evaluate as evaluate_filter
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
-from beliefscope.filters.finetuning.defaults import default_settings
+from beliefscope.filters.finetuning.defaults import settings_from
 from beliefscope.filters.finetuning.finetune import finetune as finetune_filter
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import parse_slices
@@ -261,11 +261,9 @@ def finetune(
     base = load_filter(filter_)
     if unknown := settings.keys() - FineTune.__dataclass_fields__.keys():
         raise unknown_name("setting of a fine-tuning", min(unknown), FineTune.__dataclass_fields__)
-    given = any((train, freeze, faults, slices))
-    mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices, faults, base.task))
     if isinstance(success := settings.get("success"), str):
         settings["success"] = Criterion.parse(success)
-    chosen = FineTune(train=tuple(train), freeze=tuple(freeze), mix=mix) if given else default_settings(base.filter)
+    chosen = settings_from(base, train, freeze, slices, faults)
     source = _episodes(data, base)
     episodes = list(source)
     tuned = finetune_filter(base, episodes, data_hash=source.hash, settings=replace(chosen, **settings))

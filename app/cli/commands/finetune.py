@@ -99,6 +99,7 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.filters.finetuning.defaults import settings_from
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -109,8 +110,9 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
+    settings = settings_from(base, train or (), freeze or (), slices or (), fault_sets or (), events or ())
     settings = replace(
-        _modules_and_data(base, train or (), freeze or (), slices or (), fault_sets or (), events or ()),
+        _changed(settings, clean_weight, steps, rates or ()),
         length=length,
         l2_sp=l2_sp,
         calibrate=calibrate,
@@ -118,11 +120,9 @@ def finetune(
         success=Criterion.parse(success) if success else None,
         seed=seed,
     )
-    settings = _changed(settings, clean_weight, steps, rates or ())
-    partial = output.with_name(f"{output.name}.partial")
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command, members = finetune_command(target, filter, data, settings), list(episodes)
-        source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": partial}
+        source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": _partial(output)}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source)
         tuned = _run(base, members, log, rerun, source)
@@ -132,6 +132,11 @@ def finetune(
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
+
+
+def _partial(output: Path) -> Path:
+    """File from which an interrupted run resumes."""
+    return output.with_name(f"{output.name}.partial")
 
 
 def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, rates: Sequence[str]) -> FineTune:
@@ -214,30 +219,6 @@ def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) ->
             progress=lambda share: update("Comparing", share, ""),
         )
     return judge(settings.success, comparison, base.task)
-
-
-def _modules_and_data(
-    base: Checkpoint,
-    train: Sequence[str],
-    freeze: Sequence[str],
-    slices: Sequence[str],
-    fault_sets: Sequence[str],
-    events: Sequence[str],
-) -> FineTune:
-    """Settings with these modules and data, or the default ones of the filter if none are given."""
-    from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.defaults import default_settings
-    from beliefscope.filters.finetuning.settings import FineTune, StepRange
-    from beliefscope.filters.finetuning.slices import parse_slices
-
-    if not isinstance(base, ExternalFilter) and not any((train, freeze, slices, fault_sets, events)):
-        return default_settings(base.filter)
-    return FineTune(
-        train=tuple(train),
-        freeze=tuple(freeze),
-        mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices, fault_sets, base.task)),
-        events=tuple(StepRange.parse(text) for text in events),
-    )
 
 
 def _summary(record: dict[str, Any]) -> list[str]:
