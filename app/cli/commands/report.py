@@ -61,7 +61,7 @@ def report(
     from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
     from beliefscope.recordings.report.folder import check_folder
-    from beliefscope.recordings.report.pdf import browser, print_page
+    from beliefscope.recordings.report.pdf import browser
 
     check_folder(output)
     chromium = browser() if pdf else None
@@ -93,8 +93,7 @@ def report(
             quantity=quantity,
             progress=lambda fraction: advance(0.6 * fraction),
         )
-        printer = None if chromium is None else lambda page, target: print_page(chromium, page, target)
-        document = write_report(content, output, printer, lambda fraction: advance(0.6 + 0.4 * fraction))
+        document = write_report(content, output, chromium, lambda fraction: advance(0.6 + 0.4 * fraction))
     lines = [f"{content.titles[name][0]}: {verdict}" for name, verdict in document["diagnostics"].items()]
     lines += [f"{title}: not available: {reason}" for title, reason in document["not_made"].items()]
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
