@@ -26,15 +26,15 @@ from beliefscope.app.api import (
     experiments,
     failures,
     finetune,
+    jobs as api_jobs,
     lineage,
     live,
     recordings,
     reports,
     studies,
     traces,
+    views as api_views,
 )
-from beliefscope.app.api import jobs as api_jobs
-from beliefscope.app.api import views as api_views
 from beliefscope.app.api.models.catalog import Error
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import InProgress, NameTaken, NotFound, QueueFull

@@ -1,7 +1,6 @@
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 
 
 @opt.with_options(
@@ -22,8 +21,7 @@ def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Resu
       beliefscope calibrate push --filter my_filter.py:build -o calibration.json --json -
     """
     from beliefscope.filters.calibration import save_calibration
-    from beliefscope.inspect.calibrate import calibrate as fit
-    from beliefscope.inspect.calibrate import check_level
+    from beliefscope.inspect.calibrate import calibrate as fit, check_level
     from beliefscope.inspect.traces.batch import trace_all
 
     checkpoint, faults = runs.open()

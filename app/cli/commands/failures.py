@@ -1,5 +1,4 @@
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import check_name
 from beliefscope.recordings.report.command_lines import serve_command
 
