@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     ),
     seeds=opt.option("K", "Train each filter with seeds 0 to K - 1.", parser=opt.integer(1)),
     data=opt.option("TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset."),
+    workers=opt.option("N", "Processes of this machine, each with one thread.", parser=opt.integer(1)),
 )
 def study(
     output: Path,
