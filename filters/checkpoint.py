@@ -31,8 +31,7 @@ from beliefscope.datasets.task_json import difference, task_to_json
 from beliefscope.filters.catalog import build
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
-from beliefscope.filters.names import PRETRAINED as PRETRAINED
-from beliefscope.filters.names import shipped as shipped
+from beliefscope.filters.names import PRETRAINED as PRETRAINED, shipped as shipped
 
 FORMAT = 1
 

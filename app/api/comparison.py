@@ -1,7 +1,5 @@
 """Route of the comparison of two runs."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import APIRouter, Query

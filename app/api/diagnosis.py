@@ -3,22 +3,20 @@
 The probable cause of a fault is preliminary from a trace and confirmed by a job; a job searches the smallest repair.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
-from beliefscope.app.api.jobs import result_or_job
+from beliefscope.app.api.jobs import key_over_episodes, result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob, SmallestRepair
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.inspect.diagnosis.diagnose import preliminary
@@ -41,7 +39,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         responses={202: {"model": DiagnosisJob | Progress}},
     )
     def get_diagnosis(selection: RequestedRun, over: Over = "episode") -> Response:
-        job = jobs.find("diagnosis", _key(store, _arguments(store, selection, over)))
+        job = jobs.find("diagnosis", key_over_episodes(store, _arguments(store, selection, over)))
         if path := jobs.finished_result(job):
             return FileResponse(path, media_type="application/json")
         first = preliminary_diagnosis(store, selection)
@@ -56,7 +54,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         scope = f"episode {selection.episode}" if over == "episode" else f"{len(episodes)} held-out episodes"
         title = ", ".join(filter(None, [f"Diagnosis of {selection.filter}", f"{selection.task} {scope}", faults]))
         link = _link(selection, arguments["data"], over)
-        return JobReply(job=jobs.submit("diagnosis", title, arguments, _key(store, arguments), link))
+        return JobReply(job=jobs.submit("diagnosis", title, arguments, key_over_episodes(store, arguments), link))
 
     @router.get(
         "/api/repair/{task}/{filter}/{episode}", response_model=SmallestRepair, responses={202: {"model": JobReply}}
@@ -80,9 +78,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
 def _link(selection: Selection, data: str, over: str) -> str:
     """The page's address that shows the result."""
-    query = {"task": selection.task, "filter": selection.filter, "data": data, "faults": str(selection.faults)}
-    shown = {"episode": selection.episode, "over": over, "tab": "diagnosis"}
-    return "?" + urlencode({name: value for name, value in query.items() if value} | shown)
+    run = {"task": selection.task, "filter": selection.filter, "data": data, "faults": str(selection.faults)}
+    return page_link(**run, episode=selection.episode, over=over, tab="diagnosis")
 
 
 def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> Any:
@@ -90,7 +87,9 @@ def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> 
 
     Raises BadInput without a healthy profile, and InProgress.
     """
-    path = jobs.finished_result(jobs.find("diagnosis", _key(store, _arguments(store, selection, "episode"))))
+    path = jobs.finished_result(
+        jobs.find("diagnosis", key_over_episodes(store, _arguments(store, selection, "episode")))
+    )
     return preliminary_diagnosis(store, selection) if path is None else json.loads(path.read_bytes())
 
 
@@ -117,10 +116,3 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
         "faults": str(selection.faults),
         "episodes": [selection.episode, *(held_out if over == "held-out" else ())],
     }
-
-
-def _key(store: TraceStore, arguments: dict[str, Any]) -> object:
-    """Everything the result depends on."""
-    task, filter_, data = names = [arguments[name] for name in ("task", "filter", "data")]
-    hashes = (store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash)
-    return names, arguments["faults"], arguments["episodes"], hashes, store.settings.seed, store.settings.particles

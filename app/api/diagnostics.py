@@ -1,7 +1,5 @@
 """Routes under ``/api/diagnostics``: diagnostics of one episode or of all held-out episodes; slow ones as jobs."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Mapping

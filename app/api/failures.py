@@ -1,22 +1,19 @@
 """Routes under ``/api/failures``: failure events of a filter over a data set, found by a job."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends
 from fastapi.responses import JSONResponse, Response
 
-from beliefscope.app.api.jobs import result_or_job
+from beliefscope.app.api.jobs import key_over_episodes, result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.results import Failures
 from beliefscope.app.api.traces import finished_run
 from beliefscope.app.jobs.failures import failure_document
 from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
@@ -53,7 +50,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def get_failures(request: RequestedSurvey) -> Response:
         if request.data.startswith(LIVE_PREFIX):
             return _live_failures(store, request)
-        return result_or_job(jobs, "failures", _key(store, _arguments(store, request)))
+        return result_or_job(jobs, "failures", key_over_episodes(store, _arguments(store, request)))
 
     @router.post("/api/failures/{task}/{filter}", status_code=202)
     def find_failures(request: RequestedSurvey) -> JobReply:
@@ -61,9 +58,9 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         count, faults = len(arguments["episodes"]), arguments["faults"]
         scope = f"all {count} episodes" if request.among == "all" else f"{count} held-out episodes"
         title = ", ".join(filter(None, [f"Failures of {request.filter}", f"{request.task} {scope}", faults]))
-        query = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults") if arguments[name]}
-        link = "?" + urlencode(query | {"tab": "failures"})
-        return JobReply(job=jobs.submit("failures", title, arguments, _key(store, arguments), link))
+        state = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults")}
+        link = page_link(**state, tab="failures")
+        return JobReply(job=jobs.submit("failures", title, arguments, key_over_episodes(store, arguments), link))
 
     return router
 
@@ -71,7 +68,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 def found_failures(store: TraceStore, jobs: Jobs, selection: Selection) -> Path | None:
     """The result of the search over the held-out episodes with the filter, data and faults of a run, if done."""
     request = SurveyRequest(selection.task, selection.filter, selection.data, faults=str(selection.faults))
-    return jobs.finished_result(jobs.find("failures", _key(store, _arguments(store, request))))
+    return jobs.finished_result(jobs.find("failures", key_over_episodes(store, _arguments(store, request))))
 
 
 def _live_failures(store: TraceStore, request: SurveyRequest) -> Response:
@@ -94,11 +91,3 @@ def _arguments(store: TraceStore, request: SurveyRequest) -> dict[str, Any]:
         "faults": str(faults),
         "episodes": data.held_out() if request.among == "held-out" else list(range(len(data))),
     }
-
-
-def _key(store: TraceStore, arguments: Mapping[str, Any]) -> object:
-    """Everything the result depends on; names occur in its links."""
-    task, filter_, data = names = [arguments[name] for name in ("task", "filter", "data")]
-    hashes = (store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash)
-    others = [arguments[name] for name in ("among", "faults", "episodes")]
-    return names, others, hashes, store.settings.seed, store.settings.particles

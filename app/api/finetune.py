@@ -1,7 +1,5 @@
 """Routes under ``/api/finetune`` and ``/api/tuned``: options, runs and their results."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import asdict
@@ -15,18 +13,18 @@ from fastapi.responses import JSONResponse
 from beliefscope.app.api.models.catalog import Progress
 from beliefscope.app.api.models.training import FineTuneDetails, FineTuneOffer, FineTuneRunInfo
 from beliefscope.app.api.traces import RequestedRun
-from beliefscope.app.api.weaknesses import Weakness, weaknesses
+from beliefscope.app.api.weaknesses import Weakness, weaknesses_of
 from beliefscope.app.jobs.finetune import catalog_name
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.runs.training_data import simulated_episodes
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.finetuning.choices import choices
 from beliefscope.filters.finetuning.module_selection import select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.success import measures
+from beliefscope.filters.finetuning.training_data import simulated_episodes
 
 Action = Literal["promote", "save", "discard"]
 
@@ -42,7 +40,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/weaknesses/{task}/{filter}/{episode}", responses={202: {"model": Progress}})
     def get_weaknesses(selection: RequestedRun) -> list[Weakness]:
-        return weaknesses(store, jobs, selection)
+        return weaknesses_of(store, jobs, selection)
 
     @router.post("/api/finetune/{task}/{filter}", status_code=202)
     def start(task: str, filter: str, settings: Annotated[dict[str, Any], Body()], data: str = "") -> FineTuneRunInfo:
@@ -51,7 +49,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         select_parameters(checkpoint.filter, tuning.train, tuning.freeze)
         tuning.check_fit(checkpoint.filter)
         data, episodes = store.dataset(task, data)
-        simulated_episodes(store.settings, data, episodes)
+        simulated_episodes(data, episodes, data not in store.settings.data)
         key = [filter, data, checkpoint.hash, episodes.hash, tuning.to_json(), store.settings.particles]
         id = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         run = runs.add(id, task, filter, data, tuning)
@@ -120,7 +118,7 @@ def _options(store: TraceStore, task: str, filter_: str, data: str) -> dict[str,
     name, episodes = store.dataset(task, data)
     titles = [{"name": key, "title": title} for key, title in measures(checkpoint.task).items()]
     try:
-        simulated = simulated_episodes(store.settings, name, episodes)
+        simulated = simulated_episodes(name, episodes, name not in store.settings.data)
     except BadInput as error:
         return options | {"why_not": options["why_not"] or str(error), "measures": titles, "simulated": 0}
     return options | {"measures": titles, "simulated": simulated}

@@ -1,14 +1,15 @@
 """Routes under ``/api/jobs``."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 from fastapi import APIRouter
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.protocol.errors import NotFound
+from beliefscope.app.runs.trace_store import TraceStore
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,14 @@ def routes(jobs: Jobs) -> APIRouter:
         return FileResponse(path, media_type="application/json")
 
     return router
+
+
+def key_over_episodes(store: TraceStore, arguments: Mapping[str, Any]) -> object:
+    """Everything that the result of a job over episodes of a data set depends on, given its arguments."""
+    task, filter_, data = (arguments[name] for name in ("task", "filter", "data"))
+    hashes = store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash
+    others = [value for name, value in arguments.items() if name != "settings"]  # names occur in links
+    return others, hashes, store.settings.seed, store.settings.particles
 
 
 def result_or_job(jobs: Jobs, kind: str, key: object) -> Response:

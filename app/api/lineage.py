@@ -1,7 +1,5 @@
 """Routes under ``/api/lineage``: which checkpoints were fine-tuned from which."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 import zipfile
@@ -11,8 +9,7 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from beliefscope import __version__
-from beliefscope.app.api.models.training import Lineage as LineageReply
-from beliefscope.app.api.models.training import LineageMember
+from beliefscope.app.api.models.training import Lineage as LineageReply, LineageMember
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns

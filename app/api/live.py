@@ -4,8 +4,6 @@ A page requests the steps it does not have and the next ones once it has drawn t
 Neither the filter nor the server buffers anything for a page.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time
@@ -20,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 from beliefscope.app.api.models.traces import LiveList
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import close_reason, describe_error
-from beliefscope.app.protocol.trace_format import camera_images, columns
+from beliefscope.app.protocol.trace_format import columns
 from beliefscope.app.runs.live_runs import LiveRuns, describe, resolve_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.paths import file_within
@@ -30,6 +28,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.external.load import UnavailableFilter
 from beliefscope.inspect.traces.live_run import LiveRun
+from beliefscope.inspect.traces.sensors import camera_images
 
 MAX_BLOCK = 1 << 22  # bytes of the run's file per message
 POLL_INTERVAL = 0.02  # s between checks of a file

@@ -1,7 +1,5 @@
 """Routes under ``/api/reports``: reports of runs, written by jobs and kept in the workspace."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Annotated
 
@@ -32,9 +30,8 @@ MAX_EVENTS, MAX_TITLE = 20, 200
 class ReportRequest(RequestBody):
     """Body of ``POST /api/reports/...``; the same options as ``beliefscope report``.
 
-    Attributes:
-        events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF.
-        quantity: of the maps; the other one if the filter does not have it.
+    events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF. quantity:
+    of the maps; the other one if the filter does not have it.
     """
 
     events: list[NonNegativeInt] = Field(default=[], max_length=MAX_EVENTS)

@@ -1,7 +1,5 @@
 """Routes under ``/api/studies``: results of studies, and training of their unfinished cells."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -159,12 +157,12 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
         if task not in files:
             raise BadInput(f"study {study.name!r} does not name the training data of {task}")
         path, data_hash = files[task]
-        names_ = {"task": task, "filter": filter_, "seed": int(seed.removeprefix("seed")), "preset": results.preset}
         given = results.given.get(filter_, "")
         if is_code(given):
             raise BadInput(f"filter {filter_!r} is code: continue with beliefscope study --filter {given}")
-        names_["given"] = given
-        cells.append(names_ | {"source": sources.get(task, task), "data": path, "data_hash": data_hash})
+        number, source = int(seed.removeprefix("seed")), sources.get(task, task)
+        cell_ = {"task": task, "filter": filter_, "seed": number, "preset": results.preset, "given": given}
+        cells.append(cell_ | {"source": source, "data": path, "data_hash": data_hash})
     return {"folder": str(study.folder.resolve()), "preset": results.preset, "cells": cells}
 
 

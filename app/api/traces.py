@@ -1,25 +1,23 @@
 """Routes of the health check, the catalog and traces."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Progress
 from beliefscope.app.api.models.traces import TraceHeader
-from beliefscope.app.protocol.errors import InProgress
+from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
-from beliefscope.app.protocol.trace_format import displayed_sensors, sensor_pixels
 from beliefscope.app.runs import episode_list
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
 from beliefscope.datasets.faults.injection import Faults, fault_catalog
+from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
 
 TRACE_TIMEOUT = 0.25  # s that a request waits for a trace before it answers with the progress
 IN_PROGRESS: dict[int | str, dict[str, Any]] = {202: {"model": Progress}}
@@ -72,7 +70,7 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         responses=IN_PROGRESS,
     )
     def trace_header(selection: RequestedRunOrComparison) -> Any:
-        return finished_run(store, selection).header() | {"filter": selection.filter}
+        return finished_run(store, selection).header | {"filter": selection.filter}
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns", response_class=Response, responses=IN_PROGRESS)
     def trace_columns(selection: RequestedRunOrComparison, request: Request) -> Response:
@@ -82,7 +80,10 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
     def trace_images(selection: RequestedRunOrComparison, request: Request, sensor: str = "") -> Response:
         run = finished_run(store, selection)
-        name = sensor or next((each["name"] for each in displayed_sensors(run.trace)), "")
+        names = [displayed["name"] for displayed in displayed_sensors(run.trace)]
+        name = sensor or next(iter(names), "")
+        if name not in names:
+            raise NotFound(f"Sensor {name!r} has no images. Available: {', '.join(names) or 'none'}.")
         pixels = sensor_pixels(run.trace, name)
         return _immutable(request, run, f"images {name}", pixels.tobytes)
 
@@ -98,11 +99,6 @@ def finished_run(store: TraceStore, selection: Selection) -> TracedRun:
     if not run.ready(TRACE_TIMEOUT):
         raise InProgress(run.progress)
     return run
-
-
-def in_progress(_: Request, error: Exception) -> Response:
-    """The response to a request that raises InProgress."""
-    return JSONResponse({"progress": error.args[0]}, 202)
 
 
 def _immutable(request: Request, run: TracedRun, part: str, content: Callable[[], bytes]) -> Response:

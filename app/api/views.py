@@ -1,7 +1,5 @@
 """Routes of views: the page's socket and its 3D scene."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Annotated
 

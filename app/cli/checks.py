@@ -4,8 +4,6 @@ Each check is a function of the ``Place`` where a server would run, and returns 
 has failed.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

@@ -41,8 +41,7 @@ def note(line: str) -> None:
 class Result:
     """What a command returns: it is printed as text, or as one JSON document with ``--json -``.
 
-    Attributes:
-        path: the written file; named before the text, and in the document with its size. code: exit code.
+    path: the written file; named before the text, and in the document with its size. code: exit code.
     """
 
     document: Mapping[str, Any]

@@ -4,8 +4,6 @@ Exit codes: 0 success, 1 failure, 2 invalid input; the last two print one line t
 modules only when they run, so that ``--help`` is fast.
 """
 
-from __future__ import annotations
-
 import io
 import sys
 from contextlib import suppress

@@ -93,8 +93,6 @@ DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5")
 CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors")
 TRACE = output_file("RUN.trace", "Output trace file.", ".trace")
 FIGURE = output_file("FIGURE", "Output figure: .svg, .pdf or .png.")
-ENGINE = option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]').")
-WORKERS = option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1))
 TRACE_FILTER = option(
     "NAME|CHECKPOINT",
     "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
@@ -153,6 +151,14 @@ OPTIONS: dict[str, Any] = {
     "freeze": option("PATTERN", "Freeze these modules: dotted names, * matches any text. Repeatable."),
     "workspace": option("DIR", "Workspace folder for recordings and traces; created if missing."),
     "log": option("DIR", "Folder for TensorBoard logs."),
+    "every": flag("Use all episodes, not only the held-out ones.", "--all"),
+    "by": option(
+        "SCORE",
+        "Score: error (position), the name of an angle, nees, ess (effective sample size), disagreement (of the "
+        "modalities) or regret (of the fusion weights).",
+    ),
+    "engine": option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]')."),
+    "workers": option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1)),
     "align": flag("Move data of another frame by the constant offset that explains the difference.", "--align"),
     "json": option("-", "Print one JSON document instead of text: --json -", callback=_check_json),
 }
@@ -239,6 +245,10 @@ class Runs:
         with open_dataset(self.data) as data:
             return data.task if data.task.name == self.task else self.task
 
+    def settings(self, faults: Faults) -> dict[str, Any]:
+        """Arguments that all functions that run a filter over episodes have."""
+        return {"faults": faults, "seed": self.seed, "particles": self.particles}
+
     def episodes(self, task: Task) -> Dataset:
         """The dataset."""
         return open_episodes(task, self.data, self.skip_bad)
@@ -319,57 +329,6 @@ def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Data
     for line in data.skipped:
         console.note(f"skipped: {line}")
     return data
-
-
-def open_trace(path: Path, task: str = "") -> Trace:
-    """Read a trace from a trace file, a recording or a live file. Raises BadInput if it is not of the task.
-
-    Args:
-        task: name or ``path/to/file.py:NAME``, with its functions; by default the definition in the file, without.
-    """
-    from beliefscope.inspect.trace import load_trace
-
-    return _open(_read_recording if path.suffix in (".rrd", ".live") else load_trace, path, task)
-
-
-def open_recording(path: Path, task: str = "") -> Trace:
-    """As ``open_trace``, only from a recording or a live file."""
-    return _open(_read_recording, path, task)
-
-
-def _open(read: Callable[[Path, Sequence[Task]], Trace], path: Path, name: str) -> Trace:
-    from beliefscope.datasets.catalog import load_task
-    from beliefscope.datasets.task_json import difference
-
-    given = [load_task(name)] if name else []
-    trace = read(path, given)
-    for task in given:
-        if other := difference(task, trace.task):
-            raise BadInput(f"{path} is of {other}, not of task {task.name!r}")
-    return trace
-
-
-def _read_recording(path: Path, given: Sequence[Task]) -> Trace:
-    """A separate process checks recordings first (Rerun may crash)."""
-    from beliefscope.inspect.traces.live_file import SUFFIX, load_live
-    from beliefscope.recordings.probe import RecordingProbe
-    from beliefscope.recordings.read import read_recording
-
-    if path.suffix == SUFFIX:
-        return load_live(path, given)
-    if path.is_file():
-        metadata = RecordingProbe()(path)
-        if metadata.problem and not metadata.application:
-            raise BadInput(f"{path}: {metadata.problem}")
-    return read_recording(path, given)
-
-
-def open_traces(paths: Sequence[Path], filter_: str, task: str = "") -> tuple[list[Trace], Checkpoint | None]:
-    """Read traces of one filter, and its checkpoint if available; see ``open_trace`` and ``checkpoint_of``."""
-    from beliefscope.inspect.traces.provenance import checkpoint_of
-
-    traces = [open_trace(path, task) for path in paths]
-    return traces, checkpoint_of(traces, paths, filter_)
 
 
 def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:

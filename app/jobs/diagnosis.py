@@ -1,7 +1,5 @@
 """Jobs that diagnose a filter over episodes of a data set, and search the smallest repair of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import closing
 from typing import Any

@@ -1,7 +1,5 @@
 """Job that computes a diagnostic over one or more episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import closing
 from typing import Any

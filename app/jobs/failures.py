@@ -1,7 +1,5 @@
 """Job that runs a filter over a data set and ranks its failure events by every score."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import closing
 from typing import Any

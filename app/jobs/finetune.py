@@ -1,7 +1,5 @@
 """Job that fine-tunes a checkpoint and compares the result with its base."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping
@@ -11,17 +9,17 @@ from typing import Any
 from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.runs.training_data import simulated_episodes, training_episodes
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from beliefscope.filters.engine import one_thread
-from beliefscope.filters.finetuning.finetune import finetune
+from beliefscope.filters.finetuning.finetune import Callbacks, finetune
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.report import curve_values, no_change
 from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.training_data import simulated_episodes, training_episodes
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
 from beliefscope.inspect.compare.progress_log import ProgressLog
 from beliefscope.inspect.compare.success import judge
@@ -45,12 +43,13 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     with closing(TraceStore(settings)) as store, one_thread():
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
-        share = _Shares(tuning, data, simulated_episodes(settings, data_name, data))
+        is_sample = data_name not in settings.data
+        share = _Shares(tuning, data, simulated_episodes(data_name, data, is_sample))
 
         def on_simulation(done: int, count: int) -> None:
             report(share("simulation", done / count), f"simulating training episode {done} of {count}")
 
-        episodes, data_hash = training_episodes(settings, data_name, data, on_simulation)
+        episodes, data_hash = training_episodes(data_name, data, is_sample, folder.parent, on_simulation)
         with log_curves(folder / "log") as write:
             log = ProgressLog(folder / "progress.json", tuning.steps, base.task.main_error)
 
@@ -68,9 +67,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 data_hash=data_hash,
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
-                report=on_step,
-                on_validation=on_validation,
-                on_resume=log.resume,
+                callbacks=Callbacks(on_step, on_validation, log.resume),
                 partial=folder / "finetuned.partial",
             )
             log.write()

@@ -4,8 +4,6 @@ A job is a function listed in ``KINDS``, with JSON arguments and a JSON result; 
 Its folder ``jobs/ID`` holds ``job.json``, ``log.txt`` and, once it is done, ``result.json``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging
@@ -52,6 +50,7 @@ LOG_TAIL = 8000  # bytes
 
 State = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 ACTIVE = ("waiting", "running")
+REASONS: dict[State, str] = {"cancelled": "cancelled", "interrupted": "the server stopped"}
 
 log = logging.getLogger("beliefscope.app")
 
@@ -94,9 +93,7 @@ RECORD = TypeAdapter(Job)
 class Jobs:
     """The jobs of one server, including ended ones of earlier servers. Thread-safe.
 
-    Args:
-        folder: of the job folders; created on first use.
-        kinds: see ``KINDS``. max_running, max_waiting: limits.
+    folder: of the job folders; created on first use. kinds: see ``KINDS``. max_running, max_waiting: limits.
     """
 
     def __init__(
@@ -116,7 +113,7 @@ class Jobs:
         self._jobs: dict[str, Job] = {}
         for job in sorted(_read_jobs(folder), key=lambda job: job.submitted):
             if job.active:
-                self._put(replace(job, state="interrupted", error="the server stopped"))
+                self._put(replace(job, state="interrupted", error=REASONS["interrupted"]))
             else:
                 self._jobs[job.id] = job
 
@@ -163,9 +160,8 @@ class Jobs:
     ) -> Job:
         """Queue a job, or return the existing one with the same kind and key if it is active or done.
 
-        Args:
-            arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
-            link: page address of the result. output_exists: False if files that the job wrote have been deleted.
+        arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
+        link: page address of the result. output_exists: False if files that the job wrote have been deleted.
 
         Raises BadInput for an unknown kind or a full disk, and QueueFull.
         """
@@ -205,7 +201,7 @@ class Jobs:
         with self._lock:
             job = self[id]
             if job.state == "waiting":
-                self._put(replace(job, state="cancelled", error="cancelled", ended=time.time()))
+                self._end(job, "cancelled")
             elif job.state == "running":
                 self._stop(id, "cancelled")
             else:
@@ -219,7 +215,7 @@ class Jobs:
             self._closing = True
             for job in self.all():
                 if job.state == "waiting":
-                    self._put(replace(job, state="interrupted", error="the server stopped", ended=time.time()))
+                    self._end(job, "interrupted")
             for id in self._processes:
                 self._stop(id, "interrupted")
         self._executor.shutdown()
@@ -233,6 +229,12 @@ class Jobs:
             self._save(job)
         except BadInput as error:  # a full disk or a deleted folder: only a later server misses the job
             log.warning("job %s cannot be saved: %s", job.id, error)
+
+    def _end(self, job: Job, state: State, error: str = "") -> Job:
+        """Save a job that has ended. The clock may have been set back."""
+        ended = max(time.time(), job.started or job.submitted)
+        self._put(replace(job, state=state, error=error or REASONS.get(state, ""), ended=ended))
+        return self._jobs[job.id]
 
     def _delete(self, id: str) -> None:
         del self._jobs[id]
@@ -249,24 +251,20 @@ class Jobs:
                 with (self._folder / id / "log.txt").open("wb") as output:
                     process = self._processes[id] = WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
             except OSError as error:  # deleted folder, or no memory or file descriptors left
-                message = f"it could not be started: {error.strerror or error}"
-                self._put(replace(job, state="failed", error=message, ended=max(time.time(), job.submitted)))
+                self._end(job, "failed", f"it could not be started: {error.strerror or error}")
                 return
             self._put(replace(job, state="running", message="starting", started=max(time.time(), job.submitted)))
             log.info("job started", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
         failure = self._call(id, process, arguments)
         with self._lock:
             del self._processes[id]
-            job = self._jobs[id]
-            job = replace(job, ended=max(time.time(), job.started or 0.0))
             stopped = self._stopping.pop(id, None)
             if not failure and self.result(id):
-                job = replace(job, state="done", progress=1.0, message="")
+                job = self._end(replace(self._jobs[id], progress=1.0, message=""), "done")
             elif stopped:
-                job = replace(job, state=stopped, error="cancelled" if stopped == "cancelled" else "the server stopped")
+                job = self._end(self._jobs[id], stopped)
             else:
-                job = replace(job, state="failed", error=failure or "its result was deleted")
-            self._put(job)
+                job = self._end(self._jobs[id], "failed", failure or "its result was deleted")
         seconds = round((job.ended or 0.0) - (job.started or 0.0), 1)
         event = {"job": id, "kind": job.kind, "state": job.state, "seconds": seconds, "error": job.error}
         log.log(logging.WARNING if job.state == "failed" else logging.INFO, "job ended", extra={"event": event})
@@ -331,7 +329,7 @@ def _is_other_process(pid: int) -> bool:
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 

@@ -1,7 +1,5 @@
 """Jobs of recordings: writing one with likelihood maps, and opening the run of one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Job that writes the report of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -14,7 +12,7 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
 from beliefscope.inspect.likelihood import missing_quantities
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
-from beliefscope.recordings.report.pdf import browser, print_page
+from beliefscope.recordings.report.pdf import browser
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -58,6 +56,5 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         folder = Path(arguments["folder"])
         folder.parent.mkdir(parents=True, exist_ok=True)
         chromium = browser() if options["pdf"] else None
-        to_pdf = None if chromium is None else lambda page, pdf: print_page(chromium, page, pdf)
-        document = write_report(composed, folder, to_pdf, lambda share: report(0.5 + 0.5 * share, "drawing figures"))
+        document = write_report(composed, folder, chromium, lambda share: report(0.5 + 0.5 * share, "drawing figures"))
         return {"folder": str(folder), "files": document["files"]}

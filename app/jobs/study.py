@@ -1,7 +1,5 @@
 """Job that trains and evaluates the unfinished cells of a study."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

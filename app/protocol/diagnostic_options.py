@@ -1,7 +1,5 @@
 """Options of diagnostics from query strings or a command line."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, get_type_hints
 

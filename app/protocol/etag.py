@@ -1,7 +1,5 @@
 """Responses with an ETag, for browser caches."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

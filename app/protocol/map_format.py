@@ -1,7 +1,5 @@
 """Binary encoding of likelihood maps (docs/api.md): statistics, particles and cells."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass, replace
@@ -45,8 +43,7 @@ NUMBERS = (
 class EncodedMaps:
     """Maps of one step, and their message except for the fields that depend on the cursor.
 
-    Attributes:
-        description: JSON header of the message without its first three entries. content: binary part.
+    description: JSON header of the message without its first three entries. content: binary part.
     """
 
     maps: LikelihoodMap
@@ -68,8 +65,7 @@ class EncodedMaps:
 def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> EncodedMaps:
     """Encode maps: float32 particles, then the layers as uint16.
 
-    Args:
-        index: of the maps' step in the trace, which may be part of a run.
+    index: of the maps' step in the trace, which may be part of a run.
     """
     effector = trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantise(maps.log_likelihood)
@@ -121,8 +117,7 @@ def _axis_json(task: Task, index: int, offsets: NDArray[np.float32]) -> dict[str
 def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
     """Layers (L, R, S) of log-likelihood as q, with ``log = log_max + log_range * (q / 65535 - 1)``.
 
-    Returns:
-        q (L, R, S), log_max (L,), log_range (L,) at most ``LOG_RANGE``: there q = 0 stands for all lower values.
+    Returns q (L, R, S), log_max (L,), log_range (L,) at most ``LOG_RANGE``: there q = 0 stands for all lower values.
     """
     top = log.max(axis=(1, 2), keepdims=True)
     span = np.clip(top - log.min(axis=(1, 2), keepdims=True), 1e-6, LOG_RANGE)

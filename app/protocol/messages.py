@@ -1,9 +1,7 @@
 """Messages from the page over the socket of a view, as validated models (docs/api.md)."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Protocol, get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, ValidationError
 
@@ -121,14 +119,11 @@ def parse_view_message(message: Mapping[str, Any]) -> ViewMessage:
         raise BadInput(f"{type_}.{describe_error(error)}.") from None
 
 
-class _HasErrors(Protocol):
-    """pydantic's ValidationError, or FastAPI's RequestValidationError."""
+def describe_error(error: Any) -> str:
+    """The first error of a failed validation, in one line: ``cursor.size: Input should be 41 or 135``.
 
-    def errors(self) -> Sequence[Any]: ...
-
-
-def describe_error(error: _HasErrors) -> str:
-    """The first error of a failed validation, in one line: ``cursor.size: Input should be 41 or 135``."""
+    error: pydantic's ValidationError, or FastAPI's RequestValidationError.
+    """
     first = error.errors()[0]
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     location = ".".join(str(part) for part in first["loc"])

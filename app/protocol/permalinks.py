@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 def permalink(task: Task, filter_: str, data: str, episode: int, step: int, faults: str = "", by: str = "error") -> str:
     """``?task=...&step=...``, identical to the address that the page itself shows.
 
-    Args:
-        filter_, data: names on the page. by: the score that ranks the page's failures; it also selects the track of
-            the timeline, the component or the kind of weights.
+    filter_, data: names on the page. by: the score that ranks the page's failures; it also selects the track of the
+    timeline, the component or the kind of weights.
     """
     query: dict[str, str | int] = {
         "task": task.name,
@@ -35,6 +34,11 @@ def permalink(task: Task, filter_: str, data: str, episode: int, step: int, faul
         query["by"] = by
     # Browsers' URLSearchParams do not encode the star and encode the tilde.
     return "?" + urlencode(query, safe="*").replace("~", "%7E")
+
+
+def page_link(**state: str | int | None) -> str:
+    """The page's address with the parts of its state that are not empty."""
+    return "?" + urlencode({name: value for name, value in state.items() if value not in ("", None)})
 
 
 def comparison_permalink(link: str, event: Regression, filter_: str) -> str:

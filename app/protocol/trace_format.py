@@ -1,33 +1,25 @@
 """Traces as the page reads them: a JSON header and little-endian float32 columns (docs/api.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
-from beliefscope.datasets.episode import is_image
-from beliefscope.datasets.points import extent_of, point_sensors, points_of
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import virtual_innovations
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.sensors import camera_images, displayed_sensors
 
 SENSORS = ("effector_position", "force")
 
 
 def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
-    """The trace's time series.
-
-    Returns:
-        Descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and the float32 buffer they refer to.
-    """
+    """The trace's time series: descriptions ``{"name", "shape", "offset"}``, offset in bytes, and a float32 buffer."""
     innovation, groups = virtual_innovations(trace), measures.shaded_groups(trace)
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {
@@ -70,58 +62,6 @@ def _faulty(trace: Trace) -> NDArray[np.bool_] | None:
     return faulty if faulty.any() and not faulty.all() else None
 
 
-def camera_images(trace: Trace) -> NDArray[np.uint8] | None:
-    """(T, H, W) or (T, H, W, 3) the first image observation, as the filter received it; None if there is none."""
-    return next((readings for readings in trace.episode.observations.values() if is_image(readings)), None)
-
-
-def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
-    """Sensors that the page draws: images first, then arrays of numbers with two axes, scans and point clouds.
-
-    ``low`` and ``high`` are the range of an array's values in the run, from the first to the last colour; None for
-    images. Of scans and point clouds, ``points`` is the number of points per step and ``high`` the extent in m: 99 % of
-    the points are in the square of twice this side around the sensor.
-    """
-    observations = trace.episode.observations
-    images = [key for key, readings in observations.items() if is_image(readings)]
-    clouds = [key for key in point_sensors(trace.task) if key in observations]
-    arrays = [key for key, values in observations.items() if values.ndim == 3 and key not in (*images, *clouds)]
-    sensors = []
-    for key in images + arrays:
-        height, width, *channels = observations[key].shape[1:]
-        low = high = None
-        if key in arrays and len(trace):
-            low, high = float(observations[key].min()), float(observations[key].max())
-        sensor = {"name": key, "height": height, "width": width, "channels": channels[0] if channels else 1}
-        sensors.append(sensor | {"low": low, "high": high, "points": 0})
-    for key in clouds:
-        points = points_of(trace.task, key, observations[key])
-        size = {"height": 1, "width": 1, "channels": 1, "points": points.shape[1]}
-        sensors.append({"name": key, **size, "low": 0.0, "high": extent_of(points)})
-    return sensors
-
-
-def sensor_pixels(trace: Trace, key: str) -> NDArray[np.uint8] | NDArray[np.float32]:
-    """A sensor of ``displayed_sensors``: (T, H, W) or (T, H, W, 3) uint8, arrays of numbers scaled to 0..255.
-
-    Of scans and point clouds, (T, P, 2) float32, in m: x and y in the frame of the sensor, NaN for absent points.
-    """
-    sensor = next((s for s in displayed_sensors(trace) if s["name"] == key), None)
-    if sensor is None:
-        raise NotFound(f"Sensor {key!r} has no images. Available: {_names(trace)}.")
-    readings = trace.episode.observations[key]
-    if sensor["points"]:
-        return points_of(trace.task, key, readings)[..., :2]
-    if sensor["low"] is None:
-        return np.asarray(readings, np.uint8)
-    span = max(sensor["high"] - sensor["low"], 1e-12)
-    return np.rint(255.0 * (readings - sensor["low"]) / span).astype(np.uint8)
-
-
-def _names(trace: Trace) -> str:
-    return ", ".join(sensor["name"] for sensor in displayed_sensors(trace)) or "none"
-
-
 def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLayer]:
     """The layers that the 3D scene of a trace has."""
     on_floor = task.floor is not None
@@ -145,10 +85,9 @@ def header(
     no_maps: str | None,
     missing: Mapping[Quantity, str],
 ) -> dict[str, Any]:
-    """Metadata of a trace, as in ``responses.TraceHeader``.
+    """Metadata of a trace, as in ``api.models.traces.TraceHeader``.
 
-    Args:
-        no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
+    no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
     """
     components = [component_json(c) for c in task.components]
     return {

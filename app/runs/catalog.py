@@ -1,7 +1,5 @@
 """Catalog of filters and data sets by task: the user's own first, then the included ones."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -44,8 +42,7 @@ DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 class TaskCatalog:
     """Filters and data sets of one task by name. The included ones are loaded on first use.
 
-    Attributes:
-        paths: filter -> checkpoint file; external filters have none.
+    paths: filter -> checkpoint file; external filters have none.
     """
 
     task: Task
@@ -151,10 +148,8 @@ def task_catalogs(
 ) -> tuple[dict[str, TaskCatalog], list[str]]:
     """Catalogs of all tasks, those with filters or data of the user first; and one line for each unusable input.
 
-    Args:
-        checkpoints: displayed name -> checkpoint file, or a loaded filter.
-        data: displayed name -> file or folder of episodes.
-        tasks: user-defined tasks, as for ``stored_task``.
+    checkpoints: displayed name -> checkpoint file, or a loaded filter. data: displayed name -> file or folder of
+    episodes. tasks: user-defined tasks, as for ``stored_task``.
     """
     catalogs: dict[str, TaskCatalog] = {}
     problems: list[str] = []
@@ -196,8 +191,7 @@ def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, source: str) -> Ta
 def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[str, Path]:
     """A unique name for each file or folder: its stem, preceded by as many parent folders as necessary.
 
-    Args:
-        reserved: names that are already in use.
+    reserved: names that are already in use.
     """
     parts = {path: _name_parts(path) for path in {path.resolve(): path for path in paths}.values()}
 

@@ -1,7 +1,5 @@
 """Parts of the list of episodes of a data set: by position, and by words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

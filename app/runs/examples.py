@@ -1,7 +1,5 @@
 """Examples that the page offers: runs that show one thing each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from urllib.parse import parse_qs
@@ -19,14 +17,11 @@ class Example:
 
     @property
     def task(self) -> str:
-        return self._value("task")
+        return parse_qs(self.link[1:])["task"][0]
 
     @property
     def filter(self) -> str:
-        return self._value("filter")
-
-    def _value(self, key: str) -> str:
-        return parse_qs(self.link.removeprefix("?"))[key][0]
+        return parse_qs(self.link[1:])["filter"][0]
 
 
 EXAMPLES = (

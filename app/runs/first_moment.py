@@ -1,14 +1,11 @@
 """Episode and step at which the page opens a data set."""
 
-from __future__ import annotations
-
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode, is_image
+from beliefscope.datasets.episode import Episode, is_image, lost_images
 
 BEFORE, DURING = 3, 5
 """Steps of the first contact with images before the outage, and in it."""
@@ -43,16 +40,11 @@ def _search(data: Dataset) -> tuple[int, int]:
 
 def outage_in_first_contact(episode: Episode) -> int | None:
     """Last step with an image before an outage that begins in the first contact, or None."""
-    contact, black = episode.contact.astype(bool), _black(episode)
+    contact = episode.contact.astype(bool)
+    black = np.any([lost_images(images) for images in episode.observations.values() if is_image(images)], axis=0)
     first = int(contact.argmax())
     last = first + int(np.append(~contact[first:], True).argmax())  # first step after the contact
     begin = first + int(np.append(black[first:last], True).argmax())
     if begin - first < BEFORE or last - begin < DURING or not black[begin : begin + DURING].all():
         return None
     return begin - 1
-
-
-def _black(episode: Episode) -> NDArray[np.bool_]:
-    """(T,): whether all pixels of an image are zero."""
-    images = [values.reshape(len(values), -1) for values in episode.observations.values() if is_image(values)]
-    return np.any([values.max(axis=1) == 0 for values in images], axis=0)

@@ -3,8 +3,6 @@
 A run is the only episode of the data set ``live:NAME``. The filter and its viewers communicate through the file alone.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -53,16 +51,13 @@ class GrowingRun(TracedRun):
         return self._run.reader.part(first, last)
 
     @cached_property
-    def _complete(self) -> Trace:
+    def trace(self) -> Trace:
+        """All steps in one trace."""
         return self._part(0, self._steps)
 
     def ready(self, timeout: float) -> bool:
         """Whether there is a step."""
         return self._steps > 0
-
-    def result(self, timeout: float | None = None) -> Trace:
-        """All steps in one trace."""
-        return self._complete
 
     def __len__(self) -> int:
         return self._steps
@@ -78,6 +73,7 @@ class GrowingRun(TracedRun):
         """Compute the map from this step alone, without encoding the images of all earlier steps."""
         return replace(compute_map(MapEngine(self.checkpoint, self.at(step)[0]), 0, size, options), step=step)
 
+    @property
     def header(self) -> dict[str, Any]:
         """Description of the run for the page. Each block of steps describes its own columns."""
         missing = missing_quantities(self.checkpoint, self._last)
@@ -132,8 +128,7 @@ class LiveRuns:
     def traced_run(self, selection: Selection, filters: Mapping[str, Checkpoint]) -> TracedRun | None:
         """The live run, or None if the selection applies another filter, faults or an intervention to its episode.
 
-        Raises:
-            BadInput: the run does not exist or belongs to another task or episode.
+        Raises BadInput if the run does not exist or belongs to another task or episode.
         """
         run = self[selection.data.removeprefix(LIVE_PREFIX)]
         name, checkpoint = resolve_filter(run, filters)

@@ -1,7 +1,5 @@
 """Fine-tuned filters that are saved in a workspace and listed by its servers."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,15 +46,14 @@ def with_saved_filters(settings: Settings) -> Settings:
 def save_filter(store: TraceStore, new: SavedFilter) -> None:
     """Add a filter to the catalog and to the list. A default replaces the previous default of its task.
 
-    Raises:
-        BadInput: the checkpoint or the list cannot be read.
+    Raises BadInput if the checkpoint or the list cannot be read.
     """
     others = [saved for saved in _read(store.settings.workspace) if (saved.task, saved.name) != (new.task, new.name)]
     if new.default:
         others = [replace(saved, default=saved.default and saved.task != new.task) for saved in others]
     path = Path(new.path)
     store.add_filter(new.task, new.name, load_checkpoint(path), path, first=new.default)
-    _write(store.settings.workspace, [new, *others])
+    write_record([new, *others], store.settings.workspace / FILE)
 
 
 def remove_filter(store: TraceStore, task: str, name: str) -> None:
@@ -64,7 +61,7 @@ def remove_filter(store: TraceStore, task: str, name: str) -> None:
     workspace = store.settings.workspace
     others = [saved for saved in _read(workspace) if (saved.task, saved.name) != (task, name)]
     store.remove_filter(task, name)
-    _write(workspace, others)
+    write_record(others, workspace / FILE)
 
 
 def _read(workspace: Path) -> list[SavedFilter]:
@@ -78,7 +75,3 @@ def _read(workspace: Path) -> list[SavedFilter]:
         raise BadInput(
             f"{str(path)!r} is damaged or was written by another version: move it away to start a new list"
         ) from None
-
-
-def _write(workspace: Path, filters: list[SavedFilter]) -> None:
-    write_record(filters, workspace / FILE)

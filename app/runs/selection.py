@@ -19,13 +19,8 @@ FILE_STEM_LENGTH = 150  # characters of task and filter in a file name
 class Selection:
     """One filter run.
 
-    Attributes:
-        task, filter: names.
-        episode: index in the data set.
-        faults: injected sensor faults.
-        data: name of the data set; empty for the first data set of the task.
-        edit: intervention on some steps of the run.
-        only: the only modality that a standalone run uses; empty for all modalities.
+    data: name of the data set; empty for the first data set of the task. edit: intervention on some steps of the run.
+    only: the only modality that a standalone run uses; empty for all modalities.
     """
 
     task: str

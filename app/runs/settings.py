@@ -24,8 +24,6 @@ class Settings:
         checkpoints: displayed name -> checkpoint file or external filter; listed before the pretrained filters, of
             which it replaces those with the same name.
         hosts: additional host names that the server answers to.
-        particles: number of particles of particle filters.
-        seed: seed of the filters.
         views: maximum number of pages open at a time.
         tasks: user-defined tasks, as accepted by ``load_task``.
         studies, sweeps: displayed name -> folder of a study or of a sweep.

@@ -1,7 +1,5 @@
 """The traces of a server, each computed once on first request; and the catalog of filters and data sets."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import threading
@@ -119,9 +117,7 @@ class TraceStore:
     def request(self, selection: Selection) -> TracedRun:
         """The selected run; its computation is started if necessary.
 
-        Raises:
-            BadInput: part of the selection does not exist.
-            QueueFull: too many runs are waiting.
+        Raises BadInput if part of the selection does not exist, and QueueFull if too many runs are waiting.
         """
         if (live_run := self._live_run(selection)) is not None:
             return live_run

@@ -30,13 +30,11 @@ class RunRequest:
     """A filter run in terms of files, so that another process can carry it out.
 
     Attributes:
-        selection: the run.
         task: definition, as JSON text.
         checkpoint: checkpoint file, or the source of an external filter. external: whether it is the latter.
         data: file or folder of episodes, or the file of a live run.
         original: trace file of the run without intervention.
         output: trace file of the run.
-        seed, particles: settings of the filter.
     """
 
     selection: Selection

@@ -1,12 +1,9 @@
 """A filter run that is being computed or complete, and the values derived from its trace."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as FutureTimeout
+from concurrent.futures import Future, TimeoutError as FutureTimeout
 from functools import cached_property
 from typing import Any
 
@@ -30,7 +27,6 @@ class TracedRun:
 
     Attributes:
         key: hash of everything the trace depends on: checkpoint, episode, seed, particles, faults, intervention.
-        checkpoint: the filter.
         future: the trace, or the error that ended its computation.
         progress: completed fraction, 0..1.
         scene_key: identifies what a 3D scene draws; equal for all states of a live run.
@@ -52,10 +48,6 @@ class TracedRun:
         self._cache: OrderedDict[tuple[int, int, MapOptions], EncodedMaps] = OrderedDict()
         self._cache_bytes = 0
 
-    def result(self, timeout: float | None = None) -> Trace:
-        """Wait for the trace. Raises the error of its computation, or TimeoutError of ``concurrent.futures``."""
-        return self.future.result(timeout)
-
     def ready(self, timeout: float) -> bool:
         """Whether the trace is complete within ``timeout`` s. Raises the error of its computation."""
         try:
@@ -66,8 +58,8 @@ class TracedRun:
 
     @property
     def trace(self) -> Trace:
-        """The trace; waits until it is complete."""
-        return self.result()
+        """The trace; waits until it is complete. Raises the error of its computation."""
+        return self.future.result()
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -83,15 +75,13 @@ class TracedRun:
         return no_maps(self.checkpoint, self.trace)
 
     @cached_property
-    def data_warning(self) -> str | None:
-        """How the episode differs from the filter's training data, in one line; None if it does not."""
-        return data_warning(self.checkpoint, [self.trace.episode], self.trace.faults)
-
     def header(self) -> dict[str, Any]:
         """Description of the trace for the page."""
-        missing = missing_quantities(self.checkpoint, self.trace)
-        description = header(self.trace, self.columns[0], self.checkpoint.task, self.no_maps, missing)
-        return description | {"data_warning": self.data_warning, "no_diagnosis": no_diagnosis(self.checkpoint)}
+        checkpoint, trace = self.checkpoint, self.trace
+        missing = missing_quantities(checkpoint, trace)
+        description = header(trace, self.columns[0], checkpoint.task, self.no_maps, missing)
+        warning = data_warning(checkpoint, [trace.episode], trace.faults)
+        return description | {"data_warning": warning, "no_diagnosis": no_diagnosis(checkpoint)}
 
     @cached_property
     def columns(self) -> tuple[list[dict[str, Any]], bytes]:

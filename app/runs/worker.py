@@ -6,8 +6,6 @@ Standard input carries calls of functions of the module, one JSON array a line; 
 outcome. Printed text goes to standard error.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -57,10 +55,8 @@ class WorkerProcess(subprocess.Popen[str]):
     def call(self, function: str, arguments: Mapping[str, Any], report: Report) -> Any:
         """Run a function and return its result. Call it from one thread at a time.
 
-        Raises:
-            BadInput: raised by the function.
-            WorkerDied: the process ended; the message describes how.
-            RuntimeError: any other error of the function.
+        Raises BadInput if the function does, RuntimeError for any other error of it, and WorkerDied if the
+        process ended; it describes how.
         """
         assert self.stdin is not None
         assert self.stdout is not None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from functools import lru_cache, wraps
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.catalog import TaskCatalog
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import read_faults
-from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.events import find_failures
 from beliefscope.inspect.figures.top_view import draw_step
 from beliefscope.inspect.likelihood import COARSE, MapEngine, no_maps
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.summaries import phase_summaries, step_values
 from beliefscope.inspect.trace import Trace, trace
 
 if TYPE_CHECKING:
@@ -34,9 +34,6 @@ MOST_EPISODES = 20
 """Episodes of one question; an answer must not take minutes."""
 
 MOST_EVENTS = 50
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 class Assistant:
@@ -72,21 +69,14 @@ class Assistant:
         except BadInput as reason:
             diagnosis = {"state": "unknown", "headline": str(reason)}
         main, error = run.task.main_error, measures.main_error(run)
-        phases = {
-            name: {
-                "steps": int(mask.sum()),
-                f"rmse_{main.key}": self._by_layer(run, np.sqrt(np.mean(main.factor**2 * error[mask] ** 2, axis=0))),
-                "nees": self._by_layer(run, measures.nees(run)[mask].mean(0)),
-                "effective_weights": self._weights(run, mask),
-            }
-            for name, mask in measures.phases(run).items()
-            if mask.any()
-        }
         worst = np.argsort(-np.nan_to_num(error[:, -1]))[:3].tolist()
-        moments = [{"step": step, main.key: main.factor * error[step, -1]} for step in worst]
-        for moment in moments:
-            moment["link"] = self._link(run, filter, data, moment["step"])
-        return as_json({"run": repr(run), "diagnosis": diagnosis, "phases": phases, "worst_moments": moments})
+        moments = [
+            {"step": step, main.key: main.factor * error[step, -1], "link": self._link(run, filter, data, step)}
+            for step in worst
+        ]
+        return as_json(
+            {"run": repr(run), "diagnosis": diagnosis, "phases": phase_summaries(run), "worst_moments": moments}
+        )
 
     def values(
         self, task: str, filter: str, episode: int, step: int, data: str = "", faults: str = ""
@@ -94,25 +84,7 @@ class Assistant:
         """All estimates with standard deviations, truth, errors and weights at one step, in units for display."""
         run = self._trace(task, filter, episode, data, faults)
         self._check_step(run, step)
-        _, factors = measures.display_units(run.task)
-        means = factors * measures.means(run)[step]
-        std = factors * np.sqrt(np.diagonal(measures.covariances(run)[step], axis1=-2, axis2=-1))
-        names = [component.key for component in run.task.components]
-        layers = {
-            layer: {"estimate": dict(zip(names, means[i], strict=True)), "sigma": dict(zip(names, std[i], strict=True))}
-            for i, layer in enumerate(measures.layers(run))
-        }
-        mask = np.arange(len(run)) == step
-        return as_json(
-            {
-                "truth": dict(zip(names, factors * run.episode.states[step], strict=True)),
-                "estimates": layers,
-                "effective_weights": self._weights(run, mask),
-                "groups": [name for name, group in measures.shaded_groups(run).items() if group[step]],
-                "blackout": bool(measures.blackout(run)[step]),
-                "link": self._link(run, filter, data, step),
-            }
-        )
+        return as_json(step_values(run, step) | {"link": self._link(run, filter, data, step)})
 
     def diagnose(
         self, task: str, filter: str, data: str = "", faults: str = "", episodes: list[int] | None = None
@@ -168,23 +140,12 @@ class Assistant:
 
     def _run(self, task: str, filter_: str, episode: int, data: str, faults: str) -> Trace:
         catalog = self._catalog(task)
-        checkpoint: Checkpoint = catalog.filter(filter_)
-        injected = read_faults(faults, catalog.task)
-        source = catalog.episode(data, episode)
-        return trace(checkpoint, source, episode, self._seed, self._particles, injected)
+        checkpoint, injected = catalog.filter(filter_), read_faults(faults, catalog.task)
+        return trace(checkpoint, catalog.episode(data, episode), episode, self._seed, self._particles, injected)
 
     def _check_step(self, run: Trace, step: int) -> None:
         if not 0 <= step < len(run):
             raise BadInput(f"step {step} does not exist. Available: 0 to {len(run) - 1}.")
-
-    def _by_layer(self, run: Trace, values: measures.Array) -> dict[str, float]:
-        return {measures.layer_label(name): float(v) for name, v in zip(measures.layers(run), values, strict=True)}
-
-    def _weights(self, run: Trace, mask: measures.Mask) -> dict[str, float] | None:
-        if run.effective_weights is None:
-            return None
-        weights = run.effective_weights[mask].mean(axis=(0, 2))
-        return dict(zip(run.modalities, map(float, weights), strict=True))
 
     def _link(self, run: Trace, filter_: str, data: str, step: int) -> str:
         name = data or next(iter(self._catalogs[run.task.name].data))
@@ -200,13 +161,13 @@ def build_server(assistant: Assistant) -> MCPServer:
     except ImportError:
         raise BadInput("beliefscope mcp needs the package mcp: pip install 'beliefscope[mcp]'") from None
 
-    def explained(question: Callable[P, R]) -> Callable[P, R]:
+    def explained(question: Callable[..., Any]) -> Callable[..., Any]:
         """The question, with the message of a BadInput as its answer; other exceptions are hidden from the client."""
 
         @wraps(question)
-        def ask(*args: P.args, **kwargs: P.kwargs) -> R:
+        def ask(**arguments: Any) -> Any:
             try:
-                return question(*args, **kwargs)
+                return question(**arguments)
             except BadInput as error:
                 raise ToolError(str(error)) from None
 

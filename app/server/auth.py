@@ -5,8 +5,6 @@ A script sends the token in the header ``Authorization: Bearer TOKEN`` of each r
 token, which thus appears in no bookmark or Referer. The cookie is valid until the server stops.
 """
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import secrets
@@ -32,11 +30,7 @@ EVERYWHERE = frozenset({"0.0.0.0", "::"})
 
 @dataclass(frozen=True)
 class Access:
-    """Access to a server.
-
-    Attributes:
-        token: required of all clients; empty for none. read_only: whether changes are refused.
-    """
+    """Access to a server. token: required of all clients; empty for none. read_only: whether changes are refused."""
 
     token: str = field(default="", repr=False)
     read_only: bool = False
@@ -82,11 +76,7 @@ class TooManyAttempts(Exception):
 
 
 class SignIn:
-    """Checks tokens and cookies.
-
-    Args:
-        token: not empty. clock: in s, monotonic.
-    """
+    """Checks tokens and cookies. token: not empty. clock: in s, monotonic."""
 
     def __init__(self, token: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._token = token.encode()

@@ -4,8 +4,6 @@
 requests and failed jobs, ``error`` for server errors, with an id that the response contains, too.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re
@@ -25,8 +23,7 @@ REFUSALS = ("refused: ", "Invalid HTTP request", "Unsupported upgrade")
 class LineFormatter(logging.Formatter):
     """Formats one line per event.
 
-    Args:
-        json_lines: JSON objects ``{"time", "level", "event", ...}`` instead of text. secret: replaced by ``...``.
+    json_lines: JSON objects ``{"time", "level", "event", ...}`` instead of text. secret: replaced by ``...``.
     """
 
     def __init__(self, json_lines: bool, secret: str = "") -> None:

@@ -1,7 +1,5 @@
 """The server: one port and one origin for the page, its data, the 3D scenes and Rerun's viewer."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -28,15 +26,15 @@ from beliefscope.app.api import (
     experiments,
     failures,
     finetune,
+    jobs as api_jobs,
     lineage,
     live,
     recordings,
     reports,
     studies,
     traces,
+    views as api_views,
 )
-from beliefscope.app.api import jobs as api_jobs
-from beliefscope.app.api import views as api_views
 from beliefscope.app.api.models.catalog import Error
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import InProgress, NameTaken, NotFound, QueueFull
@@ -62,16 +60,16 @@ from beliefscope.recordings.web_viewer import WebViewer, installed
 __all__ = ["Settings", "create_app", "serve"]
 
 PAGE = Path(__file__).parents[1] / "page"
+ERRORS: tuple[type[Exception], ...] = (InProgress, BadInput, RequestValidationError, HTTPException, OSError)
+STATUS: dict[type[Exception], int] = {QueueFull: 429, NotFound: 404, NameTaken: 409}
 log = logging.getLogger("beliefscope.app")
 
 
 def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, access: Access = OPEN) -> FastAPI:
     """The application. Its threads start and end with its lifespan.
 
-    Args:
-        warm: prepare the first page's trace and Rerun's viewer in the background at startup.
-        subprocess: run filters in a subprocess instead of a thread.
-        access: required token and permissions.
+    warm: prepare the first page's trace and Rerun's viewer in the background at startup. subprocess: run filters in a
+    subprocess instead of a thread. access: required token and permissions.
     """
     with contextlib.suppress(FileExistsError):  # reported by the code that needs the folder
         settings.workspace.mkdir(mode=0o700, parents=True)
@@ -129,12 +127,8 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         app.include_router(router)
     _add_files(app, viewer)
     app.add_middleware(Guard, hosts=settings.hosts, access=access)
-    for error, status in ((BadInput, 400), (QueueFull, 429), (NotFound, 404), (NameTaken, 409)):
-        app.add_exception_handler(error, _error_handler(status))
-    app.add_exception_handler(InProgress, traces.in_progress)
-    app.add_exception_handler(RequestValidationError, _validation_error)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(OSError, _file_error)
+    for error in ERRORS:
+        app.add_exception_handler(error, _error_response)
     return app
 
 
@@ -258,27 +252,22 @@ def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> No
                 log.warning("not prepared in advance: %s", error)
 
 
-def _error_handler(status: int) -> Callable[[Request, Exception], JSONResponse]:
-    return lambda _, error: JSONResponse({"error": str(error)}, status)
-
-
-def _validation_error(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    return JSONResponse({"error": describe_error(error)}, 422)
-
-
-def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    if error.status_code == 404 and "text/html" in request.headers.get("accept", ""):  # opened in a browser
-        return HTMLResponse(not_found_page(request.url.path), 404, POLICY)
-    return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
-
-
-def _file_error(_: Request, error: Exception) -> JSONResponse:
-    """Errors in the workspace that the user can fix, such as missing permissions."""
-    if not isinstance(error, OSError) or error.filename is None:
-        raise error
-    return JSONResponse({"error": f"{str(error.filename)!r} cannot be used: {error.strerror}."}, 400)
+def _error_response(request: Request, error: Exception) -> Response:
+    """The response to a request that raises one of ``ERRORS``."""
+    match error:
+        case InProgress():
+            return JSONResponse({"progress": error.args[0]}, 202)
+        case BadInput():
+            return JSONResponse({"error": str(error)}, STATUS.get(type(error), 400))
+        case RequestValidationError():
+            return JSONResponse({"error": describe_error(error)}, 422)
+        case HTTPException(status_code=404) if "text/html" in request.headers.get("accept", ""):  # opened in a browser
+            return HTMLResponse(not_found_page(request.url.path), 404, POLICY)
+        case HTTPException():
+            return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
+        case OSError() if error.filename is not None:  # the user can fix it, such as missing permissions
+            return JSONResponse({"error": f"{str(error.filename)!r} cannot be used: {error.strerror}."}, 400)
+    raise error
 
 
 def listen(host: str, port: int) -> socket.socket:

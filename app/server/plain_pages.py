@@ -1,7 +1,5 @@
 """Pages without scripts: signing in, and addresses that do not exist."""
 
-from __future__ import annotations
-
 from html import escape
 
 _PAGE = (

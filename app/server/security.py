@@ -5,8 +5,6 @@ be known (against DNS rebinding), requests that can change something need the se
 the use of responses. If others can reach the server, requests must also be authenticated (``app/server/auth.py``).
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import re
@@ -87,9 +85,8 @@ class Reply:
 class Guard:
     """ASGI middleware that checks all requests and WebSockets and adds security headers to all responses.
 
-    Args:
-        hosts: allowed host names in addition to the loopback's, with any port (``ssh -L`` changes it).
-        access: required token and permissions. With a token, the Host may also be any IP address.
+    hosts: allowed host names in addition to the loopback's, with any port (``ssh -L`` changes it). access: required
+    token and permissions. With a token, the Host may also be any IP address.
     """
 
     def __init__(self, app: ASGIApp, hosts: Iterable[str] = (), access: Access = OPEN) -> None:

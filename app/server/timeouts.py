@@ -4,8 +4,6 @@ They override methods that are not part of uvicorn's public interface, so pyproj
 ``limit_concurrency`` is not equivalent: it counts neither WebSockets nor connections without a request.
 """
 
-from __future__ import annotations
-
 import asyncio
 
 from uvicorn._types import ASGIReceiveEvent

@@ -1,7 +1,5 @@
 """Responses with browser code of other projects (Rerun's viewer and uPlot), from their installed wheels."""
 
-from __future__ import annotations
-
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles

@@ -5,8 +5,6 @@ during construction, so that no port is opened, and connects it to Starlette Web
 It depends on viser's internals (the version is pinned); ``EmbeddedViser`` raises an error if they have changed.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import importlib.util
@@ -105,11 +103,8 @@ Handler = Callable[[_Connection], Awaitable[None]]
 class EmbeddedViser:
     """One viser server, reachable only through ``connect``.
 
-    Attributes:
-        server: the public viser API: ``scene``, ``gui``, ``flush()``.
-
-    Raises:
-        RuntimeError: the installed viser starts its socket server differently.
+    server: the public viser API: ``scene``, ``gui``, ``flush()``. Raises RuntimeError if the installed viser starts its
+    socket server differently.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,5 @@
 """Memory management of the server process, so that memory use stays constant over hours."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 from contextlib import suppress

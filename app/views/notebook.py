@@ -1,7 +1,5 @@
 """Rerun's viewer and the 3D scene in a notebook."""
 
-from __future__ import annotations
-
 import io
 import os
 import tempfile
@@ -45,8 +43,7 @@ def rerun_viewer(trace: Trace, checkpoint: Checkpoint | None, diagnostics: dict[
 class SceneViewer:
     """The 3D scene of a trace, with a slider for the step. A notebook shows it in a frame.
 
-    Attributes:
-        url: address of the scene on this machine. step: the cursor.
+    url: address of the scene on this machine. step: the cursor.
     """
 
     def __init__(self, trace: Trace, checkpoint: Checkpoint, step: int = 0) -> None:

@@ -1,7 +1,5 @@
 """The open views of a server."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 
@@ -16,9 +14,8 @@ from beliefscope.datasets.errors import BadInput
 class Views:
     """The open views, up to a maximum number.
 
-    Args:
-        limit: maximum number of views; each takes a thread and several MB (docs/reliability.md).
-        timeout: in s, after which a view without a page is closed; allows for lost connections.
+    limit: maximum number of views; each takes a thread and several MB (docs/reliability.md). timeout: in s, after which
+    a view without a page is closed; allows for lost connections.
     """
 
     def __init__(self, store: TraceStore, limit: int = 32, timeout: float = 30.0) -> None:
@@ -46,8 +43,7 @@ class Views:
     async def open(self, dark: bool) -> View:
         """Open a view; close the one that has been idle longest if there are too many.
 
-        Raises:
-            BadInput: the maximum number of views is in use.
+        Raises BadInput if the maximum number of views is in use.
         """
         async with self._open_lock:
             await self._close_idle(keep=self._limit - 1)

@@ -1,7 +1,5 @@
 """3D scene of one view: its viser server and the drawn run."""
 
-from __future__ import annotations
-
 import threading
 
 from beliefscope.app.protocol.messages import SceneLayers, Viewpoint
@@ -13,11 +11,7 @@ from beliefscope.inspect.trace import Trace
 
 
 class Scene:
-    """Draws one run at a time. ``show`` and ``close`` block and may be called from any thread.
-
-    Args:
-        dark: whether the background is dark.
-    """
+    """Draws one run at a time. ``show`` and ``close`` block and may be called from any thread."""
 
     def __init__(self, dark: bool) -> None:
         self.viser = EmbeddedViser()
@@ -63,9 +57,7 @@ class Scene:
     ) -> None:
         """Draw a step of a run and send it to the browser.
 
-        Args:
-            comparison: trace of the comparison run of the same episode.
-            maps: likelihood maps of the step.
+        comparison: trace of the comparison run of the same episode. maps: likelihood maps of the step.
         """
         with self._lock:
             if self._closed:

@@ -3,8 +3,6 @@
 Axes: x away from the robot, y to its left, z up, in m. Colors are those of the recordings (``recordings.schema``).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -64,8 +62,7 @@ class Pole:
 class BeliefScene:
     """Scene nodes of one trace.
 
-    Attributes:
-        viewpoints: available viewpoints -> position (3,) of the eye and the point (3,) that it faces, m.
+    viewpoints: available viewpoints -> position (3,) of the eye and the point (3,) that it faces, m.
     """
 
     def __init__(
@@ -73,9 +70,8 @@ class BeliefScene:
     ) -> None:
         """Draw the first step.
 
-        Args:
-            trace: of the whole run or a part of it, to which the steps of ``move`` refer.
-            labels: whether the estimates have labels. The page has a legend instead, which nothing overlaps.
+        trace: of the whole run or a part of it, to which the steps of ``move`` refer. labels: whether the estimates
+        have labels. The page has a legend instead, which nothing overlaps.
         """
         self._server = server
         self._task = run.checkpoint.task

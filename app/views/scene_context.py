@@ -1,7 +1,5 @@
 """Surroundings of the belief in the 3D scene: robot, floor map, camera, contact force."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from io import BytesIO
 from typing import Any
@@ -13,10 +11,10 @@ from viser import ViserServer
 from viser.transforms import SO3
 
 from beliefscope.app.protocol.messages import SceneLayers
-from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies
 from beliefscope.datasets.task import Task, display_name
+from beliefscope.inspect.figures.force_arrow import MAX_RINGS, DrawnForce
 from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
 from beliefscope.inspect.figures.scene_shapes import (
     DISC,
@@ -30,13 +28,11 @@ from beliefscope.inspect.figures.scene_shapes import (
 )
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.sensors import camera_images
 
 # Three times as fast as viser's standard material where the browser renders in software.
 SHADING: dict[str, Any] = {"material": "toon5", "cast_shadow": False, "receive_shadow": False}
 SMALL_LABEL: dict[str, Any] = {"font_screen_scale": 0.7, "depth_test": False}
-RING_DISTANCE = 0.05  # m between the rings of the force arrow
-MAX_RINGS = 6
-RING_RADIUS = 0.014  # m
 IMAGE_DISTANCE = 0.2  # of the way from the camera to its target
 IMAGE_SCALE = 4  # enlargement, so that the browser's smoothing keeps pixels distinguishable
 TRANSLUCENT_OPACITY = 0.35
@@ -132,11 +128,7 @@ class CameraView:
 
 
 class ForceArrow:
-    """The measured contact force as an arrow with a ring every few newtons, labeled with the force and the spacing.
-
-    Its head is at the end effector, so that the arm, which the force points at, does not hide it. If it came through
-    the floor in that way, its tail is there.
-    """
+    """The measured contact force as an arrow with rings, labeled with the force and their spacing."""
 
     def __init__(self, server: ViserServer, trace: Trace) -> None:
         self.set_trace(trace)
@@ -164,51 +156,18 @@ class ForceArrow:
 
     def set_trace(self, trace: Trace) -> None:
         """Use the forces of this trace in ``show``."""
-        episode = trace.episode
-        self._contact = episode.contact.astype(bool)
-        self._positions, self._forces = episode.observations["effector_position"], episode.observations["force"]
-        positions, forces = self._positions[self._contact], self._forces[self._contact]
-        newtons = np.linalg.norm(forces, axis=-1)
-        self._spacing = ring_spacing(float(newtons[np.isfinite(newtons)].max(initial=0.0)))
-        starts = positions[:, 2] - RING_DISTANCE / self._spacing * forces[:, 2]
-        self._ahead = bool((starts < np.minimum(0.0, positions[:, 2])).any())
+        self._force = DrawnForce(trace)
 
     def show(self, step: int) -> None:
         """Show the force of a step, if it is in contact."""
-        contact = bool(self._contact[step])
+        drawn = self._force.at(step)
         for part in (self._arrow, self._rings, self._label):
-            part.visible = contact
-        if not contact:
+            part.visible = drawn is not None
+        if drawn is None:
             return
-        hand, force = np.asarray(self._positions[step], float), np.asarray(self._forces[step], float)
-        newtons = float(np.linalg.norm(force))
-        direction = force / max(newtons, 1e-9)
-        length = RING_DISTANCE * newtons / self._spacing
-        start = hand if self._ahead else hand - length * direction
-        end = start + length * direction
-        self._arrow.points = np.stack([start, end])[None].astype(np.float32)
-        self._arrow.head_length = min(0.03, 0.6 * length)
-        along = RING_DISTANCE * np.arange(1, MAX_RINGS + 1)
-        self._rings.batched_positions = start + along[:, None] * direction
-        self._rings.batched_wxyzs = np.tile(_turned(direction), (MAX_RINGS, 1))
-        self._rings.batched_scales = np.where(along <= length, RING_RADIUS, 0.0)[:, None] * np.ones(3)
-        self._label.text = f"{newtons:.{newtons < 9.95:d}f} N, rings {self._spacing:g} N"
-        self._label.position = end if self._ahead else start
-
-
-def ring_spacing(largest: float) -> float:
-    """The smallest 1, 2 or 5 times a power of ten, N, for which the largest force has at most ``MAX_RINGS`` rings."""
-    if largest <= 0.0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(largest / MAX_RINGS))
-    return float(next(power * k for k in (1, 2, 5, 10) if power * k * MAX_RINGS >= largest * (1 - 1e-9)))
-
-
-def _turned(direction: Array) -> Array:
-    """Quaternion (4,), w first, of the shortest rotation from z to a unit vector (3,)."""
-    x, y, z = direction
-    wxyz = np.array([1.0 + z, -y, x, 0.0]) if z > -1.0 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
-    return wxyz / np.linalg.norm(wxyz)
+        self._arrow.points, self._arrow.head_length = drawn.arrow[None].astype(np.float32), drawn.head_length
+        self._rings.batched_positions, self._rings.batched_wxyzs, self._rings.batched_scales = drawn.rings
+        self._label.text, self._label.position = drawn.text, drawn.label
 
 
 class RobotScene:

@@ -1,7 +1,5 @@
 """Scheduling of short computations for many clients on a few threads."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import threading
@@ -28,9 +26,8 @@ class DeadlineExecutor:
     Two tasks that need the same resource never run at the same time. Each client awaits its task before it submits the
     next one, so the queue holds at most one task per client. Threads start with the first tasks.
 
-    Args:
-        threads: number of threads; by default one per processor, between 2 and 4, because more would only compete for
-            Python's global lock.
+    threads: number of threads; by default one per processor, between 2 and 4, because more would only compete for
+    Python's global lock.
     """
 
     def __init__(self, threads: int | None = None) -> None:
@@ -45,12 +42,8 @@ class DeadlineExecutor:
     async def run(self, work: Callable[[], T], within: float, resources: frozenset[Hashable] = frozenset()) -> T:
         """Run ``work`` in a thread and return its result. A cancelled task is removed, unless it has started.
 
-        Args:
-            within: deadline, in s from now.
-            resources: used exclusively while the task runs.
-
-        Raises:
-            RuntimeError: the executor is closed.
+        within: deadline, in s from now. resources: used exclusively while the task runs. Raises RuntimeError if the
+        executor is closed.
         """
         loop = asyncio.get_running_loop()
         task = _Task(time.monotonic() + within, resources, work, loop.create_future())
@@ -115,8 +108,7 @@ class DeadlineExecutor:
 class FairLock:
     """Asynchronous lock that is granted in order of arrival and stays locked for a pause after each use.
 
-    Args:
-        pause: in s for each s that the lock was held. max_pause: in s.
+    pause: in s for each s that the lock was held. max_pause: in s.
     """
 
     def __init__(self, pause: float = 2.0, max_pause: float = 0.1) -> None:

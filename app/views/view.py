@@ -1,7 +1,5 @@
 """View: the cursor and 3D scene of one page, and the socket that connects them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -50,10 +48,7 @@ class View:
     not answered. Each processed cursor is answered with maps, then waits for the scene. There, too, only the newest one
     waits, so that a slow scene does not delay maps.
 
-    Attributes:
-        name: random part of the view's addresses.
-        scene: its 3D scene.
-        idle_since: monotonic time at which its page disconnected; None while connected.
+    name: random part of its addresses. idle_since: monotonic time at which its page disconnected; None while connected.
     """
 
     def __init__(self, store: TraceStore, executor: DeadlineExecutor, scene_lock: FairLock, dark: bool) -> None:

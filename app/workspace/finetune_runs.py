@@ -1,7 +1,5 @@
 """Fine-tuning runs of a workspace: one folder each, with settings, progress, checkpoint and result."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from dataclasses import dataclass

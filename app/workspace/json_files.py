@@ -1,7 +1,5 @@
 """JSON files of the workspace, validated on reading: other programs may have written them."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

@@ -1,7 +1,5 @@
 """Partial files of interrupted writes: hidden files that end in ``.part``."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Path checks for files that are addressed by a name from requests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

@@ -4,8 +4,6 @@ Metadata is stored beside each file in ``.about/NAME.json``, and is valid as lon
 unchanged. Files without valid metadata are read one by one in the background.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import stat
@@ -46,9 +44,7 @@ class Record:
 class Recording:
     """A file in its current state.
 
-    Attributes:
-        bytes, modified: size and time (s since 1970) of the file.
-        info: None while the file is being read.
+    bytes, modified: size and time (s since 1970) of the file. info: None while the file is being read.
     """
 
     name: str

@@ -1,7 +1,5 @@
 """The reports of a workspace: one folder each, with a manifest."""
 
-from __future__ import annotations
-
 import re
 import threading
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Folders of studies: tables in ``study.json`` and the trained checkpoints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,9 +35,8 @@ def _rename(row: Any) -> Any:
 class Results(BaseModel):
     """Content of ``study.json``.
 
-    Attributes:
-        checkpoints: trained cell -> hash; missing in files of earlier versions. cells: cell -> state.
-        given: name -> checkpoint file or build function of each filter that was evaluated only.
+    checkpoints: trained cell -> hash; missing in files of earlier versions. cells: cell -> state. given: name ->
+    checkpoint file or build function of each filter that was evaluated only.
     """
 
     preset: str

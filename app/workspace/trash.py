@@ -1,7 +1,5 @@
 """Trash of a folder: deleted files and folders that can be restored, each in its own folder under ``.deleted``."""
 
-from __future__ import annotations
-
 import os
 import re
 import secrets

@@ -8,9 +8,14 @@ import numpy as np
 from numpy.random import Generator
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.simulation.door import CAMERA as DOOR_CAMERA
-from beliefscope.datasets.simulation.door import DOOR, door_model, draw_door, policy_name
-from beliefscope.datasets.simulation.door import IMPEDANCE as DOOR_IMPEDANCE
+from beliefscope.datasets.simulation.door import (
+    CAMERA as DOOR_CAMERA,
+    DOOR,
+    IMPEDANCE as DOOR_IMPEDANCE,
+    door_model,
+    draw_door,
+    policy_name,
+)
 from beliefscope.datasets.simulation.door_policies import POLICIES
 from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate

@@ -5,12 +5,15 @@ docs/finetune.md has its effect on the shipped filters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.module_selection import presets
-from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.filters.finetuning.slices import FAULT_SLICES, NOISY_IMAGES, fault_slices
+from beliefscope.filters.finetuning.settings import FineTune, StepRange
+from beliefscope.filters.finetuning.slices import FAULT_SLICES, NOISY_IMAGES, fault_slices, parse_slices
 
 RELIABILITY = FineTune(train=("reliability-only",), steps=150, rate=5e-4)
 
@@ -40,6 +43,21 @@ def default_settings(filter_: Filter) -> FineTune:
     if modality == "image":
         settings = replace(settings, clean_weight=CLEAN_WEIGHT)
     return replace(settings, mix=((slice_, 1.0),))
+
+
+def settings_from(
+    base: Checkpoint,
+    train: Sequence[str] = (),
+    freeze: Sequence[str] = (),
+    slices: Sequence[str] = (),
+    faults: Sequence[str] = (),
+    events: Sequence[str] = (),
+) -> FineTune:
+    """Settings with these modules and data, as texts, or the default ones of the filter if none are given."""
+    if not isinstance(base, ExternalFilter) and not any((train, freeze, slices, faults, events)):
+        return default_settings(base.filter)
+    mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices, faults, base.task))
+    return FineTune(tuple(train), tuple(freeze), mix=mix, events=tuple(map(StepRange.parse, events)))
 
 
 def reason(filter_: Filter) -> str:

@@ -45,10 +45,13 @@ class Callbacks:
             resumes. stop: before each step; the run pauses if it returns true.
     """
 
-    report: Callable[[int, int, float], None]
-    on_validation: Callable[[Validation], None]
-    on_resume: Callable[[int], None]
-    stop: Callable[[], bool]
+    report: Callable[[int, int, float], None] = lambda step, steps, loss: None
+    on_validation: Callable[[Validation], None] = lambda validation: None
+    on_resume: Callable[[int], None] = lambda step: None
+    stop: Callable[[], bool] = lambda: False
+
+
+NO_CALLBACKS = Callbacks()
 
 
 def finetune(
@@ -58,14 +61,11 @@ def finetune(
     data_hash: str,
     settings: FineTune | None = None,
     command: str = "",
-    report: Callable[[int, int, float], None] = lambda step, steps, loss: None,
-    on_validation: Callable[[Validation], None] = lambda validation: None,
-    on_resume: Callable[[int], None] = lambda step: None,
-    stop: Callable[[], bool] = lambda: False,
+    callbacks: Callbacks = NO_CALLBACKS,
     partial: Path | None = None,
     device: str | None = None,
 ) -> FineTuned | None:
-    """Fine-tunes a copy of ``base``; returns None if ``stop`` paused the run. For the callbacks see ``Callbacks``.
+    """Fine-tunes a copy of ``base``; returns None if ``callbacks.stop`` paused the run.
 
     The weights that do best on ``val`` episodes are kept, those of ``base`` included: the result is never worse there,
     as measured by ``loop.score``. Without ``val`` episodes, every eighth training episode takes their place. Frozen
@@ -94,7 +94,6 @@ def finetune(
     mixes, images = _mixes(filter_, groups, events, settings, device)
     key = cache_key(base=base.hash, settings=settings.to_json(), data=data_hash, versions=versions(), device=device)
     state = Partial(partial, key) if partial else None
-    callbacks = Callbacks(report, on_validation, on_resume, stop)
     with cached_encoders(filter_, images):
         before = validate(filter_, mixes["test"], 0, 0.0, settings)
         loop = FilterLoop(filter_, trained, settings, mixes["train"], mixes["val"])

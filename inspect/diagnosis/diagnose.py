@@ -26,7 +26,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statist
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
-from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile, profile_document
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -191,7 +191,7 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
 
 def no_diagnosis(checkpoint: Checkpoint) -> str | None:
     """Reason why a filter has no diagnosis, and what it needs; None if it has one."""
-    if find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint) is not None:
+    if profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint) is not None:
         return None
     source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
     return (

@@ -86,13 +86,18 @@ def has_profile(checkpoint: Checkpoint, path: Path | None) -> bool:
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:
-    """Profile of a checkpoint: beside the shipped checkpoint of this hash, else in its header; None without either.
+    """Profile of a checkpoint, or None; see ``profile_document``. Raises BadInput if it is malformed."""
+    document = profile_document(task, filter_, checkpoint_hash, checkpoint)
+    return None if document is None else HealthyProfile.from_json(document)
+
+
+def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> Any:
+    """JSON of a profile: beside the shipped checkpoint of this hash, else in its header; None without either.
 
     The file beside a shipped checkpoint is measured again when statistics are added, its header is not.
     """
     own = checkpoint.healthy_profile if isinstance(checkpoint, Checkpoint) else None
-    document = _beside_shipped(task, filter_, checkpoint_hash) or own
-    return None if document is None else HealthyProfile.from_json(document)
+    return _beside_shipped(task, filter_, checkpoint_hash) or own
 
 
 def _beside_shipped(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:

@@ -117,7 +117,7 @@ class LandmarkFilter:
 def fit_landmark_filter(images: Array, positions: Array, others: Array | None = None) -> LandmarkFilter | None:
     """Fit the filter to normalised images (T, H, W) and positions (T, d) of the landmark.
 
-    Its pixel is unknown: it begins as the centre of the largest contrasts, or of those that the positions explain
+    Its pixel is unknown: it begins as the centre of the largest contrasts, or of the part that the positions explain
     beyond the ``others`` (T, e), the positions of whatever else moves. In turn, the camera's map is fitted to the
     pixels, the filter to the map, and the pixels are the peaks of its response near those of the map; images in which
     these differ count less, because the landmark may be hidden. None for images that are too small, and so large that

@@ -42,6 +42,7 @@ from beliefscope.recordings.report.diagnosis import report_diagnosis
 from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
 from beliefscope.recordings.report.page import page
+from beliefscope.recordings.report.pdf import print_page
 from beliefscope.recordings.report.sections import (
     Event,
     Item,
@@ -293,13 +294,13 @@ class Writer:
 def write_report(
     report: Report,
     folder: Path,
-    pdf: Callable[[Path, Path], None] | None = None,
+    chromium: str | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> dict[str, Any]:
     """Write the folder of a report atomically; returns its manifest.
 
     Args:
-        pdf: prints (page, PDF) to write ``report.pdf``.
+        chromium: path of a browser that prints ``report.pdf``; None for no PDF.
         progress: called with the completed fraction, 0..1.
 
     Raises:
@@ -319,8 +320,8 @@ def write_report(
         diagnosis, summary, *others = sections
         diagnostics, events = others[: len(report.results)], others[len(report.results) :]
         writer.write("report.html", page(report, diagnosis, summary, diagnostics, events).encode())
-        if pdf is not None:
-            pdf(target / "report.html", target / "report.pdf")
+        if chromium is not None:
+            print_page(chromium, target / "report.html", target / "report.pdf")
         document = manifest(report, target)
         writer.write("manifest.json", _json(document))
     return document

@@ -15,11 +15,10 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import Faults, read_faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
-from beliefscope.filters.evaluate import Metrics
-from beliefscope.filters.evaluate import evaluate as evaluate_filter
+from beliefscope.filters.evaluate import Metrics, evaluate as evaluate_filter
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
-from beliefscope.filters.finetuning.defaults import default_settings
+from beliefscope.filters.finetuning.defaults import settings_from
 from beliefscope.filters.finetuning.finetune import finetune as finetune_filter
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import parse_slices
@@ -31,14 +30,12 @@ from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compar
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose as diagnose_episodes
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.failures.events import Failures
-from beliefscope.inspect.failures.events import find_failures as rank_failures
+from beliefscope.inspect.failures.events import Failures, find_failures as rank_failures
 from beliefscope.inspect.healthy import measure_profile, profile_of
 from beliefscope.inspect.likelihood import COARSE, MapEngine
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap, Quantity
 from beliefscope.inspect.sweep import Inputs
-from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.trace import trace as trace_episode
+from beliefscope.inspect.trace import Trace, trace as trace_episode
 from beliefscope.recordings.interactive.export import write_interactive
 from beliefscope.recordings.sweep_table import Experiments, run_sweep
 from beliefscope.recordings.write import write_recording
@@ -261,11 +258,9 @@ def finetune(
     base = load_filter(filter_)
     if unknown := settings.keys() - FineTune.__dataclass_fields__.keys():
         raise unknown_name("setting of a fine-tuning", min(unknown), FineTune.__dataclass_fields__)
-    given = any((train, freeze, faults, slices))
-    mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices, faults, base.task))
     if isinstance(success := settings.get("success"), str):
         settings["success"] = Criterion.parse(success)
-    chosen = FineTune(train=tuple(train), freeze=tuple(freeze), mix=mix) if given else default_settings(base.filter)
+    chosen = settings_from(base, train, freeze, slices, faults)
     source = _episodes(data, base)
     episodes = list(source)
     tuned = finetune_filter(base, episodes, data_hash=source.hash, settings=replace(chosen, **settings))

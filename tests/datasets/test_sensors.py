@@ -14,7 +14,7 @@ import torch
 from rerun.chunk import RrdReader
 from torch import nn
 
-from beliefscope.app.protocol.trace_format import columns, displayed_sensors, header, sensor_pixels
+from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults, available_presets
@@ -30,6 +30,7 @@ from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.live_file import load_live
+from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
 from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.read import read_recording

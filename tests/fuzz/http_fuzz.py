@@ -15,8 +15,7 @@ from typing import Any
 
 import mutate
 import schemathesis
-from hypothesis import HealthCheck, Phase, given, seed, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, given, seed, settings, strategies as st
 from schemathesis import GenerationMode
 from starlette.testclient import TestClient, WebSocketTestSession
 

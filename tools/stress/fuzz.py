@@ -50,10 +50,10 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
     """Run all inputs of one reader, in subprocesses."""
     import readers
 
-    from beliefscope.app.cli.options import open_recording
     from beliefscope.datasets.errors import BadInput
     from beliefscope.datasets.store import open_dataset
     from beliefscope.recordings.logs.columns import preview_columns
+    from beliefscope.recordings.open_trace import open_recording
 
     guarded = {"recording": open_recording, "log-rerun": preview_columns} | dict.fromkeys(readers.HDF5, open_dataset)
     outcome = Outcome(inputs)

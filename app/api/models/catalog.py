@@ -5,8 +5,6 @@ the tests validate them (``tests/app/conftest.py``). Dataclasses of other folder
 plain fields; models of those with arrays are derived by ``fields_of``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints

@@ -1,30 +1,19 @@
 """Models of JSON responses: diagnosis."""
 
-from __future__ import annotations
-
 from typing import Literal
 
-from beliefscope.app.api.models.catalog import JobReply, Number, Reply
+from beliefscope.app.api.models.catalog import JobReply, Number, Reply, fields_of
+from beliefscope.inspect.diagnosis.cause import Evidence, Recovery
 
 
+@fields_of(Evidence)
 class DiagnosisEvidence(Reply):
     """A deviation that supports a cause. low, high: healthy range. episode, step: moment that shows it best."""
 
-    text: str
-    value: Number
-    low: Number
-    high: Number
-    episode: int | None
-    step: int | None
 
-
+@fields_of(Recovery)
 class DiagnosisRecovery(Reply):
     """Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats."""
-
-    error: Number
-    low: Number
-    high: Number
-    nll: Number
 
 
 class DiagnosisCause(Reply):

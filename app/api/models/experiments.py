@@ -1,7 +1,5 @@
 """Response models of sweeps."""
 
-from __future__ import annotations
-
 from beliefscope.app.api.models.catalog import Number, Reply
 
 
@@ -25,10 +23,8 @@ class SweepList(Reply):
 class ExperimentRow(Reply):
     """Results of a checkpoint over a data set in one phase.
 
-    Attributes:
-        checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it.
-        error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``.
-        provenance: JSON of the file beside the checkpoint.
+    checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
+    ``unit``, at ``worst_episode`` and ``worst_step``. provenance: JSON of the file beside the checkpoint.
     """
 
     name: str

@@ -1,7 +1,5 @@
 """Models of JSON responses: recordings and reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pydantic import ConfigDict, with_config
@@ -36,9 +34,8 @@ class RunNames(Reply):
 class RecordingEntry(RecordingInfo):
     """A recording, with its metadata once they have been read.
 
-    Attributes:
-        modified: ISO 8601. reading: whether its metadata are being read.
-        run: the same run in the catalog, or None; ``why_not`` explains why.
+    modified: ISO 8601. reading: whether its metadata are being read. run: the same run in the catalog, or None;
+    ``why_not`` explains why.
     """
 
     name: str

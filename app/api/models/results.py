@@ -1,7 +1,5 @@
 """Models of JSON responses: diagnostics, comparisons and failures."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from beliefscope.app.api.models.catalog import Number, Reply, fields_of

@@ -1,7 +1,5 @@
 """Models of JSON responses: traces, live runs and views."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 from beliefscope.app.api.models.catalog import Component, Reply, TaskInfo
@@ -55,9 +53,8 @@ class Column(Reply):
 class DisplayedSensor(Reply):
     """A sensor that is drawn.
 
-    Attributes:
-        channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point
-            cloud, whose extent is ``high`` in m; else 0.
+    channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point cloud,
+    whose extent is ``high`` in m; else 0.
     """
 
     name: str

@@ -1,7 +1,5 @@
 """Models of JSON responses: lineage, fine-tuning and studies."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 
 
 @opt.with_options(
@@ -24,8 +21,7 @@ def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Resu
       beliefscope calibrate push --filter my_filter.py:build -o calibration.json --json -
     """
     from beliefscope.filters.calibration import save_calibration
-    from beliefscope.inspect.calibrate import calibrate as fit
-    from beliefscope.inspect.calibrate import check_level
+    from beliefscope.inspect.calibrate import calibrate as fit, check_level
     from beliefscope.inspect.traces.batch import trace_all
 
     checkpoint, faults = runs.open()
@@ -33,15 +29,8 @@ def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Resu
         held_out = data.held_out()
         fitted, tested = held_out[::2], held_out[1::2]
         check_level(level, len(fitted), len(tested))
-        traces = trace_all(
-            checkpoint,
-            data,
-            [*fitted, *tested],
-            faults=faults,
-            seed=runs.seed,
-            particles=runs.particles,
-            progress=advance,
-        )
+        settings = runs.settings(faults)
+        traces = trace_all(checkpoint, data, [*fitted, *tested], **settings, progress=advance)
         by_index = {trace.episode_index: trace for trace in traces}
         data_hash = data.hash
     report = fit([by_index[i] for i in fitted], [by_index[i] for i in tested], level, data_hash)

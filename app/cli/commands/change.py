@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import serve_command
 
@@ -14,10 +11,7 @@ from beliefscope.recordings.report.command_lines import serve_command
         "Path of a .safetensors file, name of a built-in filter such as crossmodal-ekf, or path/to/file.py:build.",
     ),
     after=opt.argument("AFTER", "As BEFORE."),
-    every=opt.flag("Compare on all episodes, not only the held-out ones.", "--all"),
     task=opt.option("TASK", "Task of both filters. Required for two names."),
-    engine=opt.ENGINE,
-    workers=opt.WORKERS,
     output=opt.option("DIR", "New folder for change.json, change.svg and change.md.", "-o"),
 )
 def change(

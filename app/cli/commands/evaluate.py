@@ -1,9 +1,4 @@
-from __future__ import annotations
-
-from typing import Any
-
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 
 
 @opt.with_options(
@@ -11,8 +6,6 @@ from beliefscope.app.cli import options as opt
     start_offset=opt.option(
         "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg."
     ),
-    engine=opt.ENGINE,
-    workers=opt.WORKERS,
 )
 def evaluate(
     runs: opt.Runs,
@@ -46,6 +39,7 @@ def evaluate(
     from beliefscope.filters.evaluate import evaluate as measure
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.start_offset import StartOffset
+    from beliefscope.inspect.accuracy_tables import accuracy_tables
     from beliefscope.inspect.standalone import check_standalone
 
     checkpoint, faults = runs.open()
@@ -59,10 +53,8 @@ def evaluate(
         metrics = measure(
             checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
             held_out,
-            faults=faults,
+            **runs.settings(faults),
             only=only,
-            particles=runs.particles,
-            seed=runs.seed,
             start_offset=offset,
             baselines=True,
             modalities=only is None,
@@ -85,41 +77,4 @@ def evaluate(
     }
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episodes"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
-    return console.Result(document, _table(title, metrics))
-
-
-LABELS = {
-    "rmse": "",
-    "rmse_from_step_0": ", from step 0",
-    "rmse_before_contact": ", before first contact",
-    "rmse_after_contact": ", after first contact",
-}
-"""Key of the metrics -> label of its rows in the table."""
-
-
-def _table(title: str, metrics: dict[str, Any]) -> str:
-    """The metrics of the filter and of its baselines, a row for each measure; then those of its modalities."""
-    from beliefscope.filters.evaluate import STANDALONE, UPDATE
-
-    columns = [metrics, *(baseline or {} for baseline in metrics["baselines"].values())]
-    rows = [
-        [f"rmse {name}{label}", *(_number(column.get(key, {}).get(name)) for column in columns)]
-        for key, label in LABELS.items()
-        for name in metrics.get(key, {})
-    ]
-    rows += [[name, _number(metrics[name]), "", ""] for name in ("nll", "nees", "coverage95")]
-    table = console.grid(title, ["measure", "filter", *metrics["baselines"]], rows)
-    errors = {
-        label.format(name): metrics[key][name]["rmse"]
-        for name in metrics.get("standalone", {})
-        for key, label in (("updates", UPDATE), ("standalone", STANDALONE))
-        if name in metrics.get(key, {})
-    }
-    if not errors:
-        return table
-    rows = [[f"rmse {name}", *(_number(rmse[name]) for rmse in errors.values())] for name in metrics["rmse"]]
-    return f"{table}\n\n{console.grid('Modalities', ['measure', *errors], rows)}"
-
-
-def _number(value: float | None) -> str | None:
-    return None if value is None else f"{value:8.2f}"
+    return console.Result(document, "\n\n".join(console.grids(accuracy_tables(title, metrics))))

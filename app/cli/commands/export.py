@@ -3,8 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
@@ -38,6 +37,7 @@ def export(
       beliefscope export first.trace second.trace -o supplement
     """
     from beliefscope.recordings.export import export_format, export_trace
+    from beliefscope.recordings.open_trace import open_trace
 
     if not output.suffix or output.is_dir():
         return _folder(sources, output, task, filter)
@@ -49,7 +49,7 @@ def export(
     if interactive:
         raise BadInput(f"--interactive writes a page: output {str(output)!r} must end in .html")
     export_format(output)
-    trace = opt.open_trace(sources[0], task)
+    trace = open_trace(sources[0], task)
     export_trace(trace, output)
     return opt.trace_result(trace, output)
 
@@ -58,8 +58,9 @@ def _page(source: Path, output: Path, task: str, filter_: str) -> Trace:
     """Write the interactive page of a trace."""
     from beliefscope.inspect.traces.provenance import checkpoint_of
     from beliefscope.recordings.interactive.export import write_interactive
+    from beliefscope.recordings.open_trace import open_trace
 
-    trace = opt.open_trace(source, task)
+    trace = open_trace(source, task)
     checkpoint = checkpoint_of([trace], [source], filter_)
     with console.progress(source.stem) as advance:
         write_interactive(trace, output, checkpoint, progress=advance)

@@ -1,23 +1,12 @@
-from __future__ import annotations
-
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import check_name
 from beliefscope.recordings.report.command_lines import serve_command
 
 
 @opt.with_options(
-    by=opt.option(
-        "SCORE",
-        "Score that ranks the events: error (position), the name of an angle, nees, ess (effective sample size), "
-        "disagreement (of the modalities) or regret (of the fusion weights).",
-    ),
     top=opt.option("N", "Number of events.", parser=opt.integer(1)),
     phase=opt.option("NAME", "Only events of this phase, such as 'contact made'."),
-    every=opt.flag("Search all episodes, not only the held-out ones.", "--all"),
     url=opt.option("URL", "Address of a running server; prints a full permalink per event."),
-    engine=opt.ENGINE,
-    workers=opt.WORKERS,
 )
 def failures(
     runs: opt.Runs,
@@ -54,7 +43,6 @@ def failures(
     checkpoint, faults = runs.open()
     if phase is not None:
         check_name("phase", phase, phases_of(checkpoint.task))
-    particles, seed = runs.particles, runs.seed
     with runs.episodes(checkpoint.task) as episodes, console.progress("Filtering") as advance:
         indices = range(len(episodes)) if every else episodes.held_out()
         report = find_failures(
@@ -62,9 +50,7 @@ def failures(
             episodes,
             indices,
             by=by,
-            faults=faults,
-            seed=seed,
-            particles=particles,
+            **runs.settings(faults),
             engine=engine,
             workers=workers,
             progress=advance,
@@ -75,11 +61,11 @@ def failures(
     links = [base + permalink(checkpoint.task, name, data_name, e.episode, e.step, str(faults), by) for e in events]
     document = report.to_dict() | {
         "events": [as_json(event) | {"link": link} for event, link in zip(events, links, strict=True)],
-        "serve": serve_command([runs.filter] if is_path(runs.filter) else [], runs.data, seed),
+        "serve": serve_command([runs.filter] if is_path(runs.filter) else [], runs.data, runs.seed),
     }
     text = "\n\n".join([report.verdict, *console.grids([report.phase_table(), report.event_table(events)])])
     if url is not None:
         text = "\n".join([text, f"Permalinks, for {document['serve']}", *links])
-    if particles != 300 and report.particles:
+    if runs.particles != 300 and report.particles:
         console.note("note: the dashboard uses 300 particles, so its values at these events differ")
     return console.Result(document, text)

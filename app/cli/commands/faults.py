@@ -1,7 +1,4 @@
-from __future__ import annotations
-
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 
 
 @opt.with_options()

@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import finetune_command
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.finetune import FineTuned
+    from beliefscope.filters.finetuning.finetune import Callbacks, FineTuned
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
     from beliefscope.inspect.compare.success import Success
@@ -98,6 +98,7 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.filters.finetuning.defaults import settings_from
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -108,8 +109,9 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
+    settings = settings_from(base, train or (), freeze or (), slices or (), fault_sets or (), events or ())
     settings = replace(
-        _modules_and_data(base, train or (), freeze or (), slices or (), fault_sets or (), events or ()),
+        _changed(settings, clean_weight, steps, rates or ()),
         length=length,
         l2_sp=l2_sp,
         calibrate=calibrate,
@@ -117,18 +119,23 @@ def finetune(
         success=Criterion.parse(success) if success else None,
         seed=seed,
     )
-    settings = _changed(settings, clean_weight, steps, rates or ())
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command, members = finetune_command(target, filter, data, settings), list(episodes)
+        source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": _partial(output)}
         if isinstance(base, ExternalFilter):
-            return _external(base, members, settings, output, episodes.hash, command)
-        tuned = _run(base, members, settings, _partial(output), log, rerun, data_hash=episodes.hash, command=command)
+            return _external(base, members, output, source)
+        tuned = _run(base, members, log, rerun, source)
         profile = measure_profile(tuned.filter, base.name, members, command)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
+
+
+def _partial(output: Path) -> Path:
+    """File from which an interrupted run resumes."""
+    return output.with_name(f"{output.name}.partial")
 
 
 def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, rates: Sequence[str]) -> FineTune:
@@ -141,50 +148,56 @@ def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, 
     return replace(settings, clean_weight=weight, steps=steps, rate=rate, rates=own_rates)
 
 
-def _partial(output: Path) -> Path:
-    """File from which an interrupted run resumes."""
-    return output.with_name(f"{output.name}.partial")
-
-
-def _external(
-    base: ExternalFilter, episodes: list[Episode], settings: FineTune, output: Path, data_hash: str, command: str
-) -> console.Result:
-    """Fine-tune the module of an external filter on its own loss."""
-    from beliefscope.filters.external.load import load_external
-    from beliefscope.filters.external.weights import save_weights
-    from beliefscope.filters.finetuning.external import finetune_external, loss_of
+@contextmanager
+def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: str = "") -> Iterator[Callbacks]:
+    """Progress bars and logs of a fine-tuning."""
     from beliefscope.filters.finetuning.finetune import Callbacks
-    from beliefscope.filters.finetuning.report import error_summary
+    from beliefscope.filters.finetuning.report import curve_values, error_summary
+    from beliefscope.recordings.rerun_log.training_curves import log_curves
 
     validations: list[Validation] = []
-    partial = _partial(output)
-    with console.bars() as update:
+    with console.bars() as update, log_curves(log, viewer, console.note) as write:
+
+        def on_validation(validation: Validation) -> None:
+            validations.append(validation)
+            write(validation.step, {**curve_values(validation), "score": validation.score})
 
         def report(step: int, count: int, loss: float) -> None:
             errors = error_summary(base.task.main_error, validations[0], validations[-1])
             update("Fine-tuning", step / count, f"loss {loss:.3g}; {errors}")
 
-        result = finetune_external(
-            base,
-            loss_of(base.source),
-            episodes,
-            data_hash=data_hash,
-            settings=settings,
-            command=command,
-            callbacks=Callbacks(
-                report,
-                validations.append,
-                lambda step: console.note(f"resuming after step {step}, from {partial.name}"),
-                lambda: False,
-            ),
-            partial=partial,
-        )
+        def on_resume(step: int) -> None:
+            console.note(f"resuming after step {step}, from {partial.name}")
+
+        yield Callbacks(report, on_validation, on_resume)
+
+
+def _run(
+    base: Checkpoint, episodes: list[Episode], log: Path | None, viewer: str, source: Mapping[str, Any]
+) -> FineTuned:
+    """Fine-tune a filter of this project. source: other arguments of ``finetune``."""
+    from beliefscope.filters.finetuning.finetune import finetune as tune
+
+    with _progress(base, source["partial"], log, viewer) as callbacks:
+        tuned = tune(base, episodes, callbacks=callbacks, **source)
+    assert tuned is not None, "runs without a stop callback always complete"
+    return tuned
+
+
+def _external(base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any]) -> console.Result:
+    """Fine-tune the module of an external filter on its own loss. source: other arguments of ``finetune_external``."""
+    from beliefscope.filters.external.load import load_external
+    from beliefscope.filters.external.weights import save_weights
+    from beliefscope.filters.finetuning.external import finetune_external, loss_of
+
+    with _progress(base, source["partial"]) as callbacks:
+        result = finetune_external(base, loss_of(base.source), episodes, callbacks=callbacks, **source)
     assert result is not None, "runs without a stop callback always complete"
     tensors, record = result
     save_weights(tensors, output)
-    source = f"{base.source.partition('@')[0]}@{output}"
-    digest = load_external(source, base.task).hash
-    lines = [*_summary(record), "", f"beliefscope change {base.source} {source} --task {base.task.name}"]
+    tuned = f"{base.source.partition('@')[0]}@{output}"
+    digest = load_external(tuned, base.task).hash
+    lines = [*_summary(record), "", f"beliefscope change {base.source} {tuned} --task {base.task.name}"]
     return opt.checkpoint_result(output, base.task.name, base.name, digest, record, lines)
 
 
@@ -207,30 +220,6 @@ def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) ->
     return judge(settings.success, comparison, base.task)
 
 
-def _modules_and_data(
-    base: Checkpoint,
-    train: Sequence[str],
-    freeze: Sequence[str],
-    slices: Sequence[str],
-    fault_sets: Sequence[str],
-    events: Sequence[str],
-) -> FineTune:
-    """Settings with these modules and data, or the default ones of the filter if none are given."""
-    from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.defaults import default_settings
-    from beliefscope.filters.finetuning.settings import FineTune, StepRange
-    from beliefscope.filters.finetuning.slices import parse_slices
-
-    if not isinstance(base, ExternalFilter) and not any((train, freeze, slices, fault_sets, events)):
-        return default_settings(base.filter)
-    return FineTune(
-        train=tuple(train),
-        freeze=tuple(freeze),
-        mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices, fault_sets, base.task)),
-        events=tuple(StepRange.parse(text) for text in events),
-    )
-
-
 def _summary(record: dict[str, Any]) -> list[str]:
     """Lines about training, errors before and after, and frozen tensors."""
     from beliefscope.filters.finetuning.report import held_out_rows, training_summary
@@ -244,36 +233,3 @@ def _summary(record: dict[str, Any]) -> list[str]:
         "",
         unchanged if frozen["tensors"] else "No tensor was frozen.",
     ]
-
-
-def _run(
-    base: Any, episodes: list[Any], settings: FineTune, partial: Path, log: Path | None, viewer: str, **source: Any
-) -> FineTuned:
-    """Fine-tune with progress bars and logs. source: hash of the data and command line, for the record."""
-    from beliefscope.filters.finetuning.finetune import finetune as tune
-    from beliefscope.filters.finetuning.report import curve_values, error_summary
-    from beliefscope.recordings.rerun_log.training_curves import log_curves
-
-    validations: list[Validation] = []
-    with console.bars() as update, log_curves(log, viewer, console.note) as write:
-
-        def on_validation(validation: Validation) -> None:
-            validations.append(validation)
-            write(validation.step, {**curve_values(validation), "score": validation.score})
-
-        def report(step: int, count: int, loss: float) -> None:
-            errors = error_summary(base.task.main_error, validations[0], validations[-1])
-            update("Fine-tuning", step / count, f"loss {loss:.3g}; {errors}")
-
-        tuned = tune(
-            base,
-            episodes,
-            settings=settings,
-            report=report,
-            on_validation=on_validation,
-            on_resume=lambda step: console.note(f"resuming after step {step}, from {partial.name}"),
-            partial=partial,
-            **source,
-        )
-    assert tuned is not None, "runs without a stop callback always complete"
-    return tuned

@@ -3,8 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
@@ -59,6 +58,7 @@ def import_(
     from beliefscope.recordings.logs.columns import preview_columns, read_columns
     from beliefscope.recordings.logs.guess import guess_map
     from beliefscope.recordings.logs.read_log import check_complete, read_log, recorded_trace
+    from beliefscope.recordings.open_trace import open_recording
 
     if guess:
         text = guess_map(preview_columns(source), source.stem)
@@ -67,7 +67,7 @@ def import_(
         raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")
     if source.suffix.lower() in RECORDINGS and map is None:
         opt.check_output(output, ".trace", ".live")
-        return _written(opt.open_recording(source, task), output)
+        return _written(open_recording(source, task), output)
     if map is None:
         raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
     mapping = read_map(map)

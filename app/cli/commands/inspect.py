@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
 
 
@@ -44,6 +41,7 @@ def inspect(
     from beliefscope.app.protocol.diagnostic_options import parse_options
     from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
     from beliefscope.inspect.diagnostics.plotting import write_figure
+    from beliefscope.recordings.open_trace import open_traces
 
     for name in only or ():
         check_name("diagnostic", name, DIAGNOSTICS)
@@ -57,7 +55,7 @@ def inspect(
         for name, entry in entries.items()
     }
     opt.check_folder(figures, "--figures")
-    traces, checkpoint = opt.open_traces(paths, filter, task)
+    traces, checkpoint = open_traces(paths, filter, task)
     with console.progress("Inspecting") as advance:
         results, reasons = run_diagnostics(traces, checkpoint, parsed, bool(every or only), advance)
     if not results:

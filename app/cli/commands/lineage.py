@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
@@ -26,8 +23,7 @@ def lineage(paths: list[Path], export: str | None = None, output: Path | None = 
       beliefscope lineage runs --export finetuned.safetensors -o shared
     """
     from beliefscope import __version__
-    from beliefscope.inspect.compare.lineage import export as copy
-    from beliefscope.inspect.compare.lineage import lineage_of
+    from beliefscope.inspect.compare.lineage import export as copy, lineage_of
 
     if (export is None) != (output is None):
         raise BadInput("--export and -o must be given together: the checkpoint, and the folder to copy it to")

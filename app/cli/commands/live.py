@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 import math
 import os
 import shlex
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 

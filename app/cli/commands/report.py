@@ -4,8 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 
@@ -58,9 +57,10 @@ def report(
       beliefscope report run.trace --event 35 --event 68 --all
     """
     from beliefscope.inspect.likelihood import no_maps
+    from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
     from beliefscope.recordings.report.folder import check_folder
-    from beliefscope.recordings.report.pdf import browser, print_page
+    from beliefscope.recordings.report.pdf import browser
 
     check_folder(output)
     chromium = browser() if pdf else None
@@ -69,7 +69,7 @@ def report(
     files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
     if not files:
         raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
-    traces, checkpoint = opt.open_traces(files, filter, task)
+    traces, checkpoint = open_traces(files, filter, task)
     if quantity and checkpoint is not None and (reason := no_maps(checkpoint, traces[0], quantity)):
         raise BadInput(reason)
     steps = [parse_event(text, traces) for text in events or ()]
@@ -92,8 +92,7 @@ def report(
             quantity=quantity,
             progress=lambda fraction: advance(0.6 * fraction),
         )
-        printer = None if chromium is None else lambda page, target: print_page(chromium, page, target)
-        document = write_report(content, output, printer, lambda fraction: advance(0.6 + 0.4 * fraction))
+        document = write_report(content, output, chromium, lambda fraction: advance(0.6 + 0.4 * fraction))
     lines = [f"{content.titles[name][0]}: {verdict}" for name, verdict in document["diagnostics"].items()]
     lines += [f"{title}: not available: {reason}" for title, reason in document["not_made"].items()]
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())

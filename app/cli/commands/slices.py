@@ -1,18 +1,9 @@
-from __future__ import annotations
-
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
 @opt.with_options(
-    by=opt.option(
-        "SCORE",
-        "Score to compare: error (position), the name of an angle, nees, ess (effective sample size), disagreement "
-        "(of the modalities) or regret (of the fusion weights).",
-    ),
     alpha=opt.option("P", "Probability of reporting any slice if errors depend on nothing."),
-    every=opt.flag("Search all episodes, not only the held-out ones.", "--all"),
 )
 def slices(runs: opt.Runs, by: str = "error", alpha: float = 0.05, every: bool = False) -> console.Result:
     """Find data slices in which a filter is worse.
@@ -39,9 +30,7 @@ def slices(runs: opt.Runs, by: str = "error", alpha: float = 0.05, every: bool =
             range(len(episodes)) if every else episodes.held_out(),
             by=by,
             alpha=alpha,
-            faults=faults,
-            seed=runs.seed,
-            particles=runs.particles,
+            **runs.settings(faults),
             progress=advance,
         )
     return console.Result(report.to_dict(), "\n\n".join([report.verdict, *console.grids(report.tables())]))

@@ -3,8 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     ),
     seeds=opt.option("K", "Train each filter with seeds 0 to K - 1.", parser=opt.integer(1)),
     data=opt.option("TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset."),
-    engine=opt.ENGINE,
     workers=opt.option("N", "Processes of this machine, each with one thread.", parser=opt.integer(1)),
 )
 def study(
@@ -65,15 +63,7 @@ def study(
     for name, path in files.items():
         if tasks and name not in tasks:
             raise BadInput(f"--data '{name}={path}' is for task {name!r}, but the study is of {', '.join(tasks)}")
-    cells = study_cells(
-        preset,
-        tasks or [],
-        filters or [],
-        seeds,
-        files,
-        skip_bad,
-        console.note,
-    )
+    cells = study_cells(preset, tasks or [], filters or [], seeds, files, skip_bad, console.note)
     folder = output.resolve()
     folder.mkdir(exist_ok=True)
     finished = [cell for cell in cells if cell.finished(folder) is not None]

@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
@@ -14,10 +11,7 @@ from beliefscope.datasets.errors import BadInput
     ),
     faults=opt.option("FAULTS", "Sensor faults, such as blackout=0.4; '' is clean data. Repeatable. Default: ''."),
     seeds=opt.option("K", "Run with seeds 0 to K - 1.", parser=opt.integer(1)),
-    every=opt.flag("Run over all episodes, not only the held-out ones.", "--all"),
     block=opt.option("N", "Episodes of a cell, the unit of work that is stored.", parser=opt.integer(1)),
-    engine=opt.ENGINE,
-    workers=opt.WORKERS,
     output=opt.option("DIR", "Folder of the sweep; created if missing.", "-o", "--output"),
 )
 def sweep(

@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 from pathlib import Path
 
-from beliefscope.app.cli import console
-from beliefscope.app.cli import options as opt
+from beliefscope.app.cli import console, options as opt
 
 
 @opt.with_options(output=opt.TRACE)

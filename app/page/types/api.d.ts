@@ -285,9 +285,8 @@ export interface components {
          * DisplayedSensor
          * @description A sensor that is drawn.
          *
-         *     Attributes:
-         *         channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point
-         *             cloud, whose extent is ``high`` in m; else 0.
+         *     channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point cloud,
+         *     whose extent is ``high`` in m; else 0.
          */
         DisplayedSensor: {
             /** Name */
@@ -409,10 +408,8 @@ export interface components {
          * ExperimentRow
          * @description Results of a checkpoint over a data set in one phase.
          *
-         *     Attributes:
-         *         checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it.
-         *         error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``.
-         *         provenance: JSON of the file beside the checkpoint.
+         *     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
+         *     ``unit``, at ``worst_episode`` and ``worst_step``. provenance: JSON of the file beside the checkpoint.
          */
         ExperimentRow: {
             /** Name */
@@ -1233,9 +1230,8 @@ export interface components {
          * RecordingEntry
          * @description A recording, with its metadata once they have been read.
          *
-         *     Attributes:
-         *         modified: ISO 8601. reading: whether its metadata are being read.
-         *         run: the same run in the catalog, or None; ``why_not`` explains why.
+         *     modified: ISO 8601. reading: whether its metadata are being read. run: the same run in the catalog, or None;
+         *     ``why_not`` explains why.
          */
         RecordingEntry: {
             /**
@@ -1438,9 +1434,8 @@ export interface components {
          * ReportRequest
          * @description Body of ``POST /api/reports/...``; the same options as ``beliefscope report``.
          *
-         *     Attributes:
-         *         events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF.
-         *         quantity: of the maps; the other one if the filter does not have it.
+         *     events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF. quantity:
+         *     of the maps; the other one if the filter does not have it.
          */
         ReportRequest: {
             /**
@@ -1932,13 +1927,15 @@ export interface components {
         };
         /**
          * Weakness
-         * @description A weakness and the settings of a fine-tuning that addresses it.
-         *
-         *     Attributes:
-         *         source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
-         *         slices: those of the settings.
+         * @description A weakness and the settings of a fine-tuning that addresses it. slices: those of the settings.
          */
         Weakness: {
+            /** Settings */
+            settings: {
+                [key: string]: unknown;
+            };
+            /** Slices */
+            slices: components["schemas"]["SliceInfo"][];
             /**
              * Source
              * @enum {string}
@@ -1952,12 +1949,6 @@ export interface components {
             episode: number | null;
             /** Step */
             step: number | null;
-            /** Settings */
-            settings: {
-                [key: string]: unknown;
-            };
-            /** Slices */
-            slices: components["schemas"]["SliceInfo"][];
         };
         /**
          * WrittenRecording

@@ -16,7 +16,7 @@ import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 
 from beliefscope.app.api.live import TIMEOUT
-from beliefscope.app.protocol.trace_format import camera_images, columns
+from beliefscope.app.protocol.trace_format import columns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -25,6 +25,7 @@ from beliefscope.inspect.failures.events import failures_of
 from beliefscope.inspect.failures.step_scores import Survey
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_from_arrays
 from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
+from beliefscope.inspect.traces.sensors import camera_images
 from beliefscope.recordings.read import read_recording
 
 pytestmark = pytest.mark.slow

@@ -49,7 +49,7 @@ ASCII = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 RENDER = """
 from pathlib import Path
 from beliefscope.app.server import static_files
-assert "\\u2026" in static_files._index(Path(static_files.__file__).parents[1] / "page", "version").decode()
+assert "\\u2026" in static_files.page_index(Path(static_files.__file__).parents[1] / "page", "version").decode()
 """
 
 

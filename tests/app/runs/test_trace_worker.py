@@ -57,7 +57,7 @@ def test_traces_are_identical_and_a_killed_worker_is_replaced(
     local = TraceStore(replace(settings, workspace=settings.workspace / "local"))
     for selection in (SELECTION, SELECTION.comparison("from=5&to=10&faults=blackout")):
         expected = local.request(selection).trace
-        result = store.request(selection).result(TIMEOUT)
+        result = store.request(selection).future.result(TIMEOUT)
         assert header_of(result) == header_of(expected)
         for name, array in arrays_of(expected).items():
             np.testing.assert_array_equal(arrays_of(result)[name], array, err_msg=name)
@@ -69,8 +69,8 @@ def test_traces_are_identical_and_a_killed_worker_is_replaced(
     run = store.request(OTHER)
     os.kill(first, signal.SIGKILL)
     with pytest.raises(RuntimeError, match=r"its process was ended by signal 9 \(SIGKILL\)"):
-        run.result(TIMEOUT)
-    assert len(store.request(OTHER).result(TIMEOUT)) == 40
+        run.future.result(TIMEOUT)
+    assert len(store.request(OTHER).future.result(TIMEOUT)) == 40
     assert pid(worker) != first
 
 
@@ -87,7 +87,7 @@ def test_errors_are_reported_and_close_ends_a_run(store: TraceStore, worker: Tra
     closing.join(TIMEOUT)
     assert not closing.is_alive()
     with pytest.raises(RuntimeError, match=r"signal 9|the server is stopping"):  # started before or after the close
-        run.result(TIMEOUT)
+        run.future.result(TIMEOUT)
 
 
 def test_requests_survive_json(settings: Settings) -> None:

@@ -56,7 +56,7 @@ def request_runs(store: TraceStore, count: int) -> list[weakref.ref[TracedRun]]:
     refs = []
     for number in range(1, count + 1):
         run = store.request(faulty_run(number))
-        run.result(TIMEOUT)
+        run.future.result(TIMEOUT)
         refs.append(weakref.ref(run))
     return refs
 
@@ -82,7 +82,7 @@ def test_memory_of_traces_is_limited(store: TraceStore, monkeypatch: pytest.Monk
 
 def test_trace_in_use_is_kept_and_shared(store: TraceStore) -> None:
     run = store.request(faulty_run(90))
-    run.result(TIMEOUT)
+    run.future.result(TIMEOUT)
     request_runs(store, TRACES_IN_MEMORY + 1)
     assert store.request(faulty_run(90)) is run
 
@@ -109,7 +109,7 @@ def test_number_of_waiting_runs_is_limited(client: TestClient, monkeypatch: pyte
     assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.3"}).status_code == 202
     assert client.get("/api/trace/door/crossmodal-ekf/1/columns", params={"faults": "blackout=0.3"}).status_code == 202
     proceed.set()
-    store.request(faulty_run(30)).result(TIMEOUT)
+    store.request(faulty_run(30)).future.result(TIMEOUT)
     assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.5"}).status_code in (200, 202)
 
 
@@ -161,7 +161,7 @@ def test_disk_fills_during_upload(client: TestClient, monkeypatch: pytest.Monkey
 
 def test_maps_are_cached(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
     run = store.request(faulty_run(1, "crossmodal-pf"))
-    run.result(TIMEOUT)
+    run.future.result(TIMEOUT)
     maps = run.encoded_maps(3, 41)
     assert run.encoded_maps(3, 41) is maps
     assert run.encoded_maps(3, 41, MapOptions(0.1)) is not maps

@@ -9,7 +9,7 @@ import pytest
 
 from beliefscope.app.protocol.messages import LAYERS
 from beliefscope.app.protocol.trace_format import scene_layers
-from beliefscope.app.views.scene_context import IMAGE_DISTANCE, MAX_RINGS, ring_spacing
+from beliefscope.app.views.scene_context import IMAGE_DISTANCE
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.replay import replay, replay_model
@@ -166,11 +166,3 @@ def test_the_start_view_contains_the_robot_and_the_camera_with_its_image(task: s
     assert depths.min() > 0.0
     assert np.abs((points - eye) @ np.cross(aside, ahead) / depths).max() < 1.0
     assert np.abs((points - eye) @ aside / depths).max() < 4.0 / 3.0, "also in a panel of 4:3"
-
-
-def test_the_rings_of_the_force_arrow_are_round_numbers() -> None:
-    largest = np.geomspace(0.02, 5000.0, 200)
-    spacing = np.array([ring_spacing(newtons) for newtons in largest])
-    assert (largest / spacing <= MAX_RINGS * (1 + 1e-9)).all()
-    assert (largest / spacing > MAX_RINGS / 2.5 - 1e-9).all(), "the next smaller spacing has too many rings"
-    assert {f"{value:.0e}"[0] for value in spacing} == {"1", "2", "5"}

@@ -16,7 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.finetuning.batch_mix import Mix
-from beliefscope.filters.finetuning.finetune import FineTuned, finetune
+from beliefscope.filters.finetuning.finetune import Callbacks, FineTuned, finetune
 from beliefscope.filters.finetuning.loop import FilterLoop, Validation, score
 from beliefscope.filters.finetuning.module_selection import freeze, named_tensors, select_parameters
 from beliefscope.filters.finetuning.report import no_change
@@ -172,8 +172,10 @@ def test_interrupted_run_resumes_to_the_same_weights(episodes: list[Episode], tm
             episodes,
             data_hash="-",
             settings=settings,
-            report=lambda step, count, loss: steps.append(step),
-            stop=lambda at=pause_at: len(steps) == at,  # type: ignore[misc]
+            callbacks=Callbacks(
+                report=lambda step, count, loss: steps.append(step),
+                stop=lambda at=pause_at: len(steps) == at,  # type: ignore[misc]
+            ),
             partial=partial,
         )
     assert steps == [1, 2, 3], "no step runs twice"
@@ -188,7 +190,7 @@ def test_interrupted_run_resumes_to_the_same_weights(episodes: list[Episode], tm
 
     while True:
         try:
-            result = run(episodes, settings, report=kill, partial=partial)
+            result = run(episodes, settings, callbacks=Callbacks(kill), partial=partial)
             break
         except Killed:
             pass

@@ -8,7 +8,6 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -18,29 +17,29 @@ EPISODES, SEED = 60, 1000
 """Number of simulated episodes, and the seed of their random numbers, which no sample set has."""
 
 
-def simulated_episodes(settings: Settings, name: str, data: Dataset) -> int:
+def simulated_episodes(name: str, data: Dataset, is_sample: bool) -> int:
     """Number of episodes to simulate for a fine-tuning; 0 if the data set has training episodes.
 
-    Raises BadInput if it has none and is not a sample set of a task that can be simulated.
+    Raises BadInput if it has none and is not the sample set of a task that can be simulated.
     """
     if any(summary.split == "train" for summary in data.summaries):
         return 0
-    if name in settings.data or data.task.simulate is None:
+    if not is_sample or data.task.simulate is None:
         raise BadInput(f"Data set {name!r} has no training episodes (split 'train').")
     return EPISODES
 
 
 def training_episodes(
-    settings: Settings, name: str, data: Dataset, progress: Callable[[int, int], None]
+    name: str, data: Dataset, is_sample: bool, folder: Path, progress: Callable[[int, int], None]
 ) -> tuple[list[Episode], str]:
     """The episodes of the data set, then simulated ones if it has none to train on; and the hash of all.
 
-    Simulated episodes are stored in the workspace. Raises BadInput as ``simulated_episodes`` does.
+    Raises BadInput as ``simulated_episodes`` does. folder: for the simulated episodes, which are reused.
     """
     episodes = list(data)
-    if not simulated_episodes(settings, name, data):
+    if not simulated_episodes(name, data, is_sample):
         return episodes, data.hash
-    path = settings.workspace / "finetune" / f"{data.task.name}-train.h5"
+    path = folder / f"{data.task.name}-train.h5"
     if not path.exists():
         _simulate(path, data, len(episodes[0]), progress)
     with closing(open_dataset(path)) as simulated:

@@ -1,0 +1,46 @@
+"""Tables of the accuracy of a filter, its baselines and its modalities."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from beliefscope.filters.evaluate import STANDALONE, UPDATE
+from beliefscope.inspect.diagnostics.views import Table
+
+LABELS = {
+    "rmse": "",
+    "rmse_from_step_0": ", from step 0",
+    "rmse_before_contact": ", before first contact",
+    "rmse_after_contact": ", after first contact",
+}
+"""Key of the metrics -> label of its rows."""
+
+
+def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
+    """The metrics of a filter and its baselines, a row for each measure; then those of its modalities, if any.
+
+    metrics: of ``filters.evaluate.Metrics.to_dict``.
+    """
+    columns = [metrics, *(baseline or {} for baseline in metrics["baselines"].values())]
+    rows = [
+        (f"rmse {name}{label}", *(_number(column.get(key, {}).get(name)) for column in columns))
+        for key, label in LABELS.items()
+        for name in metrics.get(key, {})
+    ]
+    rows += [(name, _number(metrics[name]), "", "") for name in ("nll", "nees", "coverage95")]
+    tables = [Table(title, ("measure", "filter", *metrics["baselines"]), tuple(rows))]
+    errors = {
+        label.format(name): metrics[key][name]["rmse"]
+        for name in metrics.get("standalone", {})
+        for key, label in (("updates", UPDATE), ("standalone", STANDALONE))
+        if name in metrics.get(key, {})
+    }
+    if errors:
+        rows = [(f"rmse {name}", *(_number(rmse[name]) for rmse in errors.values())) for name in metrics["rmse"]]
+        tables.append(Table("Modalities", ("measure", *errors), tuple(rows)))
+    return tables
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else f"{value:8.2f}"

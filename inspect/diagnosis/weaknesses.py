@@ -1,0 +1,83 @@
+"""Weaknesses of a filter that fine-tuning can address: probable causes, phases with failures, defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.filters.filter import Filter
+from beliefscope.filters.finetuning.defaults import default_settings, reason
+from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.slices import Slice
+from beliefscope.filters.finetuning.success import Criterion
+from beliefscope.inspect.diagnosis.training import training_for, training_on
+
+PROBABLE = 0.2
+"""Smallest probability of a cause that is offered."""
+
+PHASE_SLICES = {
+    "contact made": Slice("contact", contact=True),
+    "contact lost": Slice("contact", contact=True),
+    "steady contact": Slice("contact", contact=True),
+    "blackout": Slice("blackout 0.8", Faults.parse("blackout=0.8")),
+    "free motion": Slice("free motion", contact=False),
+}
+"""Phase of failure events -> slice of the steps to learn from."""
+
+
+@dataclass(frozen=True)
+class Weakness:
+    """A weakness and the settings of a fine-tuning that addresses it.
+
+    source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
+    """
+
+    source: Literal["diagnosis", "failures", "default"]
+    title: str
+    evidence: str
+    episode: int | None
+    step: int | None
+    settings: FineTune
+
+
+def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, episode: int) -> Iterator[Weakness]:
+    """Probable causes of a diagnosis, as JSON values, of a run over an episode with these faults."""
+    for cause in diagnosis["causes"]:
+        settings = training_for(cause["cause"], filter_, faults)
+        if cause["probability"] < PROBABLE or settings is None:
+            continue
+        evidence = next(iter(cause["evidence"]), None) or {"text": "", "episode": None, "step": None}
+        text = f"Probability {cause['probability']:.2f}: {evidence['text']}"
+        if (recovered := cause["recovered"]) and recovered["error"] is not None:
+            text += f"; undoing it recovers {100 * recovered['error']:.0f} % of the error"
+        title = diagnosis["headline"] if cause is diagnosis["causes"][0] else cause["cause"]
+        at = episode if evidence["episode"] is None else evidence["episode"]
+        yield Weakness("diagnosis", title, f"{text}.", at, evidence["step"], settings)
+
+
+def failing(scores: Sequence[Mapping[str, Any]], filter_: Filter) -> Iterator[Weakness]:
+    """Phases in which large errors are over-represented. scores: of a failure document."""
+    score = next((score for score in scores if score["name"] == "error"), {})
+    for phase in score.get("phases", ()):
+        slice_ = PHASE_SLICES.get(phase["name"])
+        settings = training_on(slice_, filter_) if slice_ else None
+        event = next((event for event in score["events"] if event["phase"] == phase["name"]), None)
+        if not phase["over_represented"] or settings is None or event is None:
+            continue
+        evidence = (
+            f"{100 * phase['share']:.0f} % of the steps and {100 * phase['event_share']:.0f} % of {score['total']} "
+            f"events, {phase['lift']:.1f} times as many as expected (p = {phase['p_value']:.2g})."
+        )
+        title = f"Large errors in phase \u201c{phase['name']}\u201d"
+        yield Weakness("failures", title, evidence, event["episode"], event["step"], settings)
+
+
+def untrained(filter_: Filter) -> Iterator[Weakness]:
+    """The sensor fault that the training data of a filter lack, if its default fine-tuning addresses one."""
+    if why := reason(filter_):
+        settings = default_settings(filter_)
+        name = settings.mix[0][0].name
+        title = f"Sensor fault \u201c{name}\u201d, which the training data lack"
+        yield Weakness("default", title, why, None, None, replace(settings, success=Criterion(name)))
