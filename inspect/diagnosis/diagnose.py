@@ -19,12 +19,13 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery
+from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence
 from beliefscope.inspect.diagnosis.interventions import ratios, recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, burden, explain, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnosis.visibility import VISIBLE, Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile, profile_document
 from beliefscope.inspect.trace import Trace
@@ -51,25 +52,7 @@ WORTH_UNDOING = 0.02
 RESTORED = 0.3
 """Weight of the restored share of all deviations in the score of a cause that was undone."""
 
-VISIBLE = {"error//all": 1.2, "angle error//all": 1.2, "nees/fused/all": 2.0}
-"""Statistic -> ratio to its healthy value, or inverse ratio of the NEES, from which a fault affects the filter."""
-
 Rows = Sequence[Mapping[str, float]]
-
-
-@dataclass(frozen=True)
-class Effect:
-    """Effect of undoing a cause.
-
-    Attributes:
-        restored: share of all deviations that disappears.
-        ratios: statistic of ``VISIBLE`` -> value with the fault relative to that without it; empty if the cause cannot
-            be undone completely.
-    """
-
-    recovery: Recovery
-    restored: float
-    ratios: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -292,34 +275,11 @@ def _conclude(
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    masked = effects is not None and not _visible(case, effects.get(candidates[0].cause.name) if sure else None)
+    masked = effects is not None and not is_visible(
+        case.by_statistic, effects.get(candidates[0].cause.name) if sure else None
+    )
     headline = _headline(affected, candidates, masked, len(case.rows))
     return Diagnosis(state, masked, headline, candidates, _provenance(case))
-
-
-def _visible(case: Case, effect: Effect | None) -> bool:
-    """Whether a fault affects the filter: its error or calibration differ from those without the fault.
-
-    If it was undone, these are known for the same episodes, and other faults must show as alarms. Otherwise errors and
-    calibration must be outside of the healthy range, or the error decrease without the faulty sensor.
-    """
-    undone = effect is not None and bool(effect.ratios)
-    if effect is not None:
-        changes = effect.ratios or {"error//all": 1.0 / max(1.0 - effect.recovery.error, 1e-9)}
-        if any(_large(name, ratio) for name, ratio in changes.items()):
-            return True
-    found = (case.by_statistic.get(name) for name in VISIBLE)
-    return any(
-        _large(d.statistic, d.value / d.healthy) and (d.alarm if undone else not d.low <= d.value <= d.high)
-        for d in found
-        if d is not None
-    )
-
-
-def _large(statistic: str, ratio: float) -> bool:
-    """Whether a statistic of ``VISIBLE`` changes by its limit; errors that decrease do not count."""
-    limit = VISIBLE[statistic]
-    return ratio > limit or (statistic.startswith("nees") and ratio < 1.0 / limit)
 
 
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:

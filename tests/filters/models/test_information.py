@@ -289,6 +289,9 @@ def test_a_sensor_without_information_has_an_optimum_at_infinite_noise(
             def sense(self, name: str, observations: object, noise: float = noise) -> tuple[Tensor, Tensor]:
                 return torch.zeros_like(truth), torch.full_like(truth, noise)
 
+            def has_reading(self, batch: Batch, modalities: list[str]) -> Tensor:
+                return torch.ones(batch.states.shape[:2], dtype=torch.bool)
+
         losses.append(float(sensor_likelihood(Sensor(), "image", many)))  # type: ignore[arg-type]
     assert losses[0] > losses[1] > losses[2]
 
