@@ -90,7 +90,7 @@ class Errors(Diagnostic):
             noun, verb = ("outage", "has") if outage.count == 1 else ("outages", "have")
             text = f"{outage.count} {noun} of {outage.modality}, up to {outage.longest:.3g} s, {verb} "
             text += f"{outage.share:.0%} of the squared error in {outage.steps:.0%} of the steps"
-            if (long := outage.dominant) is not None:
+            if (long := outage.dominant) is not None and long.steps < outage.steps:
                 text += f"; those over {long.low:g} s have {long.share:.0%} in {long.steps:.0%}, with an error of "
                 text += self._text(math.sqrt(long.square))
             if not math.isnan(outage.recovery):
