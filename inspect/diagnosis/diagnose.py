@@ -26,7 +26,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statist
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnosis.visibility import VISIBLE, Effect, is_visible
-from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
+from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile, profile_document
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -174,11 +174,15 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
 
 def no_diagnosis(checkpoint: Checkpoint) -> str | None:
     """Reason why a filter has no diagnosis, and what it needs; None if it has one."""
-    if profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint) is not None:
-        return None
+    lacking = "no healthy record"
+    if (document := profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)) is not None:
+        count = document.get("episodes") if isinstance(document, dict) else None
+        if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
+            return None
+        lacking = f"a healthy record of {count} episodes, of which at least {MIN_HEALTHY} are needed"
     source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
     return (
-        f"filter {checkpoint.name!r} has no healthy record; compare it with clean episodes: beliefscope diagnose "
+        f"filter {checkpoint.name!r} has {lacking}; compare it with clean episodes: beliefscope diagnose "
         f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
     )
 

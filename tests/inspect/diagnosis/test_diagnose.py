@@ -19,7 +19,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import open_filter
-from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 
@@ -115,6 +115,14 @@ def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
         diagnose(checkpoint(), {}, profile=profile())
     with pytest.raises(BadInput, match="no healthy record"):
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
+
+
+def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
+    """The comparison needs ten values of a statistic, so the page must not offer a diagnosis with fewer."""
+    few, enough = ({**profile().to_json(), "episodes": count} for count in (7, 20))
+    filter_ = replace(checkpoint(), hash="other", name="mine", healthy_profile=few)
+    assert "a healthy record of 7 episodes, of which at least 10 are needed" in (no_diagnosis(filter_) or "")
+    assert no_diagnosis(replace(filter_, healthy_profile=enough)) is None
 
 
 def test_external_filters_are_compared_with_a_measured_profile() -> None:
