@@ -179,7 +179,7 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
         count = document.get("episodes") if isinstance(document, dict) else None
         if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
             return None
-        lacking = f"a healthy record of {count} episodes, of which at least {MIN_HEALTHY} are needed"
+        lacking = f"a healthy record of {count} episodes, fewer than the {MIN_HEALTHY} needed"
     source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
     return (
         f"filter {checkpoint.name!r} has {lacking}; compare it with clean episodes: beliefscope diagnose "

@@ -121,7 +121,7 @@ def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
     """The comparison needs ten values of a statistic, so the page must not offer a diagnosis with fewer."""
     few, enough = ({**profile().to_json(), "episodes": count} for count in (7, 20))
     filter_ = replace(checkpoint(), hash="other", name="mine", healthy_profile=few)
-    assert "a healthy record of 7 episodes, of which at least 10 are needed" in (no_diagnosis(filter_) or "")
+    assert "a healthy record of 7 episodes, fewer than the 10 needed" in (no_diagnosis(filter_) or "")
     assert no_diagnosis(replace(filter_, healthy_profile=enough)) is None
 
 
