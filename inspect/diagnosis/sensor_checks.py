@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
-from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, saturated, stuck, vector_statistics
+from beliefscope.inspect.diagnosis.vector_checks import (
+    AXES,
+    contact_distance_statistics,
+    free_motion,
+    saturated,
+    stuck,
+    vector_statistics,
+)
 from beliefscope.inspect.diagnosis.window_checks import (
     EXTREME,
     RANGE,
@@ -29,7 +36,8 @@ def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference)
-    return values | vector_statistics(episode) | window_statistics(episode, reference)
+    values |= vector_statistics(episode) | contact_distance_statistics(episode, reference)
+    return values | window_statistics(episode, reference)
 
 
 def localise(statistic: str, episode: Episode, reference: Reference | None) -> tuple[int, int] | None:

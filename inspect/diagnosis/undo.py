@@ -45,6 +45,12 @@ def undo(name: str, setting: Setting, deviations: Deviations, base: Checkpoint |
     return function(setting, deviations)
 
 
+def brings_back(name: str, base: Checkpoint | None = None) -> bool:
+    """Whether an intervention brings back healthy readings, modules or equations; others only remove a sensor."""
+    removes = BY_SUBJECT.get(name.rpartition(" ")[0]) is drop or UNDO.get(name) is skip_lost_images
+    return not removes or (base is not None and name in MODULES)
+
+
 def _with_modules(setting: Setting, base: Checkpoint, prefixes: Sequence[str]) -> Setting | None:
     """The modules whose names start with one of the prefixes, from another checkpoint."""
     if base.filter.architecture != setting.checkpoint.filter.architecture:
@@ -65,11 +71,16 @@ def _with_filter(setting: Setting, filter_: Filter) -> Setting:
 
 def _with_evidence(setting: Setting, change: Callable[[Evidence], Evidence]) -> Setting:
     """A filter whose evidence is changed."""
+    return _with_encoder(setting, lambda evidence, batch: change(evidence))
+
+
+def _with_encoder(setting: Setting, change: Callable[[Evidence, Batch], Evidence]) -> Setting:
+    """A filter whose evidence is changed, depending on the readings."""
     filter_ = _copy(setting.checkpoint)
     encode = filter_.encode
 
     def encode_and_change(batch: Batch) -> Evidence:
-        return change(encode(batch))
+        return change(encode(batch), batch)
 
     object.__setattr__(filter_, "encode", encode_and_change)
     return _with_filter(setting, filter_)
@@ -92,6 +103,22 @@ def drop(modality: str, setting: Setting, deviations: Deviations) -> Setting | N
         return evidence.select_models(present)
 
     return _with_evidence(setting, select)
+
+
+def skip_lost_images(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Without the models that use images at the steps with a lost image; an external filter without all its images."""
+    checkpoint = setting.checkpoint
+    if isinstance(checkpoint, ExternalFilter):
+        return without_sensor(setting, checkpoint, "image")
+    keys = [key for key in checkpoint.task.modalities.get("image", ()) if len(checkpoint.task.observations[key]) >= 2]
+    seeing = torch.tensor(["image" in model.split("+") for model in checkpoint.filter.names])
+
+    def select(evidence: Evidence, batch: Batch) -> Evidence:
+        images = [batch.observations[key] for key in keys]
+        lost = torch.stack([(i == i[:, :, :1, :1]).flatten(2).all(-1) for i in images]).all(0)  # (T, N)
+        return evidence.select_models(~(lost[..., None] & seeing))
+
+    return _with_encoder(setting, select) if keys and seeing.any() else None
 
 
 def rescale(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
@@ -211,9 +238,11 @@ def invert_beta(setting: Setting, deviations: Deviations) -> Setting | None:
     return change_beta(setting, lambda logit: -logit)
 
 
-def more_particles(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Ten times as many particles."""
-    return replace(setting, particles=10 * setting.particles)
+def healthy_particles(setting: Setting, deviations: Deviations) -> Setting | None:
+    """As many particles as in the healthy record; None if there are more already."""
+    known = deviations.get("particles//all")
+    healthy = 0 if known is None else round(known.healthy)
+    return replace(setting, particles=healthy) if healthy > setting.particles else None
 
 
 def restore_equations(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -258,8 +287,9 @@ UNDO: dict[str, Undo] = {
     "rescale process noise": rescale_process_noise,
     "healthy beta": healthy_beta,
     "invert beta": invert_beta,
-    "10 x particles": more_particles,
+    "healthy particles": healthy_particles,
     "restore equations": restore_equations,
+    "skip lost images": skip_lost_images,
     **READINGS,
 }
 """The other interventions."""

@@ -7,15 +7,19 @@ from itertools import permutations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.statistics.reference_images import HAND
+from beliefscope.inspect.statistics.contact_distance import contact_residual
+from beliefscope.inspect.statistics.reference_images import CONTACT, HAND, Reference, displacements_in_contact
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats, robust_line
 
 AXES = "xyz"
-FORCE, TORQUE, CONTACT = "force", "torque", "contact"
-"""Observation keys of the haptic sensors, which ``datasets/faults`` uses as well."""
+FORCE, TORQUE = "force", "torque"
+"""Observation keys of the wrench, which ``datasets/faults`` uses as well."""
 
 POSITION, CHANGE = slice(0, 3), slice(3, 6)
 """Channels of controls that command a hand position: the previous position and its change."""
+
+CALMER = 0.2
+"""Relative variation of the force with the contact flag below which the flag is inverted."""
 
 MIN_MOTION = 1e-3
 """m per step: the hand moves."""
@@ -58,7 +62,8 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     """The contact flag: how often it is set and changes; compared with the force, how strongly related and how late.
 
     The flag and the force's distance from its median in free motion are correlated in healthy episodes with and without
-    contact. A bias or the sign of the force does not matter.
+    contact. A bias or the sign of the force does not matter. Free motion is without the flag or, if the force hardly
+    varies with it (``CALMER``), with the flag: so an inverted flag has the opposite correlation.
     """
     if CONTACT not in episode.observations:
         return {}
@@ -68,9 +73,13 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     if FORCE not in episode.observations:
         return values
     force = episode.observations[FORCE].astype(np.float64)
-    calm = force[~flag] if (~flag).any() else force
-    size = np.linalg.norm(force - np.median(calm, axis=0), axis=1)
-    both = min(flag.sum(), (~flag).sum()) >= 3 and size.std() > 0
+    both = min(flag.sum(), (~flag).sum()) >= 3
+    calm = ~flag if (~flag).any() else flag
+    size = np.linalg.norm(force - np.median(force[calm], axis=0), axis=1)
+    if both:
+        inverted = np.linalg.norm(force - np.median(force[flag], axis=0), axis=1)
+        size = inverted if np.median(inverted[flag]) < CALMER * np.median(size[~flag]) else size
+    both = both and size.std() > 0
     spread = np.log(size + 1e-2 * max(size.max(), 1e-9))
     related = float(np.corrcoef(flag, spread)[0, 1]) if both else np.nan
     return values | {
@@ -143,6 +152,23 @@ def control_statistics(episode: Episode) -> dict[str, float]:
         "lag/control/all": delay,
         "scale/control/all": float((a * b).sum() / power) if power > 1e-12 else np.nan,
         **{f"offset/control {axis}/all": float(m) for axis, m in zip(AXES, offset, strict=True)},
+    }
+
+
+def contact_distance_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
+    """Distance of the measured hand from the labelled object in contact, beyond that of healthy contacts, m.
+
+    ``contact distance``: its median, which an object of another size changes. ``contact distance error``: the median of
+    its size, which labels or hand positions with an offset increase as well. Neither depends on images or networks.
+    """
+    if reference is None or reference.contact is None or (moved := displacements_in_contact(episode)) is None:
+        return {}
+    if len(moved) < MIN_STEPS:
+        return {}
+    beyond = contact_residual(moved, reference.contact)
+    return {
+        "contact distance/labels/contact": float(np.median(beyond)),
+        "contact distance error/labels/contact": float(np.median(np.abs(beyond))),
     }
 
 

@@ -85,6 +85,8 @@ KINDS = {
     "hand match": ("similarity of the hand in the image to healthy images", True, 0.05),
     "object offset": ("distance in pixels of the object in the image from its labelled position", False, 0.1),
     "object match": ("similarity of the object in the image to healthy images", True, 0.05),
+    "contact distance": ("distance in m of the hand from the labelled object, beyond healthy contacts", False, 5e-4),
+    "contact distance error": ("deviation in m of the hand from the labelled object in contact", False, 5e-4),
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
@@ -125,7 +127,7 @@ PHASES = {
 
 RISING = frozenset(
     {"error", "angle error", "regret", "outside", "black", "frozen", "stuck", "saturation", "occlusion", "change"}
-    | {"opposition", "module error", "module scatter", "dynamics error"}
+    | {"opposition", "contact distance error", "module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 

@@ -25,8 +25,8 @@ FORMAT = 2
 SUFFIX = ".profile.json"
 """Of the file beside a shipped checkpoint."""
 
-DIGITS = 4
-"""Significant digits of stored values."""
+DIGITS = 3
+"""Significant digits of stored values, whose rounding is small against the differences between trajectories."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Healthy reference of the images of a task: the median image, the image expected for a hand position, and landmarks.
+"""Healthy reference of the episodes of a task: the median image, the image expected for a hand position, landmarks, and
+the distance of the hand from the object in contact.
 
 A healthy profile stores it, so that the images of later episodes can be compared with it without ground truth.
 """
@@ -13,13 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, lost_images
-from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter, fit_landmark_filter, quadratic
+from beliefscope.inspect.statistics.contact_distance import HARMONICS, fit_contact_distance
+from beliefscope.inspect.statistics.image_landmarks import DIGITS, LandmarkFilter, fit_landmark_filter, quadratic
 from beliefscope.inspect.statistics.signals import Array
 
 Gray = NDArray[np.uint8]
 
 HAND = "effector_position"
 """Observation key of the measured hand position."""
+
+CONTACT = "contact"
+"""Observation key of the contact flag."""
 
 LEVELS = 127
 """Largest integer of stored expected images."""
@@ -30,7 +35,7 @@ TAIL = 0.002
 
 @dataclass(frozen=True)
 class Reference:
-    """Healthy values of one image sensor.
+    """Healthy values of one image sensor, and of the hand against the labelled object.
 
     Attributes:
         key: observation key of the images.
@@ -43,6 +48,8 @@ class Reference:
         hand: where the hand is seen; None for data without hand positions and in profiles of earlier versions.
         object: where the object is seen, from the labels of the map's components; None for data without labels, and
             in profiles of earlier versions.
+        contact: (2 HARMONICS + 1,) m: distance of the hand from the object in contact by direction
+            (``contact_distance.py``); None for data without contact, and in profiles of earlier versions.
     """
 
     key: str
@@ -53,6 +60,7 @@ class Reference:
     range: Gray | None = None
     hand: LandmarkFilter | None = None
     object: LandmarkFilter | None = None
+    contact: Array | None = None
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -67,6 +75,7 @@ class Reference:
             "range": None if self.range is None else self.range.tolist(),
             "hand": None if self.hand is None else self.hand.to_json(),
             "object": None if self.object is None else self.object.to_json(),
+            "contact": None if self.contact is None else [float(f"{x:.{DIGITS}g}") for x in self.contact],
         }
 
     @classmethod
@@ -84,7 +93,12 @@ class Reference:
             raise ValueError(f"image {image.shape}, spread {spread.shape}")
         if range_ is not None and range_.shape != (2, *image.shape):
             raise ValueError(f"image {image.shape}, range {range_.shape}")
-        return cls(str(value["key"]), image, spread, levels * size[:, None, None], scale, range_, hand, object_)
+        contact = None if value.get("contact") is None else np.array(value["contact"], dtype=np.float64)
+        if contact is not None and contact.shape != (2 * HARMONICS + 1,):
+            raise ValueError(f"contact {contact.shape}")
+        return cls(
+            str(value["key"]), image, spread, levels * size[:, None, None], scale, range_, hand, object_, contact
+        )
 
     @property
     def has_hand(self) -> bool:
@@ -118,7 +132,9 @@ def measure_reference(episodes: Sequence[Episode]) -> Reference | None:
     gray, spread = (np.rint(values).clip(0, 255).astype(np.uint8) for values in (image, np.ceil(spread)))
     expected, scale, hand = _hand_camera(episodes, key)
     range_, object_ = _gray_range(episodes, key, medians, image), _object_filter(episodes, key)
-    return Reference(key, gray, spread, expected, scale, range_, hand, object_)
+    touching = [moved for episode in episodes if (moved := displacements_in_contact(episode)) is not None]
+    contact = fit_contact_distance(touching)
+    return Reference(key, gray, spread, expected, scale, range_, hand, object_, contact)
 
 
 def _gray_range(episodes: Sequence[Episode], key: str, medians: Array, image: Array) -> Gray:
@@ -177,6 +193,19 @@ def object_positions(episode: Episode) -> Array | None:
     """(T, d): true values of the components of the likelihood map; None without labels or map components."""
     positions = episode.states[:, list(episode.task.map_indices)].astype(np.float64)
     return positions if positions.size and np.isfinite(positions).all() else None
+
+
+def displacements_in_contact(episode: Episode) -> Array | None:
+    """(C, 2) m: from the labelled object to the measured hand in the horizontal plane, at the steps in contact.
+
+    None for data without one of them, and if the object's position has not two components.
+    """
+    positions = object_positions(episode)
+    if positions is None or positions.shape[1] != 2 or not {HAND, CONTACT} <= episode.observations.keys():
+        return None
+    hand = episode.observations[HAND].astype(np.float64)
+    touching = episode.observations[CONTACT][:, 0] > 0.5
+    return np.asarray((hand[:, :2] - positions)[touching]) if hand.shape[1] >= 2 else None
 
 
 def normalised(images: Gray) -> Array:

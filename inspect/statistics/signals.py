@@ -14,6 +14,10 @@ MAX_LAG = 12
 MIN_SCORE = 3.5
 """Smallest correlation of two signals with a lag, in standard errors of white noise, 1 / sqrt(number of steps)."""
 
+MIN_GAIN, MIN_STEP_GAIN = 2.0, 0.02
+"""By how much the correlation at a lag of more than one step must exceed that without a lag: in standard errors of
+Fisher's z, 1 / sqrt(number of steps), and itself by step of the lag. A smooth signal correlates at many lags."""
+
 MIN_STEPS = 10
 """Minimum number of steps of an estimate."""
 
@@ -80,7 +84,7 @@ def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, fl
     """Steps by which ``late`` (T, d) follows ``early`` (T, d), and the correlation at that lag.
 
     The lag, at most ``MAX_LAG`` in size, has the largest correlation of late[t] with early[t - lag], pooled over the
-    d columns. NaN if none is significant (``MIN_SCORE``).
+    d columns. NaN if none is significant (``MIN_SCORE``), or if it is hardly larger than without a lag (``MIN_GAIN``).
 
     Args:
         valid: (T,) steps at which ``late`` is known; default: all.
@@ -103,6 +107,11 @@ def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, fl
     best = int(correlation.argmax())
     if correlation[best] < MIN_SCORE / np.sqrt(max(count[best], 1)):
         return np.nan, np.nan
+    if abs(lags[best]) > 1 and enough[MAX_LAG]:
+        largest, without = np.clip(correlation[[best, MAX_LAG]], -0.999, 0.999)
+        gain = (np.arctanh(largest) - np.arctanh(without)) * np.sqrt(count[best])
+        if gain < MIN_GAIN or largest - without < MIN_STEP_GAIN * abs(lags[best]):
+            return np.nan, np.nan
     return float(lags[best]), float(correlation[best])
 
 

@@ -17,6 +17,9 @@ DYNAMICS = f"dynamics */*|{FILTER}"
 LABELS = "lag/labels*|offset/labels*"
 """Labels against the modalities."""
 
+CONTACT_DISTANCE = "contact distance*/*"
+"""Hand against the labelled object in contact, which no image and no module changes."""
+
 IMAGE = f"module */*image*|{LABELS}|{WEIGHTS}"
 """Modules that use the image."""
 

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.consequences import CONTACT_DISTANCE, DYNAMICS, FILTER, LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
 
 MODULES = f"module */*|{WEIGHTS}|{DYNAMICS}"
 
 BY_LABELS = "|".join(f"module {kind}/*" for kind in ("bias", "error", "nis", "spread", "scatter"))
 """Statistics of modules that compare them with the labels."""
+
+CONTACTS = (
+    "|".join(f"{kind}/*" for kind in ("size", "lever", "direction", "axes", "change", "noise", "saturation"))
+    + "|*/contact/*"
+)
+"""Statistics of forces and torques in contact, which depend on the physics; in free motion these say nothing."""
 
 CAUSES = (
     Cause(
@@ -19,7 +25,7 @@ CAUSES = (
             Symptom("lag/labels*|lag/dynamics/*", 1, 2.0),
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
-        f"{OBJECT}|object match/image*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
+        f"{OBJECT}|object match/image*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*",
         "Synchronise the clock of the motion capture with the sensors.",
     ),
     Cause(
@@ -30,7 +36,7 @@ CAUSES = (
             Symptom(OBJECT, 0, optional=True),
             Symptom("module bias/*", 0, 0.3, "common"),
         ),
-        f"object match/image*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
+        f"object match/image*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
         "Register the frame of the motion capture with the robot's.",
     ),
     Cause(
@@ -40,12 +46,12 @@ CAUSES = (
             Symptom("module error/*", 1),
             Symptom(
                 "module power/*|object match/image*|sharpness/image/*|occlusion/image/*|shift/image*|lever/force*"
-                "|size/*",
+                "|size/*|contact distance/*",
                 0,
             ),
         ),
-        f"{OBJECT}|object match/image*|sharpness/*|occlusion/*|shift/*|brightness/*|offset/*|*/force*|*/torque*"
-        f"|*/contact/*|{LABELS}|{MODULES}",
+        f"{OBJECT}|object match/image*|{CONTACT_DISTANCE}|sharpness/*|occlusion/*|shift/*|brightness/*|offset/*"
+        f"|{CONTACTS}|{LABELS}|{MODULES}",
         "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "
         "-o tuned.safetensors`.",
         prior=-0.4,

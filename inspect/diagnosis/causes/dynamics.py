@@ -21,11 +21,11 @@ CAUSES = (
     Cause(
         "dynamics.frozen",
         "Dynamics frozen: predicted changes are too small",
-        (Symptom("dynamics slope/*", -1),),
+        (Symptom("dynamics slope/*|dynamics spread/*", -1),),
         f"dynamics error/*|dynamics nis/*|{FILTER}",
         RETRAIN,
         "scale dynamics",
-        lowers="dynamics spread/*|lag/dynamics/*",
+        lowers="lag/dynamics/*",
     ),
     Cause(
         "dynamics.broken",

@@ -42,7 +42,7 @@ CAUSES = (
         "force.sign",
         "Force sign inverted",
         (Symptom("direction/force/*", 1), Symptom("lever/force*", 0)),
-        f"level/force*|drift/force*|axes/force/*|{CONTACT}|{HAPTICS}",
+        f"level/force*|drift/force*|{CONTACT}|{HAPTICS}",
         "Invert the force, or correct the frame of the sensor.",
         "negate force",
     ),

@@ -23,7 +23,7 @@ CAUSES = (
         (Symptom("black/image/*"),),
         f"lag/image/*|frozen/image/*|{IMAGE}",
         CHECK,
-        "drop image",
+        "skip lost images",
     ),
     Cause(
         "image.frozen",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, HAPTICS
+from beliefscope.inspect.diagnosis.causes.consequences import CONTACT_DISTANCE, DYNAMICS, HAPTICS
 from beliefscope.inspect.diagnosis.causes.image import HAND, LANDMARKS
 
 IN_PHASES = "|".join(f"{kind}/*" for kind in ("level", "drift", "change", "size", "lever", "axes", "direction"))
@@ -17,7 +17,7 @@ CAUSES = (
         "effector.offset",
         "End-effector position offset",
         (Symptom(HAND, 0, otherwise=(Symptom("offset/control*", 0),)),),
-        f"{HAPTICS}|{DYNAMICS}",
+        f"{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Calibrate the robot's kinematics against the camera.",
         "drop haptics",
     ),
@@ -25,7 +25,8 @@ CAUSES = (
         "effector.noise",
         "End-effector position noisy",
         (Symptom("position noise/effector_position*"),),
-        f"{LANDMARKS}|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        f"{LANDMARKS}|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}"
+        f"|{DYNAMICS}",
         "Check the joint encoders and the filter of the robot's kinematics.",
         "drop haptics",
     ),
@@ -36,7 +37,7 @@ CAUSES = (
             Symptom("agreement/contact/*|unflagged force/contact/*|share/contact/*", 0),
             Symptom("share/contact/*|change/force*", 0, 0.5),
         ),
-        f"opposition/contact/extreme|{IN_PHASES}|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        f"opposition/contact/extreme|{IN_PHASES}|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the contact sensor or its threshold.",
         "drop haptics",
         lowers="toggles/contact/*",
@@ -48,7 +49,7 @@ CAUSES = (
             Symptom("agreement/contact/*", -1),
             Symptom("toggles/contact/*|opposition/contact/*"),
         ),
-        f"share/contact/*|unflagged force/contact/*|{IN_PHASES}|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        f"share/contact/*|unflagged force/contact/*|{IN_PHASES}|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the sign and the threshold of the contact sensor.",
         "drop haptics",
     ),
@@ -57,7 +58,7 @@ CAUSES = (
         "Contact flag delayed",
         (Symptom("lag/contact/*"),),
         f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*"
-        f"|direction/*|{LAGS}|{HAPTICS}|{DYNAMICS}",
+        f"|direction/*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Synchronise the contact sensor with the force sensor.",
         "drop haptics",
     ),
@@ -66,7 +67,7 @@ CAUSES = (
         "Haptics lost: all readings repeat the last one",
         (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
         f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|{LANDMARKS}|position noise/*"
-        f"|{HAPTICS}|{DYNAMICS}",
+        f"|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
     ),
@@ -74,7 +75,8 @@ CAUSES = (
         "haptics.delay",
         "Haptics delayed",
         (Symptom("lag/image/*", -1),),
-        f"lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*|{HAPTICS}|{DYNAMICS}",
+        f"lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*|{CONTACT_DISTANCE}|{HAPTICS}"
+        f"|{DYNAMICS}",
         "Synchronise the clocks of camera and robot.",
         "advance haptics",
     ),

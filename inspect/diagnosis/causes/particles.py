@@ -12,7 +12,7 @@ CAUSES = (
         (Symptom("particles/*", -1),),
         FILTER,
         "Use more particles: `beliefscope evaluate {task} --filter {filter} --particles 1000`.",
-        "10 x particles",
+        "healthy particles",
     ),
     Cause(
         "particles.deprived",

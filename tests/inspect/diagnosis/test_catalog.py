@@ -168,6 +168,15 @@ def test_an_optional_symptom_counts_only_where_it_is_observed() -> None:
     assert explain(labels, [bias, differs]).score > explain(model, [bias, differs]).score
 
 
+def test_the_distance_in_contact_separates_the_object_from_the_image_model() -> None:
+    """A larger puck biases the image model, too, but only the puck changes where the hand touches it."""
+    data, model = (next(c for c in CAUSES if c.name == name) for name in ("data.shift", "model.image.bias"))
+    found = [deviation(f"module {kind}/image x/all", 10.0) for kind in ("bias", "error")]
+    same, larger = (deviation("contact distance/labels/contact", t) for t in (0.0, 10.0))
+    assert explain(model, [*found, same]).score > explain(data, [*found, same]).score
+    assert explain(data, [*found, larger]).score > explain(model, [*found, larger]).score
+
+
 def test_the_burden_counts_phases_once_and_the_filter_less() -> None:
     upstream = [deviation("black/image/all", 20.0), deviation("black/image/contact", 20.0)]
     assert burden(upstream) == pytest.approx(1.0, abs=1e-3)

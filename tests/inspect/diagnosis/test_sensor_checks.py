@@ -79,6 +79,13 @@ def test_the_statistic_changes_by_the_planted_amount(
 
 
 @pytest.mark.parametrize("task", TASKS)
+def test_an_inverted_contact_flag_opposes_the_force(task: str) -> None:
+    """From the first step: then no step tells what the flag was before."""
+    assert change(task, "contact_flipped=1", "agreement/contact/all") < -1.2
+    assert change(task, "contact_flipped=1", "opposition/contact/all") > 0.3
+
+
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
     ("faults", "statistic", "amount", "tolerance"),
     [

@@ -165,10 +165,36 @@ def test_only_affected_episodes_change() -> None:
     assert same == [False, True, True]
 
 
+@pytest.mark.parametrize(("own", "expected"), [(20, 300), (300, None), (1000, None)])
+def test_few_particles_become_as_many_as_in_the_record(own: int, expected: int | None) -> None:
+    run = replace(setting(checkpoint("unimodal-pf")), particles=own)
+    known = Deviation("particles//all", float(own), 300.0, 300.0, 300.0, 0.0, True, -10.0)
+    changed = undo("healthy particles", run, {known.statistic: known})
+    assert (None if changed is None else changed.particles) == expected
+
+
 def test_the_last_modality_is_not_dropped() -> None:
     assert undo("drop image", setting(checkpoint("image-ekf")), {}) is None
     assert undo("drop image", setting(checkpoint("feature-ekf")), {}) is None
     assert undo("drop image", setting(checkpoint("unimodal-ekf")), {}) is not None
+
+
+@pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-pf", "image-ekf"])
+def test_lost_images_are_skipped_step_by_step(name: str) -> None:
+    """The pixels of a lost image do not matter, and images of other steps are used."""
+    black, gray = (
+        {index: Faults.parse(f"blackout=0.4:gray={value}").apply(e) for index, e in episodes().items()}
+        for value in (0, 128)
+    )
+    runs = [undo("skip lost images", setting(checkpoint(name), data), {}) for data in (black, gray)]
+    assert None not in runs
+    first, second = (traces(run) for run in runs if run is not None)
+    for index, (a, b) in enumerate(zip(first, second, strict=True)):
+        np.testing.assert_array_equal(a.estimate_mean, b.estimate_mean)
+        clean = traces(setting(checkpoint(name)))[index]
+        lost = np.flatnonzero((black[a.episode_index].observations["image"] == 0).all((1, 2)))
+        np.testing.assert_array_equal(a.estimate_mean[: lost[0]], clean.estimate_mean[: lost[0]])
+        assert not np.array_equal(a.estimate_mean[lost[0]], clean.estimate_mean[lost[0]])
 
 
 def test_recovery_compares_runs() -> None:
