@@ -25,6 +25,8 @@ def diagnose(
     alarm_rate: float = 0.05,
     profile_from: Path | None = None,
     repair: int | None = None,
+    workers: int = 1,
+    engine: opt.Engine = "local",
 ) -> console.Result:
     """Name the probable cause of a filter's fault.
 
@@ -63,6 +65,8 @@ def diagnose(
             alarm_rate=alarm_rate,
             base=other,
             profile=profile,
+            engine=engine,
+            workers=workers,
             progress=advance,
         )
     document, parts = result.to_json(), [result.headline, *console.grids(result.tables())]

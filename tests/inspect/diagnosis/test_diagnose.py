@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -66,6 +67,14 @@ def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
     if cause == "image.frozen":
         assert first.steps is not None
         assert 28 <= first.steps[0] <= 32
+
+
+def test_the_number_of_processes_does_not_matter() -> None:
+    """Two blocks of episodes and up to three interventions, in one process and in two."""
+    episodes = {i: Faults.parse("image_shift=3").apply(e) for i, e in simulated(0, 20).items()}
+    one, two = (diagnose(checkpoint(), episodes, profile=profile(), workers=workers) for workers in (1, 2))
+    assert json.dumps(one.to_json()) == json.dumps(two.to_json())
+    assert one.causes[0].recovered is not None
 
 
 def test_a_fault_in_some_episodes_is_examined_in_these() -> None:

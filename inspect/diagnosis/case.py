@@ -1,0 +1,124 @@
+"""Episodes under diagnosis: their statistics compared with the healthy profile, and what the alarms concern."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+
+import numpy as np
+
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.cause import Cause
+from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
+from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+from beliefscope.inspect.diagnosis.setting import Setting
+from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.trace import Trace
+
+Rows = Sequence[Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Episodes of a filter and their deviations from the healthy profile.
+
+    Attributes:
+        rows: statistics by episode. sensors: those of sensors only.
+        deviations: with t-values relative to their critical values, largest first.
+        p_value: probability of deviations of this size in a healthy filter.
+    """
+
+    setting: Setting
+    traces: Sequence[Trace]
+    rows: Rows
+    sensors: Rows
+    profile: HealthyProfile
+    deviations: Sequence[Deviation]
+    p_value: float
+    alarm_rate: float
+
+    @property
+    def by_statistic(self) -> dict[str, Deviation]:
+        """The deviations by statistic."""
+        return {deviation.statistic: deviation for deviation in self.deviations}
+
+    @property
+    def alarms(self) -> list[Deviation]:
+        """Significant deviations, largest first; none if all deviations together are not significant."""
+        return [deviation for deviation in self.deviations if deviation.alarm and self.p_value <= self.alarm_rate]
+
+
+def observe(trace: Trace, checkpoint: Checkpoint, profile: HealthyProfile) -> tuple[dict[str, float], dict[str, float]]:
+    """All statistics of a run, and those of its sensors only."""
+    sensors = sensor_statistics(trace.episode, profile.reference)
+    return episode_statistics(trace, checkpoint, sensors), sensors
+
+
+def examine_again(case: Case, setting: Setting, traces: Sequence[Trace]) -> Case:
+    """Another run of the episodes of a case; statistics of sensors remain where the readings are the same."""
+    known = {id(trace.episode): sensors for trace, sensors in zip(case.traces, case.sensors, strict=True)}
+    rows, sensors = [], []
+    for trace in traces:
+        same = known.get(id(trace.episode))
+        sensors.append(sensor_statistics(trace.episode, case.profile.reference) if same is None else same)
+        rows.append(episode_statistics(trace, setting.checkpoint, sensors[-1]))
+    return compared(setting, traces, rows, sensors, case.profile, case.alarm_rate)
+
+
+def compared(
+    setting: Setting, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
+) -> Case:
+    """The statistics of traces, compared with a healthy profile."""
+    scattered, all_rows = with_scatter(profile, rows)
+    comparison = compare(scattered, all_rows)
+    deviations = with_critical_values(scattered, comparison, alarm_rate)
+    return Case(setting, traces, all_rows, sensors, profile, deviations, comparison.p_value, alarm_rate)
+
+
+def focus(case: Case) -> Case:
+    """The episodes with the largest alarm, if it does not concern the others; otherwise all of them."""
+    alarm = case.alarms[0]
+    hit = affected_episodes(case, case.alarms)
+    values = [row.get(alarm.statistic, np.nan) for row, chosen in zip(case.rows, hit, strict=True) if not chosen]
+    others = [value for value in values if np.isfinite(value)]
+    if not others or not alarm.low <= np.mean(others) <= alarm.high:
+        return case
+    traces = list(compress(case.traces, hit))
+    rows, sensors = (list(compress(rows, hit)) for rows in (case.rows, case.sensors))
+    episodes = {trace.episode_index: case.setting.episodes[trace.episode_index] for trace in traces}
+    setting = replace(case.setting, episodes=episodes, affected=frozenset(episodes))
+    part = compared(setting, traces, rows, sensors, case.profile, case.alarm_rate)
+    part = replace(part, p_value=case.p_value)
+    return part if part.alarms else case
+
+
+def explain_all(case: Case) -> dict[str, Explanation]:
+    """How well each cause that can be observed explains all deviations, by name."""
+    return {c.name: explain(c, case.deviations) for c in applicable(CAUSES, case.by_statistic)}
+
+
+def symptoms_of(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation]:
+    """The deviations of statistics that are symptoms of a cause, in their order."""
+    return [d for d in deviations if any(s.matches(d.statistic) for s in cause.symptoms)]
+
+
+def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
+    """(E,) mask of episodes whose value of the first alarm deviates by at least half as much as the most deviating."""
+    if not alarms:
+        return np.ones(len(case.rows), dtype=bool)
+    name, healthy = alarms[0].statistic, alarms[0].healthy
+    distance = np.array([row.get(name, np.nan) - healthy for row in case.rows])
+    distance *= np.sign(alarms[0].value - healthy)
+    return np.asarray(distance >= 0.5 * np.nanmax(distance))
+
+
+def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
+    """First step that shows a deviation and the first step after it, over the affected episodes; None if unknown."""
+    episodes = [trace.episode for trace, hit in zip(case.traces, affected, strict=True) if hit]
+    found = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]
+    known = [steps for steps in found if steps is not None]
+    return (min(first for first, _ in known), 1 + max(last for _, last in known)) if known else None

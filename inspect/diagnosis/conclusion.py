@@ -1,0 +1,120 @@
+"""The conclusion of a diagnosis: ranked causes with their evidence, and one headline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
+from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence
+from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
+from beliefscope.inspect.diagnosis.sensor_checks import localise
+from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+
+SURE = 0.5
+"""Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
+
+COMPARABLE = 0.3
+"""Smallest ratio of their probabilities for two causes that cannot be separated."""
+
+LISTED = 5
+"""Maximum number of listed causes."""
+
+EVIDENCE = 5
+"""Maximum number of listed deviations by cause."""
+
+
+def healthy(case: Case) -> Diagnosis:
+    """The diagnosis without an alarm."""
+    text = f"Healthy: all statistics are within the record of {case.profile.episodes} healthy episodes."
+    return Diagnosis("healthy", False, text, (), _provenance(case))
+
+
+def conclude(
+    case: Case, affected: Case, explanations: Mapping[str, Explanation], effects: Mapping[str, Effect] | None
+) -> Diagnosis:
+    """The diagnosis of a case with alarms.
+
+    Args:
+        affected: the episodes that the largest alarm concerns.
+        effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown.
+    """
+    by_name = {cause.name: cause for cause in CAUSES}
+    ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
+    candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
+    sure = bool(candidates) and candidates[0].probability >= SURE
+    state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
+    masked = effects is not None and not is_visible(
+        case.by_statistic, effects.get(candidates[0].cause.name) if sure else None
+    )
+    headline = _headline(affected, candidates, masked, len(case.rows))
+    return Diagnosis(state, masked, headline, candidates, _provenance(case))
+
+
+def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:
+    alarms = symptoms_of(cause, case.alarms)
+    affected = affected_episodes(case, alarms)
+    task, name = case.setting.checkpoint.task.name, case.setting.checkpoint.name
+    return Candidate(
+        cause=cause,
+        probability=probability,
+        episodes=tuple(trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit),
+        steps=affected_steps(case, alarms[0], affected) if alarms else None,
+        evidence=tuple(_evidence(case, alarm) for alarm in alarms[:EVIDENCE]),
+        recovered=None if effect is None else effect.recovery,
+        next=cause.next.format(task=task, filter=name),
+    )
+
+
+def _evidence(case: Case, deviation: Deviation) -> Evidence:
+    """A deviation and the episode that shows it most."""
+    distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.rows]
+    trace = case.traces[int(np.nanargmax(distance))]
+    steps = localise(deviation.statistic, trace.episode, case.profile.reference)
+    step = None if steps is None else steps[0]
+    return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step)
+
+
+def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int) -> str:
+    """The first cause, or two, with their probability; two that cannot be separated; or the largest deviation.
+
+    count: number of all episodes.
+    """
+    if not candidates or not candidates[0].evidence:
+        return f"Fault of unknown cause: {case.alarms[0].text}."
+    first = candidates[0]
+    if first.probability < SURE and len(candidates) > 1 and candidates[1].probability > COMPARABLE * first.probability:
+        return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
+    since = _since(case, first)
+    where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
+    where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
+    title = first.cause.title if first.probability >= SURE else f"Possibly: {first.cause.title}"
+    text = f"{title}{since}{where}, probability {first.probability:.2f}"
+    if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
+        text += f"; and {second.cause.title[0].lower()}{second.cause.title[1:]}, probability {second.probability:.2f}"
+    return f"{text}; the filter is unaffected" if masked else text
+
+
+def _since(case: Case, candidate: Candidate) -> str:
+    """The first step of a cause and its time; empty without steps, and for causes of the whole episode."""
+    if candidate.steps is None or candidate.steps[0] <= 0:
+        return ""
+    step = candidate.steps[0]
+    episodes = [t.episode for t in case.traces if t.episode_index in candidate.episodes[:1]] or [case.traces[0].episode]
+    return f" from step {step} ({episodes[0].times[step]:.1f} s)"
+
+
+def _provenance(case: Case) -> dict[str, Any]:
+    checkpoint = case.setting.checkpoint
+    return {
+        "task": checkpoint.task.name,
+        "filter": checkpoint.name,
+        "checkpoint_hash": checkpoint.hash,
+        "episodes": len(case.rows),
+        "healthy_episodes": case.profile.episodes,
+        "alarm_rate": case.alarm_rate,
+    }

@@ -1,0 +1,43 @@
+"""When a fault counts as masked: by its effect on the same episodes, else against the healthy range."""
+
+from __future__ import annotations
+
+import pytest
+
+from beliefscope.inspect.diagnosis.cause import Recovery
+from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+
+
+def error(value: float, alarm: bool = False) -> dict[str, Deviation]:
+    """RMS position error of ``value`` in units of its healthy mean, whose healthy range is 0.7 to 1.4."""
+    return {"error//all": Deviation("error//all", value, 1.0, 0.7, 1.4, 0.01, alarm, 1.0)}
+
+
+def effect(ratio: float, complete: bool) -> Effect:
+    """The error with the fault is ``ratio`` times that without it."""
+    return Effect(Recovery(1.0 - 1.0 / ratio, 0.0, 0.0, 0.0), 0.0, {"error//all": ratio}, complete)
+
+
+@pytest.mark.parametrize(
+    ("value", "alarm", "undone", "visible"),
+    [
+        (1.1, False, None, False),  # within the healthy range
+        (1.6, False, None, True),
+        (1.0, False, effect(1.5, True), True),  # easy episodes: the error is larger than without the fault
+        (1.6, False, effect(1.0, True), False),  # hard episodes: it is the same without the fault
+        (3.0, True, effect(1.0, True), True),  # something else is wrong
+        (1.0, False, effect(1.5, False), True),  # the filter is better without the sensor
+        (1.6, False, effect(1.0, False), False),  # it does not use the sensor
+        (1.6, False, effect(0.5, False), True),  # it needs the sensor, whose healthy readings are unknown
+        (1.1, False, effect(0.5, False), False),
+    ],
+)
+def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool) -> None:
+    assert is_visible(error(value, alarm), undone) is visible
+
+
+@pytest.mark.parametrize(("nees", "visible"), [(3.0, True), (0.4, True), (1.5, False)])
+def test_calibration_may_change_in_both_directions(nees: float, visible: bool) -> None:
+    changed = Effect(Recovery(0.0, 0.0, 0.0, 0.0), 0.0, {"nees/fused/all": nees}, True)
+    assert is_visible({}, changed) is visible
