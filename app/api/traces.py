@@ -11,11 +11,11 @@ from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Pro
 from beliefscope.app.api.models.traces import TraceHeader
 from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
-from beliefscope.app.runs import episode_list
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
+from beliefscope.datasets import episode_list
 from beliefscope.datasets.faults.injection import Faults, fault_catalog
 from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.app.protocol.trace_format import component_json
-from beliefscope.app.runs import episode_list
-from beliefscope.app.runs.first_moment import first_moment
+from beliefscope.datasets import episode_list
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import available_presets
+from beliefscope.datasets.first_moment import first_moment
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
