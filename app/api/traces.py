@@ -80,7 +80,7 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
     def trace_images(selection: RequestedRunOrComparison, request: Request, sensor: str = "") -> Response:
         run = finished_run(store, selection)
-        names = [displayed["name"] for displayed in displayed_sensors(run.trace)]
+        names = [displayed.name for displayed in displayed_sensors(run.trace)]
         name = sensor or next(iter(names), "")
         if name not in names:
             raise NotFound(f"Sensor {name!r} has no images. Available: {', '.join(names) or 'none'}.")

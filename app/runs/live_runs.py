@@ -79,7 +79,7 @@ class GrowingRun(TracedRun):
         missing = missing_quantities(self.checkpoint, self._last)
         description = header(self._last, [], self._run.task, self.no_maps, missing)
         # A growing array of numbers has no range yet; the page receives the images of one sensor.
-        sensors = [sensor for sensor in description["sensors"] if sensor["low"] is None][:1]
+        sensors = [sensor for sensor in description["sensors"] if sensor.low is None][:1]
         return description | {"sensors": sensors, "steps": self._steps, "live": describe(self._run)}
 
 
