@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
@@ -80,7 +80,7 @@ def header(
 
     no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
     """
-    components = [component_json(c) for c in task.components]
+    components = [component.to_json() for component in task.components]
     return {
         "steps": len(trace),
         "dt": trace.episode.dt,
@@ -103,9 +103,3 @@ def header(
         "columns": column_descriptions,
         "scene": scene_layers(task, trace, no_maps),
     }
-
-
-def component_json(component: Component) -> dict[str, Any]:
-    """A state component in headers and in the catalog."""
-    shown, scale = component.shown
-    return {"name": component.name, "unit": component.unit, "shown": shown, "scale": scale}

@@ -8,7 +8,6 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.protocol.trace_format import component_json
 from beliefscope.datasets import episode_list
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
@@ -115,7 +114,7 @@ class TaskCatalog:
         task, main = self.task, self.task.main_error
         return {
             "name": task.name,
-            "components": [component_json(c) for c in task.components],
+            "components": [component.to_json() for component in task.components],
             "modalities": list(task.modalities),
             "dt": task.dt,
             "map": {"components": list(task.map_components), "half_width": task.map_half_width},
