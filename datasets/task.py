@@ -74,6 +74,11 @@ class Component:
         """Display name, such as ``hinge x``."""
         return display_name(self.name)
 
+    def to_json(self) -> dict[str, Any]:
+        """Name, unit, and unit for display with its factor, for displays."""
+        shown, scale = self.shown
+        return {"name": self.name, "unit": self.unit, "shown": shown, "scale": scale}
+
 
 def rotation(name: str) -> tuple[Component, Component, Component]:
     """Three components of a rotation in space: its rotation vector in rad, body to world (``datasets/rotations.py``).

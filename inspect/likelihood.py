@@ -22,16 +22,9 @@ from beliefscope.filters.models.fusion import mixture
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator
-from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, Quantity
+from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, MapOptions, Quantity
 from beliefscope.inspect.maps.particle_density import ParticleDensity
-from beliefscope.inspect.maps.plane import (
-    OTHERS,
-    Others,
-    Plane,
-    describe_others,
-    other_components,
-    plane_of,
-)
+from beliefscope.inspect.maps.plane import OTHERS, Others, Plane, describe_others, other_components, plane_of
 from beliefscope.inspect.maps.statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.trace import Trace
 
@@ -224,6 +217,14 @@ class MapEngine:
             others=others,
             note=describe_others(trace, plane, others),
         )
+
+    def available_map(self, step: int, size: int, options: MapOptions) -> LikelihoodMap:
+        """Compute one map. A quantity or treatment of other components that the filter does not have is replaced."""
+        quantity = options.quantity if options.quantity in self.quantities else self.quantities[0]
+        others = options.others
+        if others is not None and self.no_others(quantity, others) is not None:
+            others = None
+        return self.map(step, options.angle, size, quantity, options.components, others)
 
     def maps(
         self,

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -213,6 +214,17 @@ def _probabilities(trace: Trace, n: int) -> dict[str, measures.Array]:
     determinant = np.linalg.slogdet(measures.covariances(trace)[:, -1])[1]
     nll = 0.5 * (squared + determinant + n * math.log(2.0 * math.pi))
     return {"nll": nll, "coverage95": np.where(np.isnan(squared), np.nan, squared <= chdtri(n, 0.05))}
+
+
+def find_checkpoints(patterns: Iterable[str]) -> tuple[Path, ...]:
+    """Checkpoints that match glob patterns. Raises BadInput for a pattern that none matches."""
+    checkpoints: dict[Path, None] = {}
+    for pattern in patterns:
+        names = [name for name in sorted(glob(pattern, recursive=True)) if name.endswith(".safetensors")]
+        if not names:
+            raise BadInput(f"no checkpoint (.safetensors) matches {pattern!r}")
+        checkpoints |= dict.fromkeys(Path(name).resolve() for name in names)
+    return tuple(checkpoints)
 
 
 def _blocks(indices: Iterable[int], size: int) -> Iterator[tuple[int, ...]]:

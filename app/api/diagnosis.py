@@ -50,10 +50,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     @router.post("/api/diagnosis/{task}/{filter}/{episode}", status_code=202)
     def find_cause(selection: RequestedRun, over: Over = "episode") -> JobReply:
         arguments = _arguments(store, selection, over)
-        episodes, faults = arguments["episodes"], arguments["faults"]
-        scope = f"episode {selection.episode}" if over == "episode" else f"{len(episodes)} held-out episodes"
-        title = ", ".join(filter(None, [f"Diagnosis of {selection.filter}", f"{selection.task} {scope}", faults]))
-        link = _link(selection, arguments["data"], over)
+        scope = "" if over == "episode" else f"{len(arguments['episodes'])} held-out episodes"
+        title, link = f"Diagnosis of {selection.describe(scope)}", _link(selection, arguments["data"], over)
         return JobReply(job=jobs.submit("diagnosis", title, arguments, key_over_episodes(store, arguments), link))
 
     @router.get(
@@ -64,14 +62,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
     def search_repair(selection: RequestedRun) -> JobReply:
-        data = store.dataset(selection.task, selection.data)[0]
-        run = f"{selection.task} episode {selection.episode}"
-        parts = [f"Smallest repair of {selection.filter}", run, str(selection.faults)]
         arguments = {"settings": store.settings.to_json(), "selection": selection.to_json()}
-        link = _link(selection, data, "episode")
-        return JobReply(
-            job=jobs.submit("repair", ", ".join(filter(None, parts)), arguments, store.key(selection), link)
-        )
+        link = _link(selection, store.dataset(selection.task, selection.data)[0], "episode")
+        title = f"Smallest repair of {selection.describe()}"
+        return JobReply(job=jobs.submit("repair", title, arguments, store.key(selection), link))
 
     return router
 

@@ -16,6 +16,7 @@ from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.diagnostic_options import parse_options
 from beliefscope.app.protocol.errors import NotFound
+from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -89,11 +90,9 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             "options": options,
             "selections": [item.to_json() for item in selections],
         }
-        scope = f"all {len(selections)} held-out episodes" if episodes else f"episode {selection.episode}"
-        parts = [f"{entry.title} of {selection.filter}", f"{selection.task} {scope}", str(selection.faults)]
-        key = _key(store, entry, selections, options)
-        link = _link(entry, selection, options, episodes)
-        return JobReply(job=jobs.submit("diagnostic", ", ".join(filter(None, parts)), arguments, key, link))
+        title = f"{entry.title} of {selection.describe(f'all {len(selections)} held-out episodes' if episodes else '')}"
+        key, link = _key(store, entry, selections, options), _link(entry, selection, options, episodes)
+        return JobReply(job=jobs.submit("diagnostic", title, arguments, key, link))
 
     return router
 
@@ -124,6 +123,6 @@ def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: 
 
 def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:
     """The page's address that shows the result."""
-    query = {"task": run.task, "filter": run.filter, "data": run.data, "episode": run.episode, "tab": "diagnostics"}
-    optional = {"faults": str(run.faults), "diagnostic": entry.name, "options": urlencode(options), "over": episodes}
-    return "?" + urlencode(query | {name: text for name, text in optional.items() if text})
+    query = {"task": run.task, "filter": run.filter, "data": run.data, "faults": str(run.faults), "over": episodes}
+    parts = {"diagnostic": entry.name, "options": urlencode(options)}
+    return page_link(**query, **parts, episode=run.episode, tab="diagnostics")

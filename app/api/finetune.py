@@ -4,7 +4,6 @@ import hashlib
 import json
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Body, HTTPException
 from fastapi.encoders import jsonable_encoder
@@ -16,6 +15,7 @@ from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.api.weaknesses import Weakness, weaknesses_of
 from beliefscope.app.jobs.finetune import catalog_name
 from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
@@ -54,7 +54,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         id = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         run = runs.add(id, task, filter, data, tuning)
         arguments = {name: getattr(run, name) for name in ("run", "task", "filter", "data", "settings")}
-        link = "?" + urlencode({"task": task, "filter": filter, "data": data, "tab": "finetune", "run": id})
+        link = page_link(task=task, filter=filter, data=data, tab="finetune", run=id)
         slices = " and ".join(slice_.name for slice_, _ in tuning.mix) or "clean data"
         title = f"Fine-tuning of {filter}, {task}: {slices}"
         jobs.submit("finetune", title, arguments | {"server": store.settings.to_json()}, id, link)

@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, urlencode
+from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
@@ -25,6 +25,7 @@ from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.jobs.recording import write
 from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.protocol.messages import READ_ONLY
+from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, display_name
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
@@ -108,7 +109,7 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
                     "maps": stride,
                     "quantity": body.quantity,
                 }
-                title, link = f"Recording of {selection.description}", _url(path.name).lstrip("/")
+                title, link = f"Recording of {selection.describe()}", _url(path.name).lstrip("/")
                 job = jobs.submit("recording", title, arguments, path.name, link, output_exists=False)
                 return JobReply(job=job)
             writer.submit(write, files, run, path).result()
@@ -136,9 +137,8 @@ def _open_run(store: TraceStore, files: RecordingFolder, jobs: Jobs, name: str) 
     filters: Mapping[str, Checkpoint] = {}
     with suppress(BadInput):  # a task that this server does not have
         filters = store.filters(str(info.task))
-    query: dict[str, Any] = {"task": info.task, "filter": display_name(info.filter, info.checkpoint_hash, filters)}
-    query |= {"data": LIVE_PREFIX + run, "episode": info.episode or 0, "tab": "scene"}
-    link, output = f"?{urlencode(query)}", store.live.folder / f"{run}{SUFFIX}"
+    filter_, output = display_name(info.filter, info.checkpoint_hash, filters), store.live.folder / f"{run}{SUFFIX}"
+    link = page_link(task=info.task, filter=filter_, data=LIVE_PREFIX + run, episode=info.episode or 0, tab="scene")
     arguments = {"recording": str(files.path(name)), "run": str(output)}
     return jobs.submit("reading", f"The run in {recording.name}", arguments, key, link, output.is_file())
 

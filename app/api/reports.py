@@ -67,7 +67,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             "url": url,
             "folder": str(folder),
         }
-        title, link = f"Report of {selection.description}", f"api/reports/{name}.html"
+        title, link = f"Report of {selection.describe()}", f"api/reports/{name}.html"
         return JobReply(job=jobs.submit("report", title, arguments, key, link, folder.is_dir()))
 
     @router.get("/api/reports/{name}.html", response_class=Response)

@@ -11,11 +11,11 @@ from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Pro
 from beliefscope.app.api.models.traces import TraceHeader
 from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
-from beliefscope.app.runs import episode_list
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
+from beliefscope.datasets import episode_list
 from beliefscope.datasets.faults.injection import Faults, fault_catalog
 from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
 
@@ -80,7 +80,7 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
     def trace_images(selection: RequestedRunOrComparison, request: Request, sensor: str = "") -> Response:
         run = finished_run(store, selection)
-        names = [displayed["name"] for displayed in displayed_sensors(run.trace)]
+        names = [displayed.name for displayed in displayed_sensors(run.trace)]
         name = sensor or next(iter(names), "")
         if name not in names:
             raise NotFound(f"Sensor {name!r} has no images. Available: {', '.join(names) or 'none'}.")

@@ -1,7 +1,6 @@
 """Job that fine-tunes a checkpoint and compares the result with its base."""
 
 import json
-import os
 from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
@@ -11,7 +10,6 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
-from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from beliefscope.filters.engine import one_thread
@@ -21,14 +19,10 @@ from beliefscope.filters.finetuning.report import curve_values, no_change
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.training_data import simulated_episodes, training_episodes
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
-from beliefscope.inspect.compare.progress_log import ProgressLog
+from beliefscope.inspect.compare.progress_log import ProgressLog, ProgressShares
 from beliefscope.inspect.compare.success import judge
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import measure_profile
-
-COSTS = {"simulation": 4.0 / (os.cpu_count() or 1), "training": 0.5, "profile": 1.0, "comparison": 2.4}
-"""Relative time of a step of an episode, from which the remaining time of a run is estimated. Measured with
-``push-field information-ekf``; only the simulation runs on all cores."""
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -44,7 +38,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         is_sample = data_name not in settings.data
-        share = _Shares(tuning, data, simulated_episodes(data_name, data, is_sample))
+        share = ProgressShares(tuning, data, simulated_episodes(data_name, data, is_sample))
 
         def on_simulation(done: int, count: int) -> None:
             report(share("simulation", done / count), f"simulating training episode {done} of {count}")
@@ -89,26 +83,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     result_json = _result(comparison, finetuned, arguments["filter"], data_name) | {"success": success}
     write_atomically(folder / "result.json", json.dumps(as_json(result_json), allow_nan=False).encode())
     return {"verdict": success.verdict if success else comparison.verdict}
-
-
-class _Shares:
-    """Progress of a run, 0..1, from that of its parts, weighted with their estimated duration."""
-
-    def __init__(self, settings: FineTune, data: Dataset, simulated: int) -> None:
-        steps = len(data.held_out()) * max(summary.steps for summary in data.summaries)
-        counts = {
-            "simulation": simulated * max(summary.steps for summary in data.summaries),
-            "training": settings.steps * settings.windows * settings.length,
-            "profile": steps,
-            "comparison": steps,
-        }
-        self._costs = {part: COSTS[part] * count for part, count in counts.items()}
-
-    def __call__(self, part: str, done: float) -> float:
-        """The progress of the run when a share of a part is done, and all parts before."""
-        parts = list(self._costs)
-        before = sum(self._costs[name] for name in parts[: parts.index(part)])
-        return (before + self._costs[part] * done) / sum(self._costs.values())
 
 
 def catalog_name(base: str, hash_: str) -> str:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.app.protocol.trace_format import component_json
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Component
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import measure_maps, particle_cloud
@@ -43,10 +42,12 @@ NUMBERS = (
 class EncodedMaps:
     """Maps of one step, and their message except for the fields that depend on the cursor.
 
-    description: JSON header of the message without its first three entries. content: binary part.
+    description: JSON header of the message without its first three entries. content: binary part. on_floor: whether the
+    maps are over the position on the floor.
     """
 
     maps: LikelihoodMap
+    on_floor: bool
     description: str
     content: bytes
 
@@ -62,16 +63,16 @@ class EncodedMaps:
         return len(text).to_bytes(4, "little") + text + b"\0" * (-len(text) % 4) + self.content
 
 
-def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> EncodedMaps:
+def encode_maps(trace: Trace, index: int, maps: LikelihoodMap) -> EncodedMaps:
     """Encode maps: float32 particles, then the layers as uint16.
 
     index: of the maps' step in the trace, which may be part of a run.
     """
-    effector = trace.episode.observations.get("effector_position")
+    task, effector = trace.task, trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantise(maps.log_likelihood)
     cloud = particle_cloud(trace, index, maps.components)
     axes = [
-        _axis_json(task, k, offsets)
+        _axis_json(task.components[k], offsets) | {"index": k}
         for k, offsets in zip(maps.components, (maps.offsets_x, maps.offsets_y), strict=False)
     ]
     on_floor, same_unit = maps.components == task.floor, len(axes) == 2 and axes[0]["unit"] == axes[1]["unit"]
@@ -104,14 +105,12 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
         "particles": 0 if cloud is None else len(cloud[0]),
     }
     floats = [] if cloud is None else [np.ascontiguousarray(part, dtype="<f4").tobytes() for part in cloud]
-    return EncodedMaps(maps, json.dumps(description), b"".join([*floats, cells.astype("<u2").tobytes()]))
+    return EncodedMaps(maps, on_floor, json.dumps(description), b"".join([*floats, cells.astype("<u2").tobytes()]))
 
 
-def _axis_json(task: Task, index: int, offsets: NDArray[np.float32]) -> dict[str, Any]:
-    """A component that a map shows. half_width: SI. scale: factor to its unit for display."""
-    component = task.components[index]
-    half_width = float(-offsets[0] + 0.5 * (offsets[1] - offsets[0]))
-    return component_json(component) | {"index": index, "half_width": half_width}
+def _axis_json(component: Component, offsets: NDArray[np.float32]) -> dict[str, Any]:
+    """A component that a map shows. half_width: SI."""
+    return component.to_json() | {"half_width": float(-offsets[0] + 0.5 * (offsets[1] - offsets[0]))}
 
 
 def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:

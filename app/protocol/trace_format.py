@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
@@ -21,24 +21,24 @@ SENSORS = ("effector_position", "force")
 def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     """The trace's time series: descriptions ``{"name", "shape", "offset"}``, offset in bytes, and a float32 buffer."""
     innovation, groups = virtual_innovations(trace), measures.shaded_groups(trace)
-    unimodal = bool(trace.modalities_with_posterior)
+    unimodal, faulty = bool(trace.modalities_with_posterior), measures.faulty(trace)
     arrays: dict[str, NDArray[Any] | None] = {
         "time": trace.episode.time,
         "truth": trace.episode.states,
         "estimate_mean": trace.task.near(trace.estimate_mean, trace.episode.states),
-        "estimate_sigma": _sigma(trace.estimate_covariance) if trace.has_covariance else None,
+        "estimate_sigma": measures.deviations(trace.estimate_covariance) if trace.has_covariance else None,
         "modality_mean": trace.task.near(trace.modality_mean, trace.episode.states[:, None]) if unimodal else None,
-        "modality_sigma": _sigma(trace.modality_covariance) if unimodal else None,
+        "modality_sigma": measures.deviations(trace.modality_covariance) if unimodal else None,
         "nees": measures.nees(trace) if trace.has_covariance else None,
         "innovation": None if innovation is None else innovation[0],
-        "innovation_sigma": None if innovation is None else _sigma(innovation[1]),
+        "innovation_sigma": None if innovation is None else measures.deviations(innovation[1]),
         "weights": trace.weights,
         "effective_weights": trace.effective_weights,
         "contact": trace.episode.contact,
         "groups": np.stack(list(groups.values()), axis=1) if groups else None,
         "effective_sample_size": trace.effective_sample_size,
         "blackout": measures.blackout(trace) if camera_images(trace) is not None else None,
-        "faulty": _faulty(trace),
+        "faulty": faulty if faulty.any() and not faulty.all() else None,
     }
     arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
     arrays |= {f"extra/{name}": values for name, values in trace.extra.items()}
@@ -51,15 +51,6 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
             buffers.append(np.ascontiguousarray(array, dtype="<f4").tobytes())
             offset += len(buffers[-1])
     return descriptions, b"".join(buffers)
-
-
-def _faulty(trace: Trace) -> NDArray[np.bool_] | None:
-    """(T,) steps within the span of an injected fault. None if that is every step or none."""
-    at = np.arange(len(trace))
-    faulty = np.zeros(len(trace), bool)
-    for fault in trace.faults:
-        faulty |= (at >= fault.from_) & (at < (len(trace) if fault.to is None else fault.to))
-    return faulty if faulty.any() and not faulty.all() else None
 
 
 def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLayer]:
@@ -89,7 +80,7 @@ def header(
 
     no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
     """
-    components = [component_json(c) for c in task.components]
+    components = [component.to_json() for component in task.components]
     return {
         "steps": len(trace),
         "dt": trace.episode.dt,
@@ -112,14 +103,3 @@ def header(
         "columns": column_descriptions,
         "scene": scene_layers(task, trace, no_maps),
     }
-
-
-def component_json(component: Component) -> dict[str, Any]:
-    """A state component in headers and in the catalog."""
-    shown, scale = component.shown
-    return {"name": component.name, "unit": component.unit, "shown": shown, "scale": scale}
-
-
-def _sigma(covariance: NDArray[Any]) -> NDArray[Any]:
-    """(..., n, n) -> (..., n): standard deviations."""
-    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

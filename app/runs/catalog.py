@@ -8,14 +8,13 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.protocol.trace_format import component_json
-from beliefscope.app.runs import episode_list
-from beliefscope.app.runs.first_moment import first_moment
+from beliefscope.datasets import episode_list
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import available_presets
+from beliefscope.datasets.first_moment import first_moment
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
@@ -23,7 +22,6 @@ from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.external.load import load_external
 from beliefscope.filters.names import is_path
-from beliefscope.inspect.diagnostics.healthy_profile import has_profile
 
 SAMPLE = "sample"
 """Name of the data set that ships with a task."""
@@ -115,7 +113,7 @@ class TaskCatalog:
         task, main = self.task, self.task.main_error
         return {
             "name": task.name,
-            "components": [component_json(c) for c in task.components],
+            "components": [component.to_json() for component in task.components],
             "modalities": list(task.modalities),
             "dt": task.dt,
             "map": {"components": list(task.map_components), "half_width": task.map_half_width},
@@ -127,7 +125,7 @@ class TaskCatalog:
                 "indices": main.indices,
             },
             "fault_presets": [{"name": name, "faults": text} for name, text in available_presets(task).items()],
-            "filters": [_filter_json(name, filter_, self.paths.get(name)) for name, filter_ in self.filters.items()],
+            "filters": [_filter_json(name, filter_) for name, filter_ in self.filters.items()],
             "data": [_data_json(name, data) for name, data in self.data.items()],
         }
 
@@ -219,14 +217,13 @@ def _name_parts(path: Path) -> tuple[str, ...]:
     return (valid if valid.is_dir() else valid.with_suffix("")).parts[1:]
 
 
-def _filter_json(name: str, checkpoint: Checkpoint, path: Path | None) -> dict[str, Any]:
+def _filter_json(name: str, checkpoint: Checkpoint) -> dict[str, Any]:
     record = dict(checkpoint.record)
     metrics = record.pop("metrics", {})
     return {
         "name": name,
         "kind": checkpoint.kind,
         "checkpoint_hash": checkpoint.hash,
-        "has_profile": has_profile(checkpoint, path),
         "training": record,
         "metrics": metrics,
     }

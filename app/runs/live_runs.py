@@ -16,7 +16,7 @@ import numpy as np
 
 from beliefscope.app.protocol.trace_format import header
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.traced_run import DEFAULT_MAP, TracedRun, compute_map
+from beliefscope.app.runs.traced_run import DEFAULT_MAP, TracedRun
 from beliefscope.app.workspace.json_files import is_text
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.episode import Episode
@@ -71,7 +71,8 @@ class GrowingRun(TracedRun):
 
     def map(self, step: int, size: int, options: MapOptions = DEFAULT_MAP) -> LikelihoodMap:
         """Compute the map from this step alone, without encoding the images of all earlier steps."""
-        return replace(compute_map(MapEngine(self.checkpoint, self.at(step)[0]), 0, size, options), step=step)
+        engine = MapEngine(self.checkpoint, self.at(step)[0])
+        return replace(engine.available_map(0, size, options), step=step)
 
     @property
     def header(self) -> dict[str, Any]:
@@ -79,7 +80,7 @@ class GrowingRun(TracedRun):
         missing = missing_quantities(self.checkpoint, self._last)
         description = header(self._last, [], self._run.task, self.no_maps, missing)
         # A growing array of numbers has no range yet; the page receives the images of one sensor.
-        sensors = [sensor for sensor in description["sensors"] if sensor["low"] is None][:1]
+        sensors = [sensor for sensor in description["sensors"] if sensor.low is None][:1]
         return description | {"sensors": sensors, "steps": self._steps, "live": describe(self._run)}
 
 

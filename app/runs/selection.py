@@ -31,10 +31,10 @@ class Selection:
     edit: Edit | None = None
     only: str = ""
 
-    @property
-    def description(self) -> str:
-        """The run in words, for titles."""
-        return f"{self.filter}, {self.task} episode {self.episode}" + (f", {self.faults}" if self.faults else "")
+    def describe(self, scope: str = "") -> str:
+        """The run in words, for titles. scope: episodes, by default that of the run."""
+        run = f"{self.filter}, {self.task} {scope or f'episode {self.episode}'}"
+        return run + (f", {self.faults}" if self.faults else "")
 
     @property
     def file_stem(self) -> str:

@@ -16,7 +16,6 @@ from weakref import WeakValueDictionary
 from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
 from beliefscope.app.runs.examples import Example, available
-from beliefscope.app.runs.first_moment import first_moment
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
@@ -25,6 +24,7 @@ from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.first_moment import first_moment
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference, task_to_json
 from beliefscope.filters.checkpoint import Checkpoint

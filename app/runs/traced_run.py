@@ -8,16 +8,14 @@ from functools import cached_property
 from typing import Any
 
 from beliefscope.app.protocol.map_format import EncodedMaps, encode_maps
-from beliefscope.app.protocol.messages import MAP_SIZES
 from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.data_check import data_warning
 from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
+from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.trace import Trace, arrays_of
 
-COARSE, FINE = MAP_SIZES
 MAP_CACHE_BYTES = 12 << 20  # per trace: about 300 coarse maps
 DEFAULT_MAP = MapOptions()
 
@@ -91,7 +89,7 @@ class TracedRun:
     def map(self, step: int, size: int, options: MapOptions = DEFAULT_MAP) -> LikelihoodMap:
         """Compute one map. The map engine keeps caches, so it computes one map at a time."""
         with self._engine_lock:
-            return compute_map(self._engine, step, size, options)
+            return self._engine.available_map(step, size, options)
 
     def maps(self, steps: Iterable[int], quantity: Quantity = "likelihood") -> Iterator[LikelihoodMap]:
         """Compute fine maps of several steps. Other threads get their maps in between."""
@@ -104,7 +102,7 @@ class TracedRun:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        maps = encode_maps(self.checkpoint.task, *self.at(step), self.map(step, size, options))
+        maps = encode_maps(*self.at(step), self.map(step, size, options))
         with self._cache_lock:
             if key not in self._cache:
                 self._cache[key] = maps
@@ -133,12 +131,3 @@ class TracedRun:
     @cached_property
     def _engine(self) -> MapEngine:
         return MapEngine(self.checkpoint, self.trace)
-
-
-def compute_map(engine: MapEngine, step: int, size: int, options: MapOptions) -> LikelihoodMap:
-    """Compute one map. A quantity or treatment of other components that the filter does not have is replaced."""
-    quantity = options.quantity if options.quantity in engine.quantities else engine.quantities[0]
-    others = options.others
-    if others is not None and engine.no_others(quantity, others) is not None:
-        others = None
-    return engine.map(step, options.angle, size, quantity, options.components, others)

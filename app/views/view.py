@@ -16,12 +16,12 @@ from beliefscope.app.protocol.map_format import EncodedMaps
 from beliefscope.app.protocol.messages import Cursor, MoveViewpoint, SceneLayers, Theme, parse_view_message
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.runs.traced_run import COARSE, FINE, TracedRun
+from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.scene import Scene
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 log = logging.getLogger("beliefscope.app")
@@ -139,8 +139,7 @@ class View:
                 await websocket.send_bytes(other.message(cursor.serial, other=True))
             encoded = await self._maps(cursor, run)
             await websocket.send_bytes(encoded.message(cursor.serial))
-            # The floor of the scene shows positions only.
-            maps = encoded.maps if encoded.maps.components == run.checkpoint.task.floor else None
+            maps = encoded.maps if encoded.on_floor else None  # the floor of the scene shows positions only
             if not run.growing:
                 self._prefetch_center = cursor, run
                 self._maps_sent.set()

@@ -8,7 +8,7 @@ after a fault's name sets its first parameter, the other parameters are named, a
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -177,19 +177,35 @@ def read_faults(text: str, task: Task) -> Faults:
     return faults
 
 
-def fault_catalog() -> list[dict[str, Any]]:
-    """All faults as JSON values: ``fault``, ``meaning`` and ``parameters`` (name, default, unit, meaning)."""
-    return [
-        {
-            "fault": name,
-            "meaning": (fault.__doc__ or "").split("\n")[0],
-            "parameters": [
-                {"name": key, "default": p.default, "unit": p.metadata["unit"], "meaning": p.metadata["meaning"]}
-                for key, p in parameters(fault).items()
-            ],
-        }
-        for name, fault in FAULTS.items()
-    ]
+@dataclass(frozen=True)
+class FaultParameter:
+    """A parameter of a fault."""
+
+    name: str
+    default: Any
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class FaultInfo:
+    """A kind of fault."""
+
+    fault: str
+    meaning: str
+    parameters: Sequence[FaultParameter]
+
+
+def fault_catalog() -> list[FaultInfo]:
+    """All faults."""
+    catalog = []
+    for name, fault in FAULTS.items():
+        described = [
+            FaultParameter(key, p.default, p.metadata["unit"], p.metadata["meaning"])
+            for key, p in parameters(fault).items()
+        ]
+        catalog.append(FaultInfo(name, (fault.__doc__ or "").split("\n")[0], described))
+    return catalog
 
 
 def faulty_copies(faults: Faults, episodes: Iterable[Episode], seed: int) -> list[Episode]:

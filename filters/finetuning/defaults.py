@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.module_selection import presets
-from beliefscope.filters.finetuning.settings import FineTune, StepRange
+from beliefscope.filters.finetuning.settings import FineTune, StepRange, parse_rates
 from beliefscope.filters.finetuning.slices import FAULT_SLICES, NOISY_IMAGES, fault_slices, parse_slices
 
 RELIABILITY = FineTune(train=("reliability-only",), steps=150, rate=5e-4)
@@ -47,17 +48,27 @@ def default_settings(filter_: Filter) -> FineTune:
 
 def settings_from(
     base: Checkpoint,
-    train: Sequence[str] = (),
-    freeze: Sequence[str] = (),
-    slices: Sequence[str] = (),
-    faults: Sequence[str] = (),
-    events: Sequence[str] = (),
+    train: Sequence[str] | None = None,
+    freeze: Sequence[str] | None = None,
+    slices: Sequence[str] | None = None,
+    faults: Sequence[str] | None = None,
+    events: Sequence[str] | None = None,
+    rates: Sequence[str] | None = None,
+    **values: Any,
 ) -> FineTune:
-    """Settings with these modules and data, as texts, or the default ones of the filter if none are given."""
+    """Settings with these modules, data and learning rates, as texts.
+
+    Without modules and data: the default settings of the filter. values: other settings; None keeps the default.
+    """
     if not isinstance(base, ExternalFilter) and not any((train, freeze, slices, faults, events)):
-        return default_settings(base.filter)
-    mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices, faults, base.task))
-    return FineTune(tuple(train), tuple(freeze), mix=mix, events=tuple(map(StepRange.parse, events)))
+        settings = default_settings(base.filter)
+    else:
+        mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices or (), faults or (), base.task))
+        steps = tuple(map(StepRange.parse, events or ()))
+        settings = FineTune(tuple(train or ()), tuple(freeze or ()), mix=mix, events=steps)
+    rate, own_rates = parse_rates(rates or ())
+    values = {name: value for name, value in values.items() if value is not None}
+    return replace(settings, rate=rate, rates=own_rates, **values)
 
 
 def reason(filter_: Filter) -> str:

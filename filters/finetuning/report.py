@@ -1,12 +1,13 @@
-"""Validation results of a fine-tuning run as curves and as text."""
+"""Modules of a filter and validation results of a fine-tuning run as curves, tables and text."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefscope.datasets.task import MainError
 from beliefscope.filters.finetuning.loop import Validation
+from beliefscope.filters.finetuning.module_selection import Node, module_change
 from beliefscope.filters.finetuning.settings import FineTune
 
 
@@ -51,6 +52,26 @@ def _difference(before: float | None, after: float | None, key: str) -> str | No
     if before is None or after is None:
         return None
     return f"{after - before:+.2f}" if key in ("nll", "nees") or not before else f"{100 * (after / before - 1):+.0f} %"
+
+
+def module_table(
+    nodes: Iterable[Node], changes: Mapping[str, Sequence[float]], depth: int
+) -> tuple[list[str], list[list[str | int | float | None]]]:
+    """Columns and rows of the modules down to a depth.
+
+    Args:
+        changes: as for ``module_change``; without any, the table has no columns of gradients and changes.
+    """
+    columns = ["module", "class", "parameters", "state", *(["gradient", "change"] if changes else []), "purpose"]
+    rows = []
+    for node in nodes:
+        if node.depth <= depth:
+            label = "  " * node.depth + (node.name.rpartition(".")[2] or "(filter)")
+            size = module_change(node.name, changes)
+            sizes = [size["gradient"] or None, f"{100 * size['change']:.2g} %" if size["change"] else None]
+            count = node.parameters or None
+            rows.append([label, node.kind, count, node.state, *(sizes if changes else []), node.description])
+    return columns, rows
 
 
 def training_summary(record: Mapping[str, Any]) -> str:

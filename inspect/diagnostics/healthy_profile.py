@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -79,12 +79,6 @@ class HealthyProfile:
         return cls(data, count, None if particles is None else int(particles), rows, reference)
 
 
-def has_profile(checkpoint: Checkpoint, path: Path | None) -> bool:
-    """Whether a checkpoint has a healthy profile, in its header or beside its file, without reading that."""
-    inside = isinstance(checkpoint, Checkpoint) and checkpoint.healthy_profile is not None
-    return inside or (path is not None and path.with_name(path.stem + SUFFIX).is_file())
-
-
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:
     """Profile of a checkpoint, or None; see ``profile_document``. Raises BadInput if it is malformed."""
     document = profile_document(task, filter_, checkpoint_hash, checkpoint)
@@ -100,6 +94,7 @@ def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: 
     return _beside_shipped(task, filter_, checkpoint_hash) or own
 
 
+@lru_cache(maxsize=4)  # shipped files do not change; reading one takes 10 ms
 def _beside_shipped(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
     """JSON of the profile in the file beside the shipped checkpoint of this hash."""
     try:

@@ -54,6 +54,11 @@ def means(trace: Trace) -> Array:
     return np.concatenate([trace.modality_mean, trace.estimate_mean[:, None]], axis=1).astype(np.float64)
 
 
+def deviations(covariance: NDArray[Any]) -> NDArray[Any]:
+    """(..., n, n) -> (..., n): standard deviations."""
+    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+
+
 def covariances(trace: Trace) -> Array:
     """(T, L, n, n): each layer's covariance, invertible (``with_floor``); NaN for filters without covariances."""
     both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
@@ -125,6 +130,15 @@ def blackout(trace: Trace) -> Mask:
         if is_image(readings):
             black |= lost_images(readings)
     return black
+
+
+def faulty(trace: Trace) -> Mask:
+    """(T,): steps within the span of an injected fault."""
+    at = np.arange(len(trace))
+    mask = np.zeros(len(trace), bool)
+    for fault in trace.faults:
+        mask |= (at >= fault.from_) & (at < (len(trace) if fault.to is None else fault.to))
+    return mask
 
 
 def counted(trace: Trace) -> Mask:

@@ -1,6 +1,6 @@
 """Readings of the sensors of a trace that are drawn as images: cameras, arrays of numbers, scans and point clouds."""
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,26 @@ def camera_images(trace: Trace) -> NDArray[np.uint8] | None:
     return next((readings for readings in trace.episode.observations.values() if is_image(readings)), None)
 
 
-def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
-    """Sensors that the page draws: images first, then arrays of numbers with two axes, scans and point clouds.
+@dataclass(frozen=True)
+class DisplayedSensor:
+    """A sensor that is drawn.
 
-    ``low`` and ``high`` are the range of an array's values in the run, from the first to the last colour; None for
-    images. Of scans and point clouds, ``points`` is the number of points per step and ``high`` the extent in m: 99 % of
-    the points are in the square of twice this side around the sensor.
+    channels: 1, or 3 for RGB. low, high: range of an array's values in the run, from the first to the last colour; None
+    for images. points: per step, of a scan or a point cloud, else 0. Its ``high`` is the extent in m: 99 % of the
+    points are in the square of twice this side around the sensor.
     """
+
+    name: str
+    height: int
+    width: int
+    channels: int
+    low: float | None
+    high: float | None
+    points: int
+
+
+def displayed_sensors(trace: Trace) -> list[DisplayedSensor]:
+    """Sensors that the page draws: images first, then arrays of numbers with two axes, scans and point clouds."""
     observations = trace.episode.observations
     images = [key for key, readings in observations.items() if is_image(readings)]
     clouds = [key for key in point_sensors(trace.task) if key in observations]
@@ -32,12 +45,10 @@ def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
         low = high = None
         if key in arrays and len(trace):
             low, high = float(observations[key].min()), float(observations[key].max())
-        sensor = {"name": key, "height": height, "width": width, "channels": channels[0] if channels else 1}
-        sensors.append(sensor | {"low": low, "high": high, "points": 0})
+        sensors.append(DisplayedSensor(key, height, width, channels[0] if channels else 1, low, high, 0))
     for key in clouds:
         points = points_of(trace.task, key, observations[key])
-        size = {"height": 1, "width": 1, "channels": 1, "points": points.shape[1]}
-        sensors.append({"name": key, **size, "low": 0.0, "high": extent_of(points)})
+        sensors.append(DisplayedSensor(key, 1, 1, 1, 0.0, extent_of(points), points.shape[1]))
     return sensors
 
 
@@ -46,11 +57,11 @@ def sensor_pixels(trace: Trace, key: str) -> NDArray[np.uint8] | NDArray[np.floa
 
     Of scans and point clouds, (T, P, 2) float32, in m: x and y in the frame of the sensor, NaN for absent points.
     """
-    sensor = next(sensor for sensor in displayed_sensors(trace) if sensor["name"] == key)
+    sensor = next(sensor for sensor in displayed_sensors(trace) if sensor.name == key)
     readings = trace.episode.observations[key]
-    if sensor["points"]:
+    if sensor.points:
         return points_of(trace.task, key, readings)[..., :2]
-    if sensor["low"] is None:
+    if sensor.low is None or sensor.high is None:
         return np.asarray(readings, np.uint8)
-    span = max(sensor["high"] - sensor["low"], 1e-12)
-    return np.rint(255.0 * (readings - sensor["low"]) / span).astype(np.uint8)
+    span = max(sensor.high - sensor.low, 1e-12)
+    return np.rint(255.0 * (readings - sensor.low) / span).astype(np.uint8)

@@ -29,10 +29,12 @@ def show(run: Trace, filter_: Filter | None = None, *, viewer: Literal["run", "r
         from beliefscope.recordings.interactive.widget import RunWidget
 
         return RunWidget(run, checkpoint)
-    from beliefscope.app.views.notebook import SceneViewer, rerun_viewer
-
     if viewer == "rerun":
+        from beliefscope.recordings.interactive.rerun_viewer import rerun_viewer
+
         return rerun_viewer(run, checkpoint, quick(run, checkpoint))
     if checkpoint is None:
         raise BadInput("the scene needs the filter: show(run, filter, viewer='scene')")
+    from beliefscope.app.views.notebook import SceneViewer
+
     return SceneViewer(run, checkpoint)

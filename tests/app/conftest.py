@@ -72,7 +72,7 @@ def check_response(app: Any, method: str, response: Any) -> None:
             declared = {str(status): answer.get("model") for status, answer in route.responses.items()}
             model = Error if response.is_error else declared.get(str(response.status_code), route.response_model)
             if model is not None:
-                TypeAdapter(model).validate_json(response.content, strict=True)
+                TypeAdapter(model).validate_json(response.content, strict=True, extra="forbid")
             return
 
 

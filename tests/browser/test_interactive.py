@@ -11,7 +11,6 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.interactive.export import write_interactive
-from beliefscope.recordings.interactive.widget import RunWidget
 
 
 def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
@@ -66,6 +65,8 @@ window.close_widget = widget.render({ model, el: document.querySelector('#cell')
 
 
 def test_widget_shares_its_cursor(context: Any) -> None:
+    from beliefscope.recordings.interactive.widget import RunWidget  # imports IPython
+
     with open_dataset(sample_path("push")) as data:
         run = trace(load_checkpoint(shipped("push", "crossmodal-ekf")), data[29], 29)
     widget = RunWidget(run, load_checkpoint(shipped("push", "crossmodal-ekf")), 21)

@@ -158,7 +158,7 @@ def test_every_reading_reaches_an_external_filter(run: Trace) -> None:
 
 def test_blackouts_and_displayed_sensors(run: Trace) -> None:
     assert measures.blackout(run).tolist() == [t == 5 for t in range(T)]
-    assert [(s["name"], s["channels"], s["points"]) for s in displayed_sensors(run)] == [
+    assert [(s.name, s.channels, s.points) for s in displayed_sensors(run)] == [
         ("left", 3, 0),
         ("right", 1, 0),
         ("depth", 1, 0),
@@ -166,12 +166,15 @@ def test_blackouts_and_displayed_sensors(run: Trace) -> None:
         ("cloud", 1, 7),
     ]
     np.testing.assert_array_equal(sensor_pixels(run, "left"), run.episode.observations["left"])
-    depth, low = run.episode.observations["depth"], displayed_sensors(run)[2]["low"]
+    depth, low = run.episode.observations["depth"], displayed_sensors(run)[2].low
     pixels = sensor_pixels(run, "depth")
     assert (pixels.min(), pixels.max()) == (0, 255)
-    span = displayed_sensors(run)[2]["high"] - low
+    high = displayed_sensors(run)[2].high
+    assert low is not None
+    assert high is not None
+    span = high - low
     np.testing.assert_allclose(low + pixels / 255.0 * span, depth, atol=span / 255.0)
-    assert header(run, columns(run)[0], TASK, None, {})["sensors"][0]["width"] == 32
+    assert header(run, columns(run)[0], TASK, None, {})["sensors"][0].width == 32
 
 
 def test_points_of_scans_and_clouds(run: Trace, tmp_path: Path) -> None:

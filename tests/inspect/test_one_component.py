@@ -147,7 +147,7 @@ def test_the_map_is_the_density_over_the_component(runs: list[Trace]) -> None:
         assert map_.log_likelihood.shape[1:] == (1, 101)
         np.testing.assert_allclose(map_.log_likelihood[-1, 0], expected, atol=2e-4)  # float32 states near 20
         assert map_.offsets_x[-1] == pytest.approx(2.0 * 100 / 101)
-    encoded = encode_maps(task(), runs[0], step, engine.map(step, size=101))
+    encoded = encode_maps(runs[0], step, engine.map(step, size=101))
     assert '"rows": 1' in encoded.description
     # Of a Gaussian, 95 % are within 1.96 standard deviations.
     area = np.array(engine.map(step, size=1001, quantity="posterior").log_likelihood[-1, 0], float)

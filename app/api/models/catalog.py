@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, create_model
 from beliefscope.app.jobs.queue import Job
 from beliefscope.app.runs.examples import Example
 from beliefscope.datasets.dataset import EpisodeSummary
+from beliefscope.datasets.faults.injection import FaultInfo
 
 Number = float | None
 """None if not finite or not available."""
@@ -104,12 +105,11 @@ class MainError(Reply):
 
 
 class FilterInfo(Reply):
-    """A filter in the catalog. has_profile: whether it can be diagnosed. training, metrics: its training record."""
+    """A filter in the catalog. training, metrics: its training record."""
 
     name: str
     kind: str
     checkpoint_hash: str
-    has_profile: bool
     training: dict[str, Any]
     metrics: dict[str, Any]
 
@@ -162,23 +162,6 @@ class TaskInfo(Reply):
     fault_presets: list[FaultPreset]
     filters: list[FilterInfo]
     data: list[DataInfo]
-
-
-class FaultParameter(Reply):
-    """A parameter of a fault."""
-
-    name: str
-    default: Any
-    unit: str
-    meaning: str
-
-
-class FaultInfo(Reply):
-    """A kind of fault."""
-
-    fault: str
-    meaning: str
-    parameters: list[FaultParameter]
 
 
 class Catalog(Reply):

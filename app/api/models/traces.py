@@ -5,6 +5,7 @@ from typing import Any, Literal
 from beliefscope.app.api.models.catalog import Component, Reply, TaskInfo
 from beliefscope.app.protocol.messages import SceneLayer
 from beliefscope.inspect.maps.likelihood_map import Quantity
+from beliefscope.inspect.traces.sensors import DisplayedSensor
 
 
 class LiveState(Reply):
@@ -48,22 +49,6 @@ class Column(Reply):
     name: str
     shape: list[int]
     offset: int
-
-
-class DisplayedSensor(Reply):
-    """A sensor that is drawn.
-
-    channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point cloud,
-    whose extent is ``high`` in m; else 0.
-    """
-
-    name: str
-    height: int
-    width: int
-    channels: int
-    low: float | None
-    high: float | None
-    points: int
 
 
 class TraceHeader(Reply):

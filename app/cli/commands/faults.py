@@ -19,10 +19,9 @@ def faults() -> console.Result:
     catalog = fault_catalog()
     lines = []
     for fault in catalog:
-        lines.append(f"{fault['fault']:<20}{fault['meaning']}")
-        for parameter in fault["parameters"][:-2]:
-            name, default = parameter["name"], parameter["default"]
-            usage = name if default is None else f"{name}={default}".removesuffix(".0")
-            lines.append(f"  {usage:<18}{parameter['unit']}: {parameter['meaning']}")
+        lines.append(f"{fault.fault:<20}{fault.meaning}")
+        for parameter in fault.parameters[:-2]:
+            usage = parameter.name + ("" if parameter.default is None else f"={parameter.default}".removesuffix(".0"))
+            lines.append(f"  {usage:<18}{parameter.unit}: {parameter.meaning}")
     lines += ["", "Presets:", *(f"  {text:<30}{name}" for name, text in FAULT_PRESETS.items())]
     return console.Result({"faults": catalog, "presets": FAULT_PRESETS}, "\n".join(lines))

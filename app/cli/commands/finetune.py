@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -109,16 +109,10 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
-    settings = settings_from(base, train or (), freeze or (), slices or (), fault_sets or (), events or ())
-    settings = replace(
-        _changed(settings, clean_weight, steps, rates or ()),
-        length=length,
-        l2_sp=l2_sp,
-        calibrate=calibrate,
-        patience=patience,
-        success=Criterion.parse(success) if success else None,
-        seed=seed,
-    )
+    values: dict[str, Any] = {"clean_weight": clean_weight, "steps": steps, "length": length, "l2_sp": l2_sp}
+    values |= {"calibrate": calibrate, "patience": patience, "seed": seed}
+    values["success"] = Criterion.parse(success) if success else None
+    settings = settings_from(base, train, freeze, slices, fault_sets, events, rates, **values)
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command, members = finetune_command(target, filter, data, settings), list(episodes)
         source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": _partial(output)}
@@ -136,16 +130,6 @@ def finetune(
 def _partial(output: Path) -> Path:
     """File from which an interrupted run resumes."""
     return output.with_name(f"{output.name}.partial")
-
-
-def _changed(settings: FineTune, clean_weight: float | None, steps: int | None, rates: Sequence[str]) -> FineTune:
-    """The settings with the values that are given, and with learning rates."""
-    from beliefscope.filters.finetuning.settings import parse_rates
-
-    rate, own_rates = parse_rates(rates)
-    weight = settings.clean_weight if clean_weight is None else clean_weight
-    steps = settings.steps if steps is None else steps
-    return replace(settings, clean_weight=weight, steps=steps, rate=rate, rates=own_rates)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ def modules(
     """
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.finetuning.module_selection import module_change, module_tree, presets, select_parameters
+    from beliefscope.filters.finetuning.report import module_table
     from beliefscope.filters.open_filter import open_filter
 
     checkpoint = open_filter(task, filter)
@@ -36,17 +37,7 @@ def modules(
         "presets": {name: list(patterns) for name, patterns in groups.items()},
         "modules": [node.to_json() | module_change(node.name, parts) for node in nodes],
     }
-    columns = ["module", "class", "parameters", "state", *(["gradient", "change"] if parts else []), "purpose"]
-    rows = []
-    for node in nodes:
-        if node.depth <= depth:
-            label = "  " * node.depth + (node.name.rpartition(".")[2] or "(filter)")
-            change = module_change(node.name, parts)
-            changes = [change["gradient"] or None, f"{100 * change['change']:.2g} %" if change["change"] else None]
-            rows.append(
-                [label, node.kind, node.parameters or None, node.state, *(changes if parts else []), node.description]
-            )
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}): {nodes[0].parameters:,} parameters"
-    lines = [console.grid(title, columns, rows), "", "Presets for --train"]
+    lines = [console.grid(title, *module_table(nodes, parts, depth)), "", "Presets for --train"]
     lines += [f"  {name}: {', '.join(patterns)}" for name, patterns in groups.items()]
     return console.Result(document, "\n".join(lines))

@@ -1,7 +1,6 @@
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
-from beliefscope.datasets.errors import BadInput
 
 
 @opt.with_options(
@@ -40,13 +39,12 @@ def sweep(
       beliefscope sweep --checkpoints 'runs/*.safetensors' --faults '' --faults blackout=0.8 --workers 8 -o sweep
       beliefscope sweep --checkpoints '/lab/**/*.safetensors' --data /lab/door.h5 --engine ray -o /lab/sweep
     """
-    from beliefscope.inspect.sweep import Inputs
+    from beliefscope.inspect.sweep import Inputs, find_checkpoints
     from beliefscope.recordings.sweep_table import Experiments, run_sweep
 
     opt.check_folder(output, "output")
-    paths = [path for pattern in checkpoints for path in _matches(pattern)]
     inputs = Inputs(
-        tuple(dict.fromkeys(paths)),
+        find_checkpoints(checkpoints),
         tuple(path.resolve() for path in data or ()),
         tuple(dict.fromkeys(faults or [""])),
         tuple(range(seeds)),
@@ -71,13 +69,3 @@ def sweep(
     return console.Result(
         document, console.arrow("Checkpoints", overview.drop_columns(["provenance"])), output / "results.parquet"
     )
-
-
-def _matches(pattern: str) -> list[Path]:
-    """Files of a glob pattern. Raises BadInput if there is none."""
-    from glob import glob
-
-    paths = [Path(text).resolve() for text in sorted(glob(pattern, recursive=True)) if text.endswith(".safetensors")]
-    if not paths:
-        raise BadInput(f"no checkpoint (.safetensors) matches {pattern!r}")
-    return paths

@@ -285,8 +285,9 @@ export interface components {
          * DisplayedSensor
          * @description A sensor that is drawn.
          *
-         *     channels: 1, or 3 for RGB. low, high: range of an array of numbers. points: per step, of a scan or a point cloud,
-         *     whose extent is ``high`` in m; else 0.
+         *     channels: 1, or 3 for RGB. low, high: range of an array's values in the run, from the first to the last colour; None
+         *     for images. points: per step, of a scan or a point cloud, else 0. Its ``high`` is the extent in m: 99 % of the
+         *     points are in the square of twice this side around the sensor.
          */
         DisplayedSensor: {
             /** Name */
@@ -588,7 +589,7 @@ export interface components {
         };
         /**
          * FilterInfo
-         * @description A filter in the catalog. has_profile: whether it can be diagnosed. training, metrics: its training record.
+         * @description A filter in the catalog. training, metrics: its training record.
          */
         FilterInfo: {
             /** Name */
@@ -597,8 +598,6 @@ export interface components {
             kind: string;
             /** Checkpoint Hash */
             checkpoint_hash: string;
-            /** Has Profile */
-            has_profile: boolean;
             /** Training */
             training: {
                 [key: string]: unknown;

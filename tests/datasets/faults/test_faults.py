@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -316,9 +316,9 @@ def test_presets_fit_the_door_and_change_the_episode(episode: Episode) -> None:
 
 def test_catalog_describes_all_parameters() -> None:
     for fault in fault_catalog():
-        assert fault["meaning"].endswith(".")
-        assert all(p["unit"] and p["meaning"] for p in fault["parameters"])
-    assert json.dumps(fault_catalog())
+        assert fault.meaning.endswith(".")
+        assert all(p.unit and p.meaning for p in fault.parameters)
+        assert json.dumps(asdict(fault))
 
 
 def test_every_fault_is_documented() -> None:
@@ -326,10 +326,10 @@ def test_every_fault_is_documented() -> None:
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*\.) \|$", page.split("## Sensor faults")[1], re.MULTILINE))
     assert list(rows) == list(FAULTS)
     for fault in fault_catalog():
-        names = [p["name"] for p in fault["parameters"][:-2]]
-        documented = rows[fault["fault"]].split("`")[1].split() if names else []
+        names = [p.name for p in fault.parameters[:-2]]
+        documented = rows[fault.fault].split("`")[1].split() if names else []
         assert [text.split("=")[0] for text in documented] == names
-        assert rows[fault["fault"]].endswith(f"| {fault['meaning']}")
+        assert rows[fault.fault].endswith(f"| {fault.meaning}")
 
 
 BAD = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.external_replay import open_replay
 from beliefscope.inspect.traces.replay import Edit
 
-pytest.importorskip("filterpy", reason="filterpy is not installed (pip install .[test])")
-
 sys.path.insert(0, str(Path(__file__).parent))
 import vehicle_filters as vehicle
+
+pytestmark = pytest.mark.skipif(find_spec("filterpy") is None, reason="filterpy is not installed (pip install .[test])")
 
 SOURCE = str(vehicle.GALLERY / "filterpy_vehicle.py")
 

@@ -39,8 +39,16 @@ EPISODES = (9, 19, 29, 39, 49, 109, 129, 141)
 """Held-out episodes: from step 30 to 40, five have steps with contact and five without, enough for intervals."""
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
-EKF = load_checkpoint(shipped("door", "crossmodal-ekf"))
-PF = load_checkpoint(shipped("door", "crossmodal-pf"))
+
+
+@cache
+def ekf() -> Checkpoint:
+    return load_checkpoint(shipped("door", "crossmodal-ekf"))
+
+
+@cache
+def pf() -> Checkpoint:
+    return load_checkpoint(shipped("door", "crossmodal-pf"))
 
 
 @pytest.fixture(scope="module")
@@ -67,19 +75,22 @@ def bias_haptics(filter_: Filter) -> None:
     filter_.get_parameter("virtual_sensors.haptics.state.bias")[0] += 3.0
 
 
-BIASED = finetuned(EKF, bias_haptics)
+@cache
+def biased_ekf() -> Checkpoint:
+    return finetuned(ekf(), bias_haptics)
 
 
 @cache
 def comparison(forward: bool) -> CheckpointComparison:
     """Comparison of the built-in and the biased filter, in both directions."""
-    pair = (EKF, BIASED) if forward else (BIASED, EKF)
+    pair = (ekf(), biased_ekf()) if forward else (biased_ekf(), ekf())
     with open_dataset(sample_path("door")) as episodes:
         return compare_checkpoints(*pair, {i: episode_of(episodes, i, 60) for i in EPISODES})
 
 
-@pytest.mark.parametrize("checkpoint", [EKF, PF], ids=["ekf", "pf"])
-def test_filter_is_identical_to_itself(checkpoint: Checkpoint, data: Dataset) -> None:
+@pytest.mark.parametrize("load", [ekf, pf], ids=["ekf", "pf"])
+def test_filter_is_identical_to_itself(load: Callable[[], Checkpoint], data: Dataset) -> None:
+    checkpoint = load()
     short = [episode_of(data, index, 40) for index in EPISODES]
     result = compare_checkpoints(checkpoint, finetuned(checkpoint, lambda _: None), short, particles=20)
     assert all(d.effect == d.low == d.high == 0.0 for d in result.differences)
@@ -159,7 +170,7 @@ def test_events_are_sorted_by_error_increase() -> None:
 def test_single_modality_event_equals_the_edit_of_its_link(data: Dataset) -> None:
     event = comparison(True).events[0]
     episode = episode_of(data, event.episode, 60)
-    replay = Replay(BIASED, trace(BIASED, episode, event.episode))
+    replay = Replay(biased_ekf(), trace(biased_ekf(), episode, event.episode))
     edited = replay.edited(Edit(0, event.last + 1, weights={event.only[0]: 1.0}))
     # A one-hot beta equals a single modality up to rounding.
     assert main_error(edited)[event.step, -1] == pytest.approx(event.after, rel=1e-3)
@@ -171,7 +182,7 @@ def test_frozen_modules_are_verified_by_hash() -> None:
     assert set(result.frozen) >= {"statistics", "dynamics", "virtual_sensors.image", "weight_model"}
     assert result.finetuned
     sensor = modules["virtual_sensors.haptics.state"]
-    bias, weight = (EKF.filter.get_parameter(f"{sensor.name}.{name}") for name in ("bias", "weight"))
+    bias, weight = (ekf().filter.get_parameter(f"{sensor.name}.{name}") for name in ("bias", "weight"))
     assert not sensor.unchanged
     assert sensor.weights == pytest.approx(3.0 / float(torch.cat([bias, weight.flatten()]).norm()), rel=1e-5)
     assert sensor.drift > 0.0
@@ -182,23 +193,23 @@ def test_frozen_modules_are_verified_by_hash() -> None:
 
 
 def test_output_hooks_are_removed(data: Dataset) -> None:
-    batch = sample_steps([data[9]], PF.task, 8)
-    outputs = module_outputs(PF.filter, batch)
+    batch = sample_steps([data[9]], pf().task, 8)
+    outputs = module_outputs(pf().filter, batch)
     assert outputs["measurement_models.image.head"][0].isfinite().all()
-    assert not any(m._forward_hooks for m in PF.filter.modules())
+    assert not any(m._forward_hooks for m in pf().filter.modules())
 
 
 def test_numbers_equal_evaluate(data: Dataset) -> None:
     black = Slice("black", Faults.parse("blackout=0.4"))
     episodes = [data[i] for i in EPISODES[:2]]
-    result = compare_checkpoints(EKF, PF, episodes, slices=[black], particles=20, seed=3)
+    result = compare_checkpoints(ekf(), pf(), episodes, slices=[black], particles=20, seed=3)
     for name, faults, only in (
         ("clean", Faults(), None),
         ("black", black.faults, None),
         ("haptics only", Faults(), "haptics"),
     ):
         rows = {d.measure: d for d in result.differences if d.slice == name}
-        for checkpoint, side in ((EKF, "before"), (PF, "after")):
+        for checkpoint, side in ((ekf(), "before"), (pf(), "after")):
             metrics = evaluate(checkpoint.filter, episodes, faults=faults, only=only, particles=20, seed=3)
             errors = {f"{d.measure}_{d.display[2]}": d.display[side == "after"] for d in rows.values() if d.is_error}
             # Double precision here, single precision in evaluate.
@@ -213,13 +224,13 @@ def test_numbers_equal_evaluate(data: Dataset) -> None:
 def test_values_do_not_depend_on_the_number_of_processes(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beliefscope.filters.evaluate.BLOCK", 2)
     members = {index: episode_of(data, index, 40) for index in EPISODES[:5]}
-    one, two = (compare_checkpoints(PF, EKF, members, particles=20, workers=n).to_dict() for n in (1, 2))
+    one, two = (compare_checkpoints(pf(), ekf(), members, particles=20, workers=n).to_dict() for n in (1, 2))
     assert one == two
 
 
 def test_interval_coverage() -> None:
     """95 % intervals for pairs of episodes with a known ratio of expected squared errors."""
-    rng, task = np.random.default_rng(0), EKF.task
+    rng, task = np.random.default_rng(0), ekf().task
     position = [m for m in measures_of(task) if m.name == "position"]
     n, episodes, trials, expected = len(task.components), 40, 50, 0.5 * math.log(1.5)
     covered = 0
@@ -236,7 +247,7 @@ def test_interval_coverage() -> None:
 
 def test_slice_without_steps_is_omitted(data: Dataset) -> None:
     episodes = [replace(episode_of(data, i, 40), contact=np.zeros(40, bool)) for i in EPISODES[:5]]
-    result = compare_checkpoints(EKF, BIASED, episodes)
+    result = compare_checkpoints(ekf(), biased_ekf(), episodes)
     assert "contact" not in {d.slice for d in result.differences}
     assert next(p for p in result.slices if p.slice.name == "contact").steps == 0
 
@@ -256,9 +267,9 @@ def test_external_filters_are_compared(data: Dataset) -> None:
     """The errors are those of ``evaluate``; a modality that is used alone replaces the readings of the others."""
     own = load_external(f"{EXAMPLES / '04_own_filter.py'}:build", "door")
     episodes = [episode_of(data, i, 60) for i in EPISODES]
-    result = compare_checkpoints(own, EKF, episodes)
+    result = compare_checkpoints(own, ekf(), episodes)
     by_slice = {(d.slice, d.measure): d for d in result.differences}
-    for i, checkpoint in enumerate((own, EKF.filter)):
+    for i, checkpoint in enumerate((own, ekf().filter)):
         metrics = evaluate(checkpoint, episodes)
         assert by_slice["clean", "position"].display[i] == pytest.approx(metrics.rmse["position_cm"], rel=1e-4)
         assert by_slice["clean", "angle"].display[i] == pytest.approx(metrics.rmse["angle_deg"], rel=1e-4)
@@ -275,9 +286,9 @@ def test_external_filters_are_compared(data: Dataset) -> None:
 
 def test_incomparable_checkpoints_are_refused(data: Dataset) -> None:
     with pytest.raises(BadInput, match="'door' and 'push'"):
-        compare_checkpoints(EKF, load_checkpoint(shipped("push", "crossmodal-ekf")), data)
+        compare_checkpoints(ekf(), load_checkpoint(shipped("push", "crossmodal-ekf")), data)
     with pytest.raises(BadInput, match="Available: image, haptics"):
-        compare_checkpoints(EKF, BIASED, data, slices=[Slice("a", only=("touch",))])
+        compare_checkpoints(ekf(), biased_ekf(), data, slices=[Slice("a", only=("touch",))])
 
 
 def test_views_and_figure() -> None:

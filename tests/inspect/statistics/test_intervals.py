@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import t
 
 from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, mean_interval, too_few
 
@@ -36,6 +35,8 @@ def test_the_simulation_detects_the_percentile_bootstrap() -> None:
 
 
 def test_jackknife_of_a_mean_is_students_interval() -> None:
+    from scipy.stats import t  # takes 0.3 s to import
+
     values = np.random.default_rng(0).normal(size=9)
     value, low, high = jackknife(np.stack([values, np.ones(9)], -1), lambda sums: sums[..., 0] / sums[..., 1])
     half = t.ppf(0.975, 8) * values.std(ddof=1) / 3.0

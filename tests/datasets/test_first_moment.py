@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beliefscope.app.runs.first_moment import first_moment, outage_in_first_contact
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.first_moment import first_moment, outage_in_first_contact
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beliefscope.app.runs.episode_list import LISTED, find, nearby
 from beliefscope.datasets.dataset import Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_list import LISTED, find, nearby
 from beliefscope.datasets.simulation.door import DOOR
 
 COUNT = 10_000

@@ -1,4 +1,4 @@
-"""Episode and step at which the page opens a data set."""
+"""Episode and step at which a data set is displayed first."""
 
 from weakref import WeakKeyDictionary
 
@@ -17,7 +17,7 @@ _moments: WeakKeyDictionary[Dataset, tuple[int, int]] = WeakKeyDictionary()
 
 
 def first_moment(data: Dataset) -> tuple[int, int]:
-    """Episode and step to open first: of a data set with outages, where an outage begins in the first contact.
+    """Episode and step to display first: of a data set with outages, where an outage begins in the first contact.
 
     It is the first held-out episode whose first contact has images for at least ``BEFORE`` steps and then, still in
     contact, none for at least ``DURING`` steps; and its last step with an image. There, both modalities observe the

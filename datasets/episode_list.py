@@ -20,7 +20,7 @@ def nearby(data: Dataset, index: int) -> list[dict[str, Any]]:
 def find(data: Dataset, query: str, first: int, limit: int) -> tuple[int, list[dict[str, Any]]]:
     """The number of episodes that have all words of a query, and ``limit`` of them from the ``first`` one.
 
-    Words are parts of the text that the page shows: index, policy, split, steps and seed. An episode whose index is a
+    Words are parts of the description of an episode: index, policy, split, steps and seed. An episode whose index is a
     word comes first.
     """
     words = query.lower().split()
