@@ -117,7 +117,7 @@ def test_json_round_trip() -> None:
     again = HealthyProfile.from_json(json.loads(json.dumps(reference.to_json(), allow_nan=False)))
     assert again.data == reference.data
     for name in NAMES:
-        np.testing.assert_allclose(again.statistics[name], reference.statistics[name], rtol=1e-3)
+        np.testing.assert_allclose(again.statistics[name], reference.statistics[name], rtol=5e-3)
 
 
 def test_profiles_of_format_1_have_no_reference() -> None:
@@ -142,7 +142,7 @@ def test_a_measured_profile_is_that_of_new_episodes() -> None:
     own, others = (measure_reference(chosen) for chosen in (episodes, [e for i, e in enumerate(episodes) if i % 4]))
     name = "hand offset/image x/all"
     values = [sensor_statistics(episodes[0], reference)[name] for reference in (own, others)]
-    assert measured.statistics[name][0] == pytest.approx(values[1], abs=1e-5)
+    assert measured.statistics[name][0] == pytest.approx(values[1], rel=5e-3)
     assert abs(values[0]) < abs(values[1])
 
 
