@@ -18,6 +18,9 @@ FORCE, TORQUE = "force", "torque"
 POSITION, CHANGE = slice(0, 3), slice(3, 6)
 """Channels of controls that command a hand position: the previous position and its change."""
 
+STEADY = 0.1
+"""Largest median deviation from the median distance in contact, relative to the mean distance."""
+
 CALMER = 0.2
 """Relative variation of the force with the contact flag below which the flag is inverted."""
 
@@ -76,7 +79,7 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     both = min(flag.sum(), (~flag).sum()) >= 3
     calm = ~flag if (~flag).any() else flag
     size = np.linalg.norm(force - np.median(force[calm], axis=0), axis=1)
-    if both:
+    if min(flag.sum(), (~flag).sum()) >= MIN_STEPS:
         inverted = np.linalg.norm(force - np.median(force[flag], axis=0), axis=1)
         size = inverted if np.median(inverted[flag]) < CALMER * np.median(size[~flag]) else size
     both = both and size.std() > 0
@@ -160,15 +163,18 @@ def contact_distance_statistics(episode: Episode, reference: Reference | None) -
 
     ``contact distance``: its median, which an object of another size changes. ``contact distance error``: the median of
     its size, which labels or hand positions with an offset increase as well. Neither depends on images or networks.
+    NaN for a hand that slides over the object (``STEADY``).
     """
     if reference is None or reference.contact is None or (moved := displacements_in_contact(episode)) is None:
         return {}
     if len(moved) < MIN_STEPS:
         return {}
     beyond = contact_residual(moved, reference.contact)
+    middle = float(np.median(beyond))
+    steady = np.median(np.abs(beyond - middle)) < STEADY * reference.contact[0]
     return {
-        "contact distance/labels/contact": float(np.median(beyond)),
-        "contact distance error/labels/contact": float(np.median(np.abs(beyond))),
+        "contact distance/labels/contact": middle if steady else np.nan,
+        "contact distance error/labels/contact": float(np.median(np.abs(beyond))) if steady else np.nan,
     }
 
 

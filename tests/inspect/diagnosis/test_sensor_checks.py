@@ -12,6 +12,8 @@ import pytest
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
+from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 from beliefscope.datasets.store import open_dataset
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.vector_checks import saturated
@@ -231,6 +233,35 @@ def test_labels_with_an_offset_move_the_object_and_not_the_hand() -> None:
     middle = np.median(episodes("push")[0].states, axis=0)
     expected = np.subtract(*reference_.object.pixels(np.stack([middle, middle + offset]).astype(np.float64)))
     np.testing.assert_allclose(np.mean(moved, axis=0), expected, atol=0.2)
+
+
+def test_the_hand_touches_a_larger_puck_farther_from_its_centre() -> None:
+    """By the difference of the radii, in simulation; the fingers are the same."""
+    with open_dataset("datasets/samples/push.h5") as data:
+        reference_ = measure_reference([data[i] for i in range(100, 140)])
+    larger = PuckPhysics(radius=RADIUS + 0.008)
+
+    def simulated(index: int) -> Episode:
+        def run(rng: np.random.Generator) -> Episode:
+            scene = Scene(push_model(puck=larger), IMPEDANCE, CAMERA)
+            positions = slice(ROBOT_JOINTS, ROBOT_JOINTS + 2)
+            return simulate(PUSH, scene, PushPuck(rng, larger), lambda qpos: qpos[:, positions], 4, index, 100, {})
+
+        return first_free_start(run, 4, index)
+
+    rows = [sensor_statistics(simulated(i), reference_) for i in range(4)]
+    assert np.nanmedian([row["contact distance/labels/contact"] for row in rows]) == pytest.approx(0.008, abs=0.002)
+
+
+def test_a_hand_that_slides_over_the_object_has_no_contact_distance() -> None:
+    episode = episodes("push")[0]
+    touching = np.flatnonzero(episode.observations["contact"][:, 0] > 0.5)
+    states = episode.states.copy()
+    states[touching] += np.linspace(0.0, 0.08, len(touching))[:, None]
+    values = [sensor_statistics(e, reference("push")) for e in (episode, replace(episode, states=states))]
+    distances = [row["contact distance/labels/contact"] for row in values]
+    assert abs(distances[0]) < 0.005
+    assert np.isnan(distances[1])
 
 
 def test_reference_survives_json() -> None:
