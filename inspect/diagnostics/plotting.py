@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +58,28 @@ PANEL_HEIGHT = 1.5
 """Inches, height of a full-width chart over time; plots and image panels are half as wide and 1.6 x as high."""
 
 
+@dataclass(frozen=True)
+class StepAxis:
+    """Horizontal axis of charts over the T steps of a trace.
+
+    Attributes:
+        positions: (T,) of the steps. edges: (T + 1,) between the steps, and as far before the first and after the last.
+    """
+
+    positions: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    label: str
+
+    @classmethod
+    def of(cls, steps: int, time: NDArray[np.float64] | None) -> StepAxis:
+        """The times (T,) in s where the data have timestamps, else the indices of the steps."""
+        positions = np.arange(steps, dtype=np.float64) if time is None else time
+        middles = 0.5 * (positions[1:] + positions[:-1])
+        half = (middles[:1] - positions[:1], positions[-1:] - middles[-1:]) if steps > 1 else (0.5, 0.5)
+        edges = np.concatenate([positions[:1] - half[0], middles, positions[-1:] + half[1]])
+        return cls(positions, edges, "step" if time is None else "time (s)")
+
+
 def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure as SVG, PDF or PNG (300 dpi) depending on the suffix. Raises BadInput for other suffixes."""
     suffix = figure_format(path)
@@ -86,8 +109,12 @@ def new_figure(**settings: Any) -> Figure:
     return figure
 
 
-def draw_figure(diagnostic: Views) -> Figure:
-    """Draw the verdict, charts below one another, then plots and image panels, two per row."""
+def draw_figure(diagnostic: Views, time: NDArray[np.float64] | None = None) -> Figure:
+    """Draw the verdict, charts below one another, then plots and image panels, two per row.
+
+    Args:
+        time: (T,) s, times of the steps of the charts; None to draw them over the indices of the steps.
+    """
     charts = charts_of(diagnostic)
     panels: list[Plot | ImagePanel] = [*diagnostic.plots(), *diagnostic.images()]
     rows = len(charts) + -(-len(panels) // 2)
@@ -104,7 +131,7 @@ def draw_figure(diagnostic: Views) -> Figure:
         first = None
         for row, (name, curves) in enumerate(charts):
             first = axes = figure.add_subplot(grid[row, :], sharex=first)
-            draw_chart(axes, name, curves, diagnostic)
+            draw_chart(axes, name, curves, diagnostic, time)
         for i, panel in enumerate(panels):
             axes = figure.add_subplot(grid[len(charts) + i // 2, i % 2])
             draw_panel(axes, panel)
@@ -128,29 +155,34 @@ def charts_of(diagnostic: Views) -> list[tuple[str, list[Curve]]]:
     return [(name, list(curves)) for name, curves in groupby(diagnostic.curves(), key=lambda curve: curve.chart)]
 
 
-def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Views) -> None:
-    """Draw curves over steps with shaded bands and dashed bounds."""
-    steps = np.arange(len(curves[0].values))
-    draw_bands(axes, diagnostic.bands())
+def draw_chart(
+    axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Views, time: NDArray[np.float64] | None
+) -> None:
+    """Draw curves over steps or their times with shaded bands and dashed bounds."""
+    axis = StepAxis.of(len(curves[0].values), time)
+    draw_bands(axes, diagnostic.bands(), axis)
     layers = [curve.layer for curve in curves]
     for i, curve in enumerate(curves):
         style = ("-", "--", ":", "-.")[layers[:i].count(curve.layer) % 4]
-        axes.plot(steps, curve.values, label=curve.name, color=colour_of(curve.layer, layers), lw=1.0, ls=style)
+        axes.plot(
+            axis.positions, curve.values, label=curve.name, color=colour_of(curve.layer, layers), lw=1.0, ls=style
+        )
     for bound in dict.fromkeys(b for curve in curves if curve.bounds for b in curve.bounds):
         axes.axhline(bound, color="black", lw=0.6, ls="--")
     axes.set_title(name, loc="left")
     axes.set_ylabel(curves[0].unit)
-    axes.set_xlabel("step")
-    axes.set_xlim(-0.5, len(steps) - 0.5)
+    axes.set_xlabel(axis.label)
+    axes.set_xlim(axis.edges[0], axis.edges[-1])
     # Next to the title, clear of the curves.
     axes.legend(frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
 
 
-def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], labelled: bool = False) -> None:
+def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], axis: StepAxis, labelled: bool = False) -> None:
     """Shade the steps of each phase, extended by half a step on both sides. ``labelled``: add legend entries."""
     for phase, mask in bands.items():
         if mask.any():
-            spans = [(first - 0.5, end - first) for first, end in intervals(mask)]
+            edges = axis.edges
+            spans = [(edges[first], edges[end] - edges[first]) for first, end in intervals(mask)]
             style = BANDS.get(phase, OTHER_BAND)
             shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **style}
             axes.broken_barh(spans, (0, 1), label=phase if labelled else None, **shade)

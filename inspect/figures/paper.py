@@ -18,7 +18,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands
 from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine, Quantity
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
@@ -242,14 +242,17 @@ def weights_figure(trace: Trace) -> Figure:
             axes.set_ylabel(f"weight, {task.components[i].label}" if component_wise else "weight")
         for axes in charts:
             _shade_phases(axes, trace)
-        charts[-1].set_xlabel(f"step, {trace.episode.duration_text} each")
+        axis = _step_axis(trace)
+        charts[-1].set_xlabel(
+            axis.label if trace.episode.time is not None else f"step, {trace.episode.duration_text} each"
+        )
         for axes in (charts[0], charts[len(task.map_indices)]):
             axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
     return figure
 
 
 def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
-    steps = np.arange(len(trace))
+    steps = _step_axis(trace).positions
     factor = trace.task.components[component].shown[1]
     *unimodal, fused = factor * measures.means(trace)[..., component].T
     axes.plot(
@@ -263,7 +266,7 @@ def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
 
 def _draw_weights(axes: Axes, trace: Trace, column: int) -> None:
     assert trace.effective_weights is not None
-    steps, beta = np.arange(len(trace)), trace.weights
+    steps, beta = _step_axis(trace).positions, trace.weights
     beta_is_effective = beta is not None and np.allclose(beta, trace.effective_weights, atol=1e-3)
     for k, modality in enumerate(trace.modalities):
         shade = colour(modality, trace.modalities)
@@ -280,7 +283,11 @@ def _draw_weights(axes: Axes, trace: Trace, column: int) -> None:
 
 def _shade_phases(axes: Axes, trace: Trace) -> None:
     """Shade contact and image blackout."""
-    draw_bands(
-        axes, {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}, labelled=True
-    )
-    axes.set_xlim(-0.5, len(trace) - 0.5)
+    axis = _step_axis(trace)
+    bands = {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}
+    draw_bands(axes, bands, axis, labelled=True)
+    axes.set_xlim(axis.edges[0], axis.edges[-1])
+
+
+def _step_axis(trace: Trace) -> StepAxis:
+    return StepAxis.of(len(trace), trace.episode.time)

@@ -54,7 +54,7 @@ def counterfactual(
         edited = replay.edited(edit)
     result = compare(replay.original, edited, edit)
     if output is not None:
-        write_figure(result.plot(), output)
+        write_figure(result.plot(result.time), output)
     if trace_path is not None:
         save_trace(edited, trace_path)
     document = {
