@@ -10,7 +10,7 @@ from itertools import permutations
 
 import numpy as np
 
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import BadInput, check_name, unknown_name
 from beliefscope.datasets.faults.control_faults import ControlDelayed, ControlScaled
 from beliefscope.datasets.faults.fault import (
     AXES,
@@ -38,11 +38,33 @@ MAX_SHIFT = 4096
 """Largest shift of an image, pixels."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImageFault(Fault):
+    """A fault of one image sensor."""
+
+    sensor = "image"
+    key: str | None = name_field(None, "an image sensor of the task; default: image, or the only one")
+
+    def keys(self, task: Task) -> tuple[str, ...]:
+        images = task.images
+        if self.key is None and self.sensor in task.observations:
+            return (self.sensor,)
+        if not images:
+            sensors = ", ".join(task.observations)
+            raise BadInput(f"{self.name} needs an image sensor; task {task.name!r} has none. Its sensors: {sensors}.")
+        if self.key is None and len(images) > 1:
+            texts = ", ".join(f"{self.name}:key={key}" for key in images)
+            raise BadInput(f"{self.name} needs the name of one of the image sensors of task {task.name!r}: {texts}")
+        key = images[0] if self.key is None else self.key
+        check_name(f"image sensor of task {task.name!r}", key, images)
+        return (key,)
+
+
 @dataclass(frozen=True)
-class Blackout(Fault):
+class Blackout(ImageFault):
     """Images are blacked out, independently at each step."""
 
-    name, sensor = "blackout", "image"
+    name = "blackout"
     probability: float = number_field(1.0, "fraction", "probability of a blackout at a step", 0, 1)
     gray: int | None = value_field(
         None,
@@ -60,20 +82,20 @@ class Blackout(Fault):
 
 
 @dataclass(frozen=True)
-class ImageFrozen(Fault):
+class ImageFrozen(ImageFault):
     """The image of the fault's first step is repeated."""
 
-    name, sensor = "image_frozen", "image"
+    name = "image_frozen"
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return np.broadcast_to(readings[span.first], readings.shape)
 
 
 @dataclass(frozen=True)
-class ImageUnderexposed(Fault):
+class ImageUnderexposed(ImageFault):
     """Images are under- or overexposed and saturate at white."""
 
-    name, sensor = "image_underexposed", "image"
+    name = "image_underexposed"
     factor: float = number_field(0.4, "factor", "scale of every gray level", 0)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
@@ -81,18 +103,18 @@ class ImageUnderexposed(Fault):
 
 
 @dataclass(frozen=True)
-class ImageNoise(GaussianNoise):
+class ImageNoise(ImageFault, GaussianNoise):
     """Independent Gaussian noise is added to every pixel."""
 
-    name, sensor = "image_noise", "image"
+    name = "image_noise"
     std: float = number_field(40.0, "gray levels", "standard deviation", 0)
 
 
 @dataclass(frozen=True)
-class ImageOutage(Fault):
+class ImageOutage(ImageFault):
     """Images are black in stretches of random length: a two-state Markov chain with these stationary moments."""
 
-    name, sensor = "image_outage", "image"
+    name = "image_outage"
     fraction: float = number_field(0.5, "fraction", "expected share of steps without an image", 0, 1)
     seconds: float = number_field(2.0, "s", "mean duration of an outage", 0.01)
 
@@ -109,10 +131,10 @@ class ImageOutage(Fault):
 
 
 @dataclass(frozen=True)
-class ImageBlur(Fault):
+class ImageBlur(ImageFault):
     """Images are blurred with a Gaussian kernel."""
 
-    name, sensor = "image_blur", "image"
+    name = "image_blur"
     std: float = number_field(1.0, "pixels", "standard deviation of the kernel", 0, 32)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
@@ -129,10 +151,10 @@ class ImageBlur(Fault):
 
 
 @dataclass(frozen=True)
-class ImageOccluded(Fault):
+class ImageOccluded(ImageFault):
     """A square occludes the same part of every image."""
 
-    name, sensor = "image_occluded", "image"
+    name = "image_occluded"
     size: int = integer_field(12, "pixels", "side length of the square")
     x: int | None = integer_field(None, "pixels", "left column; default: random for each episode")
     y: int | None = integer_field(None, "pixels", "top row; default: random for each episode")
@@ -148,10 +170,10 @@ class ImageOccluded(Fault):
 
 
 @dataclass(frozen=True)
-class ImageShift(Fault):
+class ImageShift(ImageFault):
     """Images are shifted, as by a displaced camera; pixels at the border are repeated."""
 
-    name, sensor = "image_shift", "image"
+    name = "image_shift"
     x: int = integer_field(3, "pixels", "shift to the right", minimum=-MAX_SHIFT)
     y: int = integer_field(0, "pixels", "shift downwards", minimum=-MAX_SHIFT)
 
