@@ -279,15 +279,20 @@ class Run(Runs):
             return episodes[index], index
 
     def trace(self, align: bool = False, **settings: int) -> tuple[Checkpoint, Trace]:
-        """Run the filter with a progress bar; its checkpoint and the trace. settings: further ones of ``trace``."""
-        from beliefscope.inspect.trace import trace
-
+        """The filter, and its run over the selected episode: see ``over``."""
         checkpoint, faults = self.open()
         episode, index = self.read_episode(checkpoint.task)
+        return checkpoint, self.over(checkpoint, episode, index, faults, align, **settings)
+
+    def over(
+        self, checkpoint: Checkpoint, episode: Episode, index: int, faults: Faults, align: bool = False, **settings: int
+    ) -> Trace:
+        """Run the filter over an episode with a progress bar. settings: further ones of ``trace``."""
+        from beliefscope.inspect.trace import trace
+
         (episode,) = self.check(checkpoint, [episode], align)
         with console.progress("Filtering") as advance:
-            run = trace(checkpoint, episode, index, self.seed, self.particles, faults, advance, **settings)
-            return checkpoint, run
+            return trace(checkpoint, episode, index, self.seed, self.particles, faults, advance, **settings)
 
 
 def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:

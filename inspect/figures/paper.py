@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
@@ -50,31 +51,35 @@ def middle_of_longest(mask: NDArray[np.bool_]) -> int | None:
     return int(first + end - 1) // 2
 
 
-def steps_by_contact(trace: Trace, selection: Sequence[int] = ()) -> dict[bool, int]:
+def steps_by_contact(episode: Episode, index: int, selection: Sequence[int] = ()) -> dict[bool, int]:
     """A step in free motion, if any, and a step in contact; one step, as if in free motion, of a task without contact.
 
     Steps that are not in ``selection`` are the middle of the longest interval after the warm-up steps, or of the whole
     episode if there is none.
 
+    Args:
+        index: of the episode in its data set.
+
     Raises:
         BadInput: a selected step is not in the episode, two are in the same state, or the episode has no contact.
     """
-    with_contact = "contact" in trace.task.covariates
-    contact = trace.episode.contact.astype(bool) & with_contact
+    with_contact = "contact" in episode.task.covariates
+    contact = episode.contact.astype(bool) & with_contact
+    counted = np.arange(len(episode)) >= episode.task.first_counted(len(episode))
     steps: dict[bool, int] = {}
     for step in selection:
-        if not 0 <= step < len(trace):
-            raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(trace) - 1}")
+        if not 0 <= step < len(episode):
+            raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(episode) - 1}")
         state = bool(contact[step])
         if state in steps:
             where = f"are both in {STATES[state]!r}: select one per state" if with_contact else "are two: select one"
             raise BadInput(f"steps {steps[state]} and {step} {where}")
         steps[state] = step
     if with_contact and not contact.any():
-        raise BadInput(f"episode {trace.episode_index} has no contact: select another one with --episode")
+        raise BadInput(f"episode {index} has no contact: select another one with --episode")
     for state in STATES:
         mask = contact == state
-        middle = middle_of_longest(mask & measures.counted(trace))
+        middle = middle_of_longest(mask & counted)
         middle = middle_of_longest(mask) if middle is None else middle
         if middle is not None:
             steps.setdefault(state, middle)

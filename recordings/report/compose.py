@@ -221,7 +221,7 @@ class Writer:
             items.append(self.figure("estimates", caption, paper.weights_figure(worst)))
         if self.no_maps is None and worst.modalities_with_posterior and worst.episode.contact.any():
             assert self.report.checkpoint is not None
-            steps = paper.steps_by_contact(worst)
+            steps = paper.steps_by_contact(worst.episode, worst.episode_index)
             figure = paper.maps_figure(self.report.checkpoint, worst, steps, quantity=self.report.quantity)
             caption = (
                 "Likelihood or posterior (see the titles) of each modality around the true position, episode "

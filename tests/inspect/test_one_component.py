@@ -126,7 +126,9 @@ def test_a_single_model_has_no_weights(runs: list[Trace]) -> None:
 
 
 def test_the_figure_of_maps_has_curves(runs: list[Trace]) -> None:
-    figure = maps_figure(checkpoint(task()), runs[0], steps_by_contact(runs[0], [50]), size=101, quantity="posterior")
+    figure = maps_figure(
+        checkpoint(task()), runs[0], steps_by_contact(runs[0].episode, 0, [50]), size=101, quantity="posterior"
+    )
     (axes,) = figure.axes
     curve = axes.lines[0].get_xydata()
     expected = runs[0].estimate_mean[50, 0] - runs[0].episode.states[50, 0]

@@ -48,6 +48,7 @@ def counterfactual(
     if not edit.faults and not edit.weights:
         raise BadInput("no intervention: give --faults, --weights or both")
     recorded, index = run.read_episode(checkpoint.task)
+    edit.check(checkpoint, len(recorded))
     with console.progress("Filtering") as advance:
         original = trace(checkpoint, recorded, index, run.seed, run.particles)
         replay = open_replay(checkpoint, original, progress=advance)
