@@ -232,18 +232,8 @@ class Runs:
         from beliefscope.datasets.faults.injection import read_faults
         from beliefscope.filters.open_filter import open_filter
 
-        checkpoint = open_filter(self._definition(), self.filter)
+        checkpoint = open_filter(definition_of(self.task, self.data), self.filter)
         return checkpoint, read_faults(self.faults, checkpoint.task)
-
-    def _definition(self) -> Task | str:
-        """The task of the data if it is named and not shipped, so that the file that defines it is not needed."""
-        from beliefscope.datasets.catalog import TASKS
-        from beliefscope.datasets.store import open_dataset
-
-        if self.data is None or self.task in TASKS or ":" in self.task:
-            return self.task
-        with open_dataset(self.data) as data:
-            return data.task if data.task.name == self.task else self.task
 
     def settings(self, faults: Faults) -> dict[str, Any]:
         """Arguments that all functions that run a filter over episodes have."""
@@ -293,6 +283,17 @@ class Run(Runs):
         (episode,) = self.check(checkpoint, [episode], align)
         with console.progress("Filtering") as advance:
             return trace(checkpoint, episode, index, self.seed, self.particles, faults, advance, **settings)
+
+
+def definition_of(task: str, path: Path | None) -> Task | str:
+    """The task of the data if it is named and not shipped, so that the file that defines it is not needed."""
+    from beliefscope.datasets.catalog import TASKS
+    from beliefscope.datasets.store import open_dataset
+
+    if path is None or task in TASKS or ":" in task:
+        return task
+    with open_dataset(path) as data:
+        return data.task if data.task.name == task else task
 
 
 def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:

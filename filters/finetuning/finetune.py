@@ -91,6 +91,8 @@ def finetune(
     frozen = freeze(filter_, trained)
     frozen_digest = digest(filter_, frozen)
     groups, events = split_episodes(episodes, settings.events)
+    if settings.length > (longest := max(map(len, groups["train"]))):
+        raise BadInput(f"windows of {settings.length} steps are longer than every training episode: {longest} steps")
     mixes, images = _mixes(filter_, groups, events, settings, device)
     key = cache_key(base=base.hash, settings=settings.to_json(), data=data_hash, versions=versions(), device=device)
     state = Partial(partial, key) if partial else None

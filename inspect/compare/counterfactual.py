@@ -29,6 +29,9 @@ RECOVERED = 1.0
 MIN_INCREASE = 0.05
 """Minimum reported increase of an effective weight."""
 
+MAX_OTHERS = 2
+"""Maximum number of components beside those of the main error in the verdict; all are in the tables."""
+
 
 @dataclass(frozen=True)
 class Counterfactual(Diagnostic):
@@ -95,9 +98,9 @@ class Counterfactual(Diagnostic):
         peak = int(self.distance.argmax())
         largest = self.task.main_error.text(self.distance[peak])
         text = f"{self.edit} moved the estimate by up to {largest} ({self._at(peak)})"
-        for name, (change, step, unit) in self._peaks().items():
-            if name not in self._main():
-                text += f" and the {name} by up to {change:.1f} {unit} ({self._at(step)})"
+        others = {name: peak for name, peak in self._peaks().items() if name not in self._main()}
+        for name, (change, step, unit) in others.items() if len(others) <= MAX_OTHERS else ():
+            text += f" and the {name} by up to {change:.3g} {unit} ({self._at(step)})"
         text = f"{_sentence(text)}: {self._recovery()}. "
         main = self.task.main_error
         before, after = (main.factor * float(error[self.during].mean()) for error in (self.error, self.edited_error))

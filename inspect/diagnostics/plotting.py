@@ -54,6 +54,12 @@ BANDS = {
 }
 OTHER_BAND = {"facecolor": "#999999", "alpha": 0.25}
 
+LEGEND_ENTRY, LEGEND_ROW = 4.8, 1.5
+"""Width of a legend entry without its text, and height of a row, in font sizes."""
+
+MARGIN = 0.75
+"""Inches beside the axes of a chart."""
+
 PANEL_HEIGHT = 1.5
 """Inches, height of a full-width chart over time; plots and image panels are half as wide and 1.6 x as high."""
 
@@ -121,13 +127,14 @@ def draw_figure(diagnostic: Views, time: NDArray[np.float64] | None = None) -> F
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        height = PANEL_HEIGHT * (len(charts) + 1.6 * -(-len(panels) // 2)) + 0.5
+        heights = [PANEL_HEIGHT + legend_height([curve.name for curve in curves], name) for name, curves in charts]
+        heights += [1.6 * PANEL_HEIGHT] * (rows - len(charts))
+        height = sum(heights) + 0.5
         figure = new_figure(figsize=(WIDTH, height), layout="constrained")
         figure.suptitle(diagnostic.verdict, fontsize=8, x=0.01, ha="left", wrap=True)
         if not rows:
             return figure
-        ratios = [1.0] * len(charts) + [1.6] * (rows - len(charts))
-        grid = figure.add_gridspec(rows, 2, height_ratios=ratios)
+        grid = figure.add_gridspec(rows, 2, height_ratios=heights)
         first = None
         for row, (name, curves) in enumerate(charts):
             first = axes = figure.add_subplot(grid[row, :], sharex=first)
@@ -169,12 +176,45 @@ def draw_chart(
         )
     for bound in dict.fromkeys(b for curve in curves if curve.bounds for b in curve.bounds):
         axes.axhline(bound, color="black", lw=0.6, ls="--")
-    axes.set_title(name, loc="left")
     axes.set_ylabel(curves[0].unit)
     axes.set_xlabel(axis.label)
     axes.set_xlim(axis.edges[0], axis.edges[-1])
-    # Next to the title, clear of the curves.
-    axes.legend(frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
+    draw_legend(axes, name)
+
+
+def draw_legend(axes: Axes, title: str = "") -> None:
+    """Draw the title above the axes, and the legend beside it where there is room, else in rows below it."""
+    labels = axes.get_legend_handles_labels()[1]
+    columns, rows = _legend_layout(labels, title)
+    style: dict[str, Any] = {"frameon": False, "ncols": columns, "borderaxespad": 0.0}
+    if rows == 0:
+        axes.set_title(title, loc="left")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), **style)
+    else:
+        axes.set_title(title, loc="left", pad=(LEGEND_ROW * rows + 1.0) * STYLE["font.size"])
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.97), **style)
+
+
+def legend_height(labels: Sequence[str], title: str = "") -> float:
+    """Inches that the rows of a legend below its title need."""
+    return _legend_layout(labels, title)[1] * LEGEND_ROW * float(STYLE["font.size"]) / 72.0
+
+
+def _legend_layout(labels: Sequence[str], title: str) -> tuple[int, int]:
+    """Columns of a legend, and rows between title and axes: 0 beside the title; as many columns as have room."""
+    from matplotlib.textpath import TextPath
+
+    size, available = float(STYLE["font.size"]), 72.0 * (WIDTH - MARGIN)
+    widths = [size * LEGEND_ENTRY + TextPath((0, 0), text, size=size).get_extents().width for text in labels if text]
+    head = TextPath((0, 0), title, size=STYLE["axes.titlesize"]).get_extents().width if title else 0.0
+    if head + 2.0 * size + sum(widths) <= available:
+        return max(1, len(widths)), 0
+    for columns in range(len(widths), 1, -1):
+        rows = -(-len(widths) // columns)
+        used = -(-len(widths) // rows)  # entries fill one column after the other
+        if sum(max(widths[i * rows : (i + 1) * rows]) for i in range(used)) <= available:
+            return used, rows
+    return 1, max(1, len(widths))
 
 
 def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], axis: StepAxis, labelled: bool = False) -> None:

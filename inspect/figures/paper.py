@@ -19,7 +19,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
 from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine, Quantity
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
@@ -236,7 +236,9 @@ def weights_figure(trace: Trace) -> Figure:
     component_wise = trace.effective_weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.35 * (len(task.map_indices) + len(columns)) + 0.4), layout="constrained")
+        legends = 2.0 * legend_height([*map(measures.layer_label, measures.layers(trace)), "truth"])
+        height = 1.35 * (len(task.map_indices) + len(columns)) + 0.4 + legends
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
         FigureCanvasAgg(figure)
         charts = figure.subplots(len(task.map_indices) + len(columns), 1, sharex=True)
         for axes, i in zip(charts, task.map_indices, strict=False):
@@ -252,7 +254,7 @@ def weights_figure(trace: Trace) -> Figure:
             axis.label if trace.episode.time is not None else f"step, {trace.episode.duration_text} each"
         )
         for axes in (charts[0], charts[len(task.map_indices)]):
-            axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
+            draw_legend(axes)
     return figure
 
 

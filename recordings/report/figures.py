@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import with_unit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
@@ -48,7 +48,9 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
         marks: index in ``traces`` -> (step, name) of marked events.
     """
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.55 * len(traces) + 0.3), layout="constrained")
+        labels = [*map(measures.layer_label, measures.layers(traces[0])), "contact", "blackout"]
+        height = 1.55 + legend_height(labels, "episode 0")
+        figure = Figure(figsize=(WIDTH, height * len(traces) + 0.3), layout="constrained")
         FigureCanvasAgg(figure)
         charts = figure.subplots(len(traces), 1, squeeze=False)[:, 0]
         for index, (axes, trace) in enumerate(zip(charts, traces, strict=True)):
@@ -65,13 +67,12 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
                 axes.axvline(axis.positions[step], color="black", lw=0.6, ls=":")
                 place = {"xytext": (2, -1), "textcoords": "offset points", "va": "top", "fontsize": 7}
                 axes.annotate(name, (axis.positions[step], 1.0), xycoords=axes.get_xaxis_transform(), **place)
-            axes.set_title(f"episode {trace.episode_index}", loc="left")
             axes.set_ylabel(with_unit(f"{main.name} error", main.unit))
             axes.set_xlim(axis.edges[0], axis.edges[-1])
             if trace is traces[-1] or any(other.episode.time is None for other in traces) == (axis.label != "step"):
                 axes.set_xlabel(axis.label)
             axes.set_ylim(0.0, 1.15 * float(np.nanmax(error)) or 1.0)
-            axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
+            draw_legend(axes, f"episode {trace.episode_index}")
     return figure
 
 

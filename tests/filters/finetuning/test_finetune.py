@@ -326,7 +326,7 @@ def test_rates_and_windows_are_checked_before_any_evaluation(
     monkeypatch.setattr("beliefscope.filters.finetuning.finetune.validate", lambda *_: pytest.fail("evaluated"))
     with pytest.raises(BadInput, match=r"rate nope=0\.1 matches no trained parameter: "):
         run(episodes, replace(SMALL, rates=(("nope", 0.1),)))
-    with pytest.raises(BadInput, match="no matching step in windows of 9999 steps"):
+    with pytest.raises(BadInput, match="windows of 9999 steps are longer than every training episode: 60 steps"):
         run(episodes, replace(SMALL, length=9999))
 
 
