@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.faults import Blackout
+from beliefscope.datasets.faults.image_faults import Blackout
 from beliefscope.datasets.task import Task
 
 Report = Callable[[str, int, int, float], None]

@@ -161,15 +161,8 @@ class CheckpointComparison(Diagnostic):
     def event_table(self) -> Table:
         """One row per regressed event."""
         timed = any(m.time is not None for m in self.events)
-        columns: tuple[str, ...] = (
-            "slice",
-            "episode",
-            "step",
-            *(("time s",) if timed else ()),
-            "from",
-            "to",
-            "contact",
-        )
+        time = ("time s",) if timed else ()
+        columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", "contact")
         unit, factor = self.error_shown
         columns += tuple(f"{name} {unit}".rstrip() for name in ("before", "after", "increase"))
         rows = tuple(

@@ -9,7 +9,8 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.faults import FAULTS, ImageFault
+from beliefscope.datasets.faults.faults import FAULTS
+from beliefscope.datasets.faults.image_faults import ImageFault
 from beliefscope.datasets.faults.injection import Faults, available_presets
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.training.plan import EVALUATED_BLACKOUTS, evaluated_blackouts
