@@ -65,6 +65,7 @@ class Comparison(Diagnostic):
         nees_at: (T, 2) NEES / n by step.
         effective_weights_at: (T, K, 2) effective weights by step, or None.
         contact, blackout: (T,) bool; image blackout in either run.
+        time: (T,) s, times of the steps; None without timestamps.
     """
 
     task: Task
@@ -85,6 +86,7 @@ class Comparison(Diagnostic):
     effective_weights_at: Array | None
     contact: NDArray[np.bool_]
     blackout: NDArray[np.bool_]
+    time: Array | None
 
     @property
     def verdict(self) -> str:
@@ -105,7 +107,8 @@ class Comparison(Diagnostic):
             )
         parts.append(self._consistency())
         farthest = int(self.distance.argmax())
-        parts.append(f"Largest distance between the estimates {main.text(self.distance[farthest])} (step {farthest}).")
+        at = f"step {farthest}" if self.time is None else f"step {farthest}, {self.time[farthest]:.2f} s"
+        parts.append(f"Largest distance between the estimates {main.text(self.distance[farthest])} ({at}).")
         return " ".join(filter(None, parts))
 
     def _other_components(self) -> str:
@@ -262,6 +265,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         effective_weights_at=share,
         contact=this.episode.contact.astype(bool),
         blackout=either_blackout,
+        time=this.episode.time,
     )
 
 

@@ -23,6 +23,7 @@ from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.catalog import run_diagnostics
 from beliefscope.inspect.compare.counterfactual import compare
+from beliefscope.inspect.compare.two_runs import compare_runs
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.slices.covariates import _step_columns
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
@@ -197,6 +198,7 @@ def test_tables_name_the_times(run: Trace, episode: Episode) -> None:
     assert f"(step 9, {episode.times[9]:.2f} s)" in result.verdict
     table = next(table for table in result.tables() if table.title == "Largest difference of the estimates")
     assert (table.columns[-1], table.rows[0][-2:]) == ("time s", (9, episode.times[9]))
+    assert f"(step 9, {episode.times[9]:.2f} s)" in compare_runs(run, edited).verdict
     assert event_table(run, 9, None).title == f"Step 9 ({episode.times[9]:.2f} s) of episode 0"
     plain = replace(run, episode=replace(episode, time=None))
     assert event_table(plain, 9, None).title == "Step 9 of episode 0"
