@@ -23,6 +23,9 @@ from beliefscope.inspect.trace import Trace
 COLUMNS = 4
 """Maximum number of panels per row."""
 
+LEGEND = 1.5
+"""Inches of the legend beside estimates without a map."""
+
 ZOOMS = (6, 4, 2)
 MIN_SHARE = 0.98
 """Minimum fraction of each layer's likelihood inside a zoomed map."""
@@ -89,7 +92,8 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH * columns / COLUMNS, 2.05 * rows), layout="constrained")
+        beside = LEGEND if map_ is None and len(trace.task.map_indices) == 2 else 0.0
+        figure = Figure(figsize=(WIDTH * columns / COLUMNS + beside, 2.05 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, (key, image) in zip(grid, images.items(), strict=False):
@@ -121,7 +125,7 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
         axes.axvline(0.0, color=COLOURS["truth"], lw=0.6)
         for name in (*trace.modalities_with_posterior, "fused"):
             _draw_estimate(axes, positions[name], colour(name, trace.modalities), name)
-        axes.legend(frameon=False, fontsize=6)
+        axes.legend(frameon=False, fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     else:
         log = map_.log_likelihood[map_.layers.index(layer)]
         style: dict[str, Any] = {
