@@ -165,7 +165,7 @@ class Counterfactual(Diagnostic):
                 main.factor * self.distance[span].mean(),
             )
             rows.append((name, *map(float, values), _number(self.divergence[span].mean())))
-        names = (f"{name}, {main.unit}" for name in ("error", "error edited", "distance"))
+        names = (f"{name}, {main.unit}".rstrip(", ") for name in ("error", "error edited", "distance"))
         columns = ("steps", *names, "divergence, nats")
         tables = [Table("Mean over steps", columns, tuple(rows))]
         peaks = tuple(
@@ -180,7 +180,7 @@ class Counterfactual(Diagnostic):
 
     def _modality_table(self) -> Table:
         main = self.task.main_error
-        columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}")
+        columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}".rstrip(", "))
         change = main.factor * self.modality_distance[self.during].mean(0)
         rows: list[tuple[Value, ...]] = [(m, float(change[k])) for k, m in enumerate(self.modalities)]
         if self.effective_weights is not None and self.edited_weights is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
@@ -149,9 +149,9 @@ class Comparison(Diagnostic):
         for s, phase in enumerate(self.phases):
             label = f"{phase} ({self.steps[s]})"
             rows += [
-                _row(label, f"{main.name} RMSE ({main.unit})", main.factor * self.position[s], relative=True),
+                _row(label, with_unit(f"{main.name} RMSE", main.unit), main.factor * self.position[s], relative=True),
                 *(
-                    _row(label, f"{c.label} RMSE ({units[i]})", factors[i] * self.rmse[s, i], relative=True)
+                    _row(label, with_unit(f"{c.label} RMSE", units[i]), factors[i] * self.rmse[s, i], relative=True)
                     for i, c in enumerate(task.components)
                     if (i,) != main.indices
                 ),
