@@ -98,6 +98,15 @@ class Episode:
         return np.concatenate([[self.dt], np.diff(self.time)])[: len(self)]
 
     @property
+    def positions(self) -> NDArray[np.float64]:
+        """(T,) times in steps of the usual duration ``dt``; the indices of the steps without timestamps."""
+        return np.arange(len(self), dtype=np.float64) if self.time is None else self.time / self.dt
+
+    def time_of(self, step: int) -> float | None:
+        """s from the first step to a step; None if the data have no timestamps."""
+        return None if self.time is None else float(self.time[step])
+
+    @property
     def duration_text(self) -> str:
         """Duration of a step, such as ``0.10 s``, or the shortest and the longest."""
         if self.time is None or len(self) < 2:
@@ -120,6 +129,11 @@ class Episode:
             digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
             digest.update(array.tobytes())
         return digest.hexdigest()
+
+
+def step_text(step: int, time: float | None) -> str:
+    """A step, and its time where the data have timestamps: ``step 12``, ``step 12 (3.40 s)``."""
+    return f"step {step}" if time is None else f"step {step} ({time:.2f} s)"
 
 
 def hold(readings: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:

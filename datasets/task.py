@@ -254,6 +254,11 @@ class Task:
         is_array = len(self.observations[key]) == 1 or key in (*self.arrays, *self.clouds)
         return np.float32 if is_array else np.uint8
 
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Keys of the observations that are images."""
+        return tuple(key for key in self.observations if self.dtype(key) is np.uint8)
+
     def held_steps(self, key: str) -> int:
         """Consecutive repetitions of an observation that its period explains: one missed reading included."""
         return math.ceil(2.0 * self.periods.get(key, 0.0) / self.dt)

@@ -35,9 +35,9 @@ def open_filter(task: str | Task, text: str) -> Checkpoint:
     return checkpoint
 
 
-def open_filters(task: str | None, first: str, second: str) -> tuple[Checkpoint, Checkpoint]:
+def open_filters(task: str | Task | None, first: str, second: str) -> tuple[Checkpoint, Checkpoint]:
     """Two filters of one task. task: required for two names. Raises BadInput as ``open_filter``."""
-    given = [load_task(task)] if task is not None and ":" in task else []
+    given = [load_task(task)] if isinstance(task, Task) or (task is not None and ":" in task) else []
     loaded: dict[str, Checkpoint] = {}
     for text in (first, second):
         if is_code(text):

@@ -43,4 +43,7 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
 
 
 def _number(value: float | None) -> str | None:
-    return None if value is None else f"{value:8.2f}"
+    """Two decimals, or three significant digits of a smaller value, such as an error in rad/s."""
+    if value is None:
+        return None
+    return f"{value:8.2f}" if value == 0.0 or abs(value) >= 0.1 else f"{value:8.3g}"

@@ -119,6 +119,7 @@ def test_commands_and_server_need_no_definition(folder: Path) -> None:
         ["trace", *run, "--episode", "2", "-o", "again.trace"],
         ["record", *run, "-o", "again.rrd"],
         ["change", "own.safetensors", "own.safetensors", "--data", "data.h5"],
+        ["change", "own.safetensors", "own.safetensors", "--data", "data.h5", "--task", "rover"],
     ]
     result = subprocess.run(
         [sys.executable, "-c", FRESH, json.dumps(commands)],

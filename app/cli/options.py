@@ -232,18 +232,8 @@ class Runs:
         from beliefscope.datasets.faults.injection import read_faults
         from beliefscope.filters.open_filter import open_filter
 
-        checkpoint = open_filter(self._definition(), self.filter)
+        checkpoint = open_filter(definition_of(self.task, self.data), self.filter)
         return checkpoint, read_faults(self.faults, checkpoint.task)
-
-    def _definition(self) -> Task | str:
-        """The task of the data if it is named and not shipped, so that the file that defines it is not needed."""
-        from beliefscope.datasets.catalog import TASKS
-        from beliefscope.datasets.store import open_dataset
-
-        if self.data is None or self.task in TASKS or ":" in self.task:
-            return self.task
-        with open_dataset(self.data) as data:
-            return data.task if data.task.name == self.task else self.task
 
     def settings(self, faults: Faults) -> dict[str, Any]:
         """Arguments that all functions that run a filter over episodes have."""
@@ -279,15 +269,31 @@ class Run(Runs):
             return episodes[index], index
 
     def trace(self, align: bool = False, **settings: int) -> tuple[Checkpoint, Trace]:
-        """Run the filter with a progress bar; its checkpoint and the trace. settings: further ones of ``trace``."""
-        from beliefscope.inspect.trace import trace
-
+        """The filter, and its run over the selected episode: see ``over``."""
         checkpoint, faults = self.open()
         episode, index = self.read_episode(checkpoint.task)
+        return checkpoint, self.over(checkpoint, episode, index, faults, align, **settings)
+
+    def over(
+        self, checkpoint: Checkpoint, episode: Episode, index: int, faults: Faults, align: bool = False, **settings: int
+    ) -> Trace:
+        """Run the filter over an episode with a progress bar. settings: further ones of ``trace``."""
+        from beliefscope.inspect.trace import trace
+
         (episode,) = self.check(checkpoint, [episode], align)
         with console.progress("Filtering") as advance:
-            run = trace(checkpoint, episode, index, self.seed, self.particles, faults, advance, **settings)
-            return checkpoint, run
+            return trace(checkpoint, episode, index, self.seed, self.particles, faults, advance, **settings)
+
+
+def definition_of(task: str, path: Path | None) -> Task | str:
+    """The task of the data if it is named and not shipped, so that the file that defines it is not needed."""
+    from beliefscope.datasets.catalog import TASKS
+    from beliefscope.datasets.store import open_dataset
+
+    if path is None or task in TASKS or ":" in task:
+        return task
+    with open_dataset(path) as data:
+        return data.task if data.task.name == task else task
 
 
 def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:

@@ -38,7 +38,7 @@ def integer_field(default: int | None, unit: str, meaning: str, minimum: int = 0
     return value_field(default, int, unit, meaning, minimum=minimum, maximum=MAX_VALUE)
 
 
-def name_field(default: str, meaning: str, choices: tuple[str, ...] = ()) -> Any:
+def name_field(default: str | None, meaning: str, choices: tuple[str, ...] = ()) -> Any:
     return value_field(default, str, "name", meaning, choices=choices)
 
 
@@ -109,20 +109,25 @@ class Fault:
         return {"fault": self.name} | {k: v for k, v in values.items() if v is not None and (k, v) != ("from", 0)}
 
     def __str__(self) -> str:
-        text, first = self.name, True
+        texts = {}
         for key, parameter in parameters(type(self)).items():
             value = getattr(self, parameter.name)
             if value != parameter.default or isinstance(value, str):
-                text += f"={_format(value)}" if first else f":{key}={_format(value)}"
-            first = False
-        return text
+                texts[key] = _format(value)
+        first = texts.pop(first_parameter(type(self)), None)
+        return "".join([self.name, "" if first is None else f"={first}", *(f":{k}={v}" for k, v in texts.items())])
 
 
 def parameters(fault: type[Fault]) -> dict[str, Field[Any]]:
     """Parameter name in text -> dataclass field; the span comes last. ``from`` is a Python keyword: ``from_``."""
     span = {parameter.name for parameter in fields(Fault)}
-    ordered = sorted(fields(fault), key=lambda parameter: parameter.name in span)
+    ordered = sorted(fields(fault), key=lambda parameter: (parameter.kw_only, parameter.name in span))
     return {parameter.name.rstrip("_"): parameter for parameter in ordered}
+
+
+def first_parameter(fault: type[Fault]) -> str:
+    """Name of the parameter whose value directly follows the name of a fault: the first, but for an optional sensor."""
+    return next(name for name, p in parameters(fault).items() if (p.metadata["kind"], p.default) != (str, None))
 
 
 def _validate(fault: str, key: str, parameter: Field[Any], value: Any) -> Any:

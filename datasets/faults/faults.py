@@ -28,139 +28,12 @@ from beliefscope.datasets.faults.fault import (
     number_field,
     value_field,
 )
+from beliefscope.datasets.faults.image_faults import IMAGE_FAULTS
 from beliefscope.datasets.faults.sensor_faults import SENSOR_FAULTS
 from beliefscope.datasets.task import Task
 
 PERMUTATIONS = tuple("".join(order) for order in permutations(AXES))[1:]
 """Orders of the axes other than x, y, z."""
-
-MAX_SHIFT = 4096
-"""Largest shift of an image, pixels."""
-
-
-@dataclass(frozen=True)
-class Blackout(Fault):
-    """Images are blacked out, independently at each step."""
-
-    name, sensor = "blackout", "image"
-    probability: float = number_field(1.0, "fraction", "probability of a blackout at a step", 0, 1)
-    gray: int | None = value_field(
-        None,
-        int,
-        "gray levels",
-        "level of all pixels; default: 0; the paper's code has mid-gray, 128",
-        minimum=0,
-        maximum=255,
-    )
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return choose_steps(
-            rng.random(len(readings)) < self.probability, np.full_like(readings, self.gray or 0), readings
-        )
-
-
-@dataclass(frozen=True)
-class ImageFrozen(Fault):
-    """The image of the fault's first step is repeated."""
-
-    name, sensor = "image_frozen", "image"
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return np.broadcast_to(readings[span.first], readings.shape)
-
-
-@dataclass(frozen=True)
-class ImageUnderexposed(Fault):
-    """Images are under- or overexposed and saturate at white."""
-
-    name, sensor = "image_underexposed", "image"
-    factor: float = number_field(0.4, "factor", "scale of every gray level", 0)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings * self.factor
-
-
-@dataclass(frozen=True)
-class ImageNoise(GaussianNoise):
-    """Independent Gaussian noise is added to every pixel."""
-
-    name, sensor = "image_noise", "image"
-    std: float = number_field(40.0, "gray levels", "standard deviation", 0)
-
-
-@dataclass(frozen=True)
-class ImageOutage(Fault):
-    """Images are black in stretches of random length: a two-state Markov chain with these stationary moments."""
-
-    name, sensor = "image_outage", "image"
-    fraction: float = number_field(0.5, "fraction", "expected share of steps without an image", 0, 1)
-    seconds: float = number_field(2.0, "s", "mean duration of an outage", 0.01)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        # The chain changes at a step only if its number falls below ``begin`` or above ``stay``, whatever its state.
-        end = min(1.0, span.dt / self.seconds)
-        begin = 1.0 if self.fraction == 1.0 else min(1.0, end * self.fraction / (1.0 - self.fraction))
-        number, stay = rng.random(len(readings)), max(1.0 - end, begin)
-        decided = (number < begin) | (number >= stay)
-        outage = number < begin
-        decided[0], outage[0] = True, number[0] < self.fraction
-        latest = np.maximum.accumulate(np.where(decided, np.arange(len(readings)), 0))
-        return choose_steps(outage[latest], np.zeros_like(readings), readings)
-
-
-@dataclass(frozen=True)
-class ImageBlur(Fault):
-    """Images are blurred with a Gaussian kernel."""
-
-    name, sensor = "image_blur", "image"
-    std: float = number_field(1.0, "pixels", "standard deviation of the kernel", 0, 32)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        rows, columns = (self._kernel(size) for size in readings.shape[1:3])
-        channels = np.moveaxis(readings.astype(float), -1, 1) if readings.ndim == 4 else readings.astype(float)
-        blurred = rows @ channels @ columns.T
-        return np.moveaxis(blurred, 1, -1) if readings.ndim == 4 else blurred
-
-    def _kernel(self, size: int) -> Readings:
-        """(size, size): weights of the pixels of a line, normalised at the borders."""
-        distance = np.subtract.outer(np.arange(size), np.arange(size))
-        weights = np.exp(-0.5 * (distance / max(self.std, 1e-3)) ** 2)
-        return weights / weights.sum(1, keepdims=True)
-
-
-@dataclass(frozen=True)
-class ImageOccluded(Fault):
-    """A square occludes the same part of every image."""
-
-    name, sensor = "image_occluded", "image"
-    size: int = integer_field(12, "pixels", "side length of the square")
-    x: int | None = integer_field(None, "pixels", "left column; default: random for each episode")
-    y: int | None = integer_field(None, "pixels", "top row; default: random for each episode")
-    gray: float = number_field(0.0, "gray levels", "gray level of the square", 0, 255)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        room = np.maximum(np.array(readings.shape[1:3]) - self.size, 0)
-        top, left = (int(n) for n in rng.integers(room + 1))
-        top, left = top if self.y is None else self.y, left if self.x is None else self.x
-        occluded = readings.copy()
-        occluded[:, top : top + self.size, left : left + self.size] = round(self.gray)
-        return occluded
-
-
-@dataclass(frozen=True)
-class ImageShift(Fault):
-    """Images are shifted, as by a displaced camera; pixels at the border are repeated."""
-
-    name, sensor = "image_shift", "image"
-    x: int = integer_field(3, "pixels", "shift to the right", minimum=-MAX_SHIFT)
-    y: int = integer_field(0, "pixels", "shift downwards", minimum=-MAX_SHIFT)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        rows, columns = (
-            np.clip(np.arange(size) - shift, 0, size - 1)
-            for size, shift in zip(readings.shape[1:3], (self.y, self.x), strict=True)
-        )
-        return readings[:, rows[:, None], columns]
 
 
 @dataclass(frozen=True)
@@ -368,14 +241,7 @@ class Drop(ModalityFault):
 FAULTS: dict[str, type[Fault]] = {
     fault.name: fault
     for fault in (
-        Blackout,
-        ImageFrozen,
-        ImageUnderexposed,
-        ImageNoise,
-        ImageOutage,
-        ImageBlur,
-        ImageOccluded,
-        ImageShift,
+        *IMAGE_FAULTS,
         ForceBias,
         ForceNoise,
         ForceDrift,

@@ -19,7 +19,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode, FloatArray, hold
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.control_faults import ControlFault
-from beliefscope.datasets.faults.fault import Fault, Readings, parameters
+from beliefscope.datasets.faults.fault import Fault, Readings, first_parameter, parameters
 from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.simulation.simulate import hand_controls
@@ -155,6 +155,8 @@ def available_presets(task: Task) -> dict[str, str]:
     presets = {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
     common = {key for text in presets.values() for key in Faults.parse(text).sequence[0].keys(task)}
     for key in (key for key in task.observations if key not in common):
+        if key in task.images:
+            presets[f"40 % {display_name(key)} blackout"] = f"blackout=0.4:key={key}"
         presets[f"{display_name(key)} frozen"] = f"sensor_frozen={key}:from=20"
     for name in (name for name in task.modalities if name not in ("image", "haptics")):
         presets[f"{display_name(name)} dropped"] = f"drop={name}:from=20"
@@ -214,14 +216,14 @@ def faulty_copies(faults: Faults, episodes: Iterable[Episode], seed: int) -> lis
 
 
 def _create(name: Any, values: Mapping[str | None, Any]) -> Fault:
-    """Create a fault. The key None stands for its first parameter."""
+    """Create a fault. The key None stands for its ``first_parameter``."""
     name = RENAMED_FAULTS.get(str(name), name)
     if not isinstance(name, str) or name not in FAULTS:
         raise unknown_name("fault", str(name), FAULTS)
     available = parameters(FAULTS[name])
     arguments: dict[str, Any] = {}
     for key, value in values.items():
-        key = next(iter(available)) if key is None else key
+        key = first_parameter(FAULTS[name]) if key is None else key
         if key not in available:
             raise unknown_name(f"parameter of {name}", key, available)
         if available[key].name in arguments:

@@ -11,7 +11,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.faults import faults
+from beliefscope.datasets.faults import faults, image_faults
 from beliefscope.datasets.faults.fault import Fault
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.panda import Sleeve
@@ -111,11 +111,11 @@ def _axes(values: Values, prefix: str = "") -> dict[str, Any]:
 
 SENSOR_FAULTS: dict[str, Callable[[Values], Sequence[Fault]]] = {
     "image-quality": lambda v: (
-        faults.ImageUnderexposed(factor=v["exposure"]),
-        faults.ImageBlur(std=v["blur"]),
-        faults.ImageNoise(std=v["noise"]),
+        image_faults.ImageUnderexposed(factor=v["exposure"]),
+        image_faults.ImageBlur(std=v["blur"]),
+        image_faults.ImageNoise(std=v["noise"]),
     ),
-    "outages": lambda v: (faults.ImageOutage(fraction=v["fraction"], seconds=v["seconds"]),),
+    "outages": lambda v: (image_faults.ImageOutage(fraction=v["fraction"], seconds=v["seconds"]),),
     "wrist": lambda v: (
         faults.ForceBias(**_axes(v, "force_")),
         faults.ForceDrift(**_axes(v, "drift_")),

@@ -131,7 +131,8 @@ class Capture:
         outputs = {k: self._calls[part].output for k, part in enumerate(models) if part in self._calls}
         self.models = tuple(outputs) if len(models) > 1 else ()
         if outputs and all(output.shape == fused.shape for output in outputs.values()):
-            values["log_likelihood"] = torch.stack(list(outputs.values()), dim=1)
+            first, *others = outputs.values()
+            values["log_likelihood"] = torch.stack([first, *others], dim=1) if others else first.unsqueeze(1)
         after = _read(self._filter.particle_states)
         if after.shape == states.shape:
             values[RESAMPLED] = after

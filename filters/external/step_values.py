@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.filters.external.adapter import Values, letters_of
-from beliefscope.filters.external.ancestors import ancestors
+from beliefscope.filters.external.ancestors import Words, ancestors, new_table, words_of
 from beliefscope.filters.external.hooks import RESAMPLED
 
 BLOCK = 32
@@ -31,13 +31,14 @@ class StepValues:
         self._count = count
         self._arrays: dict[str, Tensor | None] = {}
         self._rows: dict[str, tuple[Tensor, ...]] = {}
-        self._resampled: dict[int, Tensor] = {}
+        self._resampled: dict[int, Words] = {}
+        self._memory: list[Words] = []
 
     def append(self, values: Values) -> None:
         t = len(self.steps)
         self.steps.append({name: self._copy(t, name, value) for name, value in values.items() if name != RESAMPLED})
         if RESAMPLED in values:
-            self._resampled[t] = values[RESAMPLED].clone()
+            self._resampled[t] = words_of(values[RESAMPLED], self._memory.pop() if self._memory else None)
             if len(self._resampled) == BLOCK:
                 self._search()
 
@@ -61,10 +62,16 @@ class StepValues:
         return row.copy_(value)
 
     def _search(self) -> None:
-        for t, particles in self._resampled.items():
-            found = with_ancestors({"particles": self.steps[t]["particles"], RESAMPLED: particles})
-            if "ancestors" in found:
-                self.steps[t]["ancestors"] = self._copy(t, "ancestors", found["ancestors"])
+        table = before = None
+        for t, after in self._resampled.items():
+            particles = self.steps[t]["particles"]
+            count = particles.shape[1]
+            before = words_of(particles, before)
+            table = new_table(count) if table is None or before.shape[2] != count else table
+            index = ancestors(after, before, table)
+            if int(index.max()) < count:
+                self.steps[t]["ancestors"] = self._copy(t, "ancestors", index)
+        self._memory.extend(self._resampled.values())
         self._resampled.clear()
 
 
@@ -72,9 +79,8 @@ def with_ancestors(values: Values) -> Values:
     """Values of a step with the ancestors of its resampled particles in their place, if all are among its particles."""
     result = {name: value for name, value in values.items() if name != RESAMPLED}
     if RESAMPLED in values:
-        index = ancestors(values[RESAMPLED], values["particles"])
-        if (index < values["particles"].shape[1]).all():
-            result["ancestors"] = index
+        index = ancestors(words_of(values[RESAMPLED]), words_of(values["particles"]))
+        result |= {"ancestors": index} if int(index.max()) < values["particles"].shape[1] else {}
     return result
 
 

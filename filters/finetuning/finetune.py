@@ -91,12 +91,14 @@ def finetune(
     frozen = freeze(filter_, trained)
     frozen_digest = digest(filter_, frozen)
     groups, events = split_episodes(episodes, settings.events)
+    if settings.length > (longest := max(map(len, groups["train"]))):
+        raise BadInput(f"windows of {settings.length} steps are longer than every training episode: {longest} steps")
     mixes, images = _mixes(filter_, groups, events, settings, device)
     key = cache_key(base=base.hash, settings=settings.to_json(), data=data_hash, versions=versions(), device=device)
     state = Partial(partial, key) if partial else None
+    loop = FilterLoop(filter_, trained, settings, mixes["train"], mixes["val"])
     with cached_encoders(filter_, images):
         before = validate(filter_, mixes["test"], 0, 0.0, settings)
-        loop = FilterLoop(filter_, trained, settings, mixes["train"], mixes["val"])
         seconds = run_loop(loop, state, began, callbacks)
         if seconds is None:
             return None
@@ -187,8 +189,10 @@ def split_episodes(
     for event in events:
         if event.episode >= len(episodes):
             raise BadInput(f"Episode {event.episode} is not in the data, which has episodes 0 to {len(episodes) - 1}.")
-        if event.first >= len(episodes[event.episode]):
-            raise BadInput(f"event {event} begins after its episode's {len(episodes[event.episode])} steps")
+        steps = len(episodes[event.episode])
+        if event.first >= steps or (event.last or 0) > steps:
+            where = "begins" if event.first >= steps else "ends"
+            raise BadInput(f"event {event} {where} after its episode's {steps} steps")
         by_episode.setdefault(event.episode, []).append(event)
     split = {name: [i for i, e in enumerate(episodes) if e.split == name and i not in by_episode] for name in SPLITS}
     train = sorted([*split["train"], *by_episode])

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix, evenly_spaced
@@ -117,7 +118,10 @@ class FineTuneLoop:
         if "dynamics.log_noise" in rates:
             rates["dynamics.log_noise"] = rate * NOISE_RATE
         for pattern, other in self.settings.rates:
-            rates |= dict.fromkeys(matching(rates, pattern), other)
+            names = matching(rates, pattern)
+            if not names:
+                raise BadInput(f"rate {pattern}={other:g} matches no trained parameter: {', '.join(rates)}")
+            rates |= dict.fromkeys(names, other)
         return rates
 
     @property

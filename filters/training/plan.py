@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.faults import Blackout
+from beliefscope.datasets.faults.image_faults import Blackout
 from beliefscope.datasets.task import Task
 
 Report = Callable[[str, int, int, float], None]
@@ -89,8 +89,12 @@ PLANS = {
 
 
 def evaluated_blackouts(task: Task) -> tuple[float, ...]:
-    """``EVALUATED_BLACKOUTS``; only 0 for a task without the sensor ``image``, which the fault ``blackout`` changes."""
-    return EVALUATED_BLACKOUTS if Blackout.sensor in task.observations else EVALUATED_BLACKOUTS[:1]
+    """``EVALUATED_BLACKOUTS``; only 0 for a task on which ``blackout`` has no image, or none by default."""
+    try:
+        Blackout().keys(task)
+    except BadInput:
+        return EVALUATED_BLACKOUTS[:1]
+    return EVALUATED_BLACKOUTS
 
 
 def parse_blackouts(text: str) -> tuple[float, ...]:

@@ -160,7 +160,9 @@ class CheckpointComparison(Diagnostic):
 
     def event_table(self) -> Table:
         """One row per regressed event."""
-        columns: tuple[str, ...] = ("slice", "episode", "step", "from", "to", "contact")
+        timed = any(m.time is not None for m in self.events)
+        time = ("time s",) if timed else ()
+        columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", "contact")
         unit, factor = self.error_shown
         columns += tuple(f"{name} {unit}".rstrip() for name in ("before", "after", "increase"))
         rows = tuple(
@@ -168,6 +170,7 @@ class CheckpointComparison(Diagnostic):
                 m.slice,
                 m.episode,
                 m.step,
+                *((m.time,) if timed else ()),
                 m.first,
                 m.last,
                 "yes" if m.contact else "no",

@@ -29,6 +29,9 @@ RECOVERED = 1.0
 MIN_INCREASE = 0.05
 """Minimum reported increase of an effective weight."""
 
+MAX_OTHERS = 2
+"""Maximum number of components beside those of the main error in the verdict; all are in the tables."""
+
 
 @dataclass(frozen=True)
 class Counterfactual(Diagnostic):
@@ -50,6 +53,7 @@ class Counterfactual(Diagnostic):
         error, edited_error: (T,) m, position errors.
         effective_weights, edited_weights: (T, K) effective weights, averaged over components; None without fusion.
         contact: (T,) bool.
+        time: (T,) s, times of the steps; None without timestamps.
         recovery: first step after the edit from which ``sigmas`` stays at most ``RECOVERED``; None if there is none.
     """
 
@@ -71,6 +75,7 @@ class Counterfactual(Diagnostic):
     effective_weights: Array | None
     edited_weights: Array | None
     contact: NDArray[np.bool_]
+    time: Array | None
     recovery: int | None
 
     @property
@@ -91,10 +96,11 @@ class Counterfactual(Diagnostic):
         if not self.distance.any() and not self.sigmas.any():
             return f"{_sentence(self.edit)} changed nothing."
         peak = int(self.distance.argmax())
-        text = f"{self.edit} moved the estimate by up to {self.task.main_error.text(self.distance[peak])} (step {peak})"
-        for name, (largest, step, unit) in self._peaks().items():
-            if name not in self._main():
-                text += f" and the {name} by up to {largest:.1f} {unit} (step {step})"
+        largest = self.task.main_error.text(self.distance[peak])
+        text = f"{self.edit} moved the estimate by up to {largest} ({self._at(peak)})"
+        others = {name: peak for name, peak in self._peaks().items() if name not in self._main()}
+        for name, (change, step, unit) in others.items() if len(others) <= MAX_OTHERS else ():
+            text += f" and the {name} by up to {change:.3g} {unit} ({self._at(step)})"
         text = f"{_sentence(text)}: {self._recovery()}. "
         main = self.task.main_error
         before, after = (main.factor * float(error[self.during].mean()) for error in (self.error, self.edited_error))
@@ -110,7 +116,14 @@ class Counterfactual(Diagnostic):
         if self.recovery is None:
             return f"{text}, not recovered by the last step"
         delay = self.recovery - self.to
-        return f"{text}, recovered " + (f"{delay} steps after the edit" if delay else "immediately after the edit")
+        if not delay:
+            return f"{text}, recovered immediately after the edit"
+        seconds = "" if self.time is None else f" ({self.time[self.recovery] - self.time[self.to]:.2f} s)"
+        return f"{text}, recovered {delay} steps{seconds} after the edit"
+
+    def _at(self, step: int) -> str:
+        """A step, and its time where the data have timestamps."""
+        return f"step {step}" if self.time is None else f"step {step}, {self.time[step]:.2f} s"
 
     def _weight_text(self) -> str:
         """Effective weight of the dominant modality during the edit."""
@@ -152,18 +165,22 @@ class Counterfactual(Diagnostic):
                 main.factor * self.distance[span].mean(),
             )
             rows.append((name, *map(float, values), _number(self.divergence[span].mean())))
-        names = (f"{name}, {main.unit}" for name in ("error", "error edited", "distance"))
+        names = (f"{name}, {main.unit}".rstrip(", ") for name in ("error", "error edited", "distance"))
         columns = ("steps", *names, "divergence, nats")
         tables = [Table("Mean over steps", columns, tuple(rows))]
-        peaks = tuple((name, largest, unit, step) for name, (largest, step, unit) in self._peaks().items())
-        tables.append(Table("Largest difference of the estimates", ("component", "difference", "unit", "step"), peaks))
+        peaks = tuple(
+            (name, largest, unit, step, *(() if self.time is None else (float(self.time[step]),)))
+            for name, (largest, step, unit) in self._peaks().items()
+        )
+        heads = ("component", "difference", "unit", "step", *(() if self.time is None else ("time s",)))
+        tables.append(Table("Largest difference of the estimates", heads, peaks))
         if self.modalities:
             tables.append(self._modality_table())
         return tables
 
     def _modality_table(self) -> Table:
         main = self.task.main_error
-        columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}")
+        columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}".rstrip(", "))
         change = main.factor * self.modality_distance[self.during].mean(0)
         rows: list[tuple[Value, ...]] = [(m, float(change[k])) for k, m in enumerate(self.modalities)]
         if self.effective_weights is not None and self.edited_weights is not None:
@@ -238,6 +255,7 @@ def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
         effective_weights=weights[0],
         edited_weights=weights[1],
         contact=original.episode.contact.astype(bool),
+        time=original.episode.time,
         recovery=_recovery_step(sigmas, edit.to),
     )
 

@@ -84,6 +84,7 @@ class Regression:
         faults, only: condition of the slice: sensor faults, and modalities that are used.
         episode: index in the data set.
         first, last, step: first and last step, and the step of the largest increase (peak).
+        time: s from the first step of the episode to the peak; None without timestamps.
         contact: whether there is contact at the peak.
         before, after: main error at the peak, in the unit of its components.
     """
@@ -95,6 +96,7 @@ class Regression:
     first: int
     last: int
     step: int
+    time: float | None
     contact: bool
     before: float
     after: float
@@ -138,13 +140,14 @@ def find_regressions(
     contact = np.concatenate([e.contact.astype(bool) for e in episodes])
     counted = step >= first
     gap = max(1, round(RECENT / task.dt))
+    position = np.concatenate([e.positions for e in episodes])
     events: list[Regression] = []
     for (faults, only), distance in sums.distance.items():
         before, after = np.concatenate(distance, axis=1)
         increase = np.where(counted, after - before, -np.inf)
         high = increase > max(MIN_INCREASE / task.main_error.factor, float(np.quantile(increase[counted], HIGH)))
         name = next(slice_.name for slice_ in slices if condition(slice_) == (faults, only))
-        for a, b in event_spans(high, episode, gap):
+        for a, b in event_spans(high, episode, gap, position):
             at = a + int(np.argmax(increase[a : b + 1]))
             events.append(
                 Regression(
@@ -155,6 +158,7 @@ def find_regressions(
                     first=int(step[a]),
                     last=int(step[b]),
                     step=int(step[at]),
+                    time=episodes[episode[at]].time_of(int(step[at])),
                     contact=bool(contact[at]),
                     before=float(before[at]),
                     after=float(after[at]),

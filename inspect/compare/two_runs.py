@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
@@ -65,6 +65,7 @@ class Comparison(Diagnostic):
         nees_at: (T, 2) NEES / n by step.
         effective_weights_at: (T, K, 2) effective weights by step, or None.
         contact, blackout: (T,) bool; image blackout in either run.
+        time: (T,) s, times of the steps; None without timestamps.
     """
 
     task: Task
@@ -85,6 +86,7 @@ class Comparison(Diagnostic):
     effective_weights_at: Array | None
     contact: NDArray[np.bool_]
     blackout: NDArray[np.bool_]
+    time: Array | None
 
     @property
     def verdict(self) -> str:
@@ -105,7 +107,8 @@ class Comparison(Diagnostic):
             )
         parts.append(self._consistency())
         farthest = int(self.distance.argmax())
-        parts.append(f"Largest distance between the estimates {main.text(self.distance[farthest])} (step {farthest}).")
+        at = f"step {farthest}" if self.time is None else f"step {farthest}, {self.time[farthest]:.2f} s"
+        parts.append(f"Largest distance between the estimates {main.text(self.distance[farthest])} ({at}).")
         return " ".join(filter(None, parts))
 
     def _other_components(self) -> str:
@@ -146,9 +149,9 @@ class Comparison(Diagnostic):
         for s, phase in enumerate(self.phases):
             label = f"{phase} ({self.steps[s]})"
             rows += [
-                _row(label, f"{main.name} RMSE ({main.unit})", main.factor * self.position[s], relative=True),
+                _row(label, with_unit(f"{main.name} RMSE", main.unit), main.factor * self.position[s], relative=True),
                 *(
-                    _row(label, f"{c.label} RMSE ({units[i]})", factors[i] * self.rmse[s, i], relative=True)
+                    _row(label, with_unit(f"{c.label} RMSE", units[i]), factors[i] * self.rmse[s, i], relative=True)
                     for i, c in enumerate(task.components)
                     if (i,) != main.indices
                 ),
@@ -262,6 +265,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         effective_weights_at=share,
         contact=this.episode.contact.astype(bool),
         blackout=either_blackout,
+        time=this.episode.time,
     )
 
 

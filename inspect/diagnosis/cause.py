@@ -85,6 +85,7 @@ class Evidence:
         text: statistic, value and healthy range in words.
         value, low, high: value of the statistic and its 95 % healthy range.
         episode, step: moment that shows it best; None if it concerns whole episodes.
+        time: s from the first step to ``step``; None without timestamps.
     """
 
     text: str
@@ -93,6 +94,7 @@ class Evidence:
     high: float
     episode: int | None = None
     step: int | None = None
+    time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -182,11 +184,14 @@ class Diagnosis:
             return []
         rows = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
         tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
-        evidence = tuple((c.cause.name, e.text, e.episode, e.step) for c in causes for e in c.evidence)
+        listed = [(c.cause.name, e) for c in causes for e in c.evidence]
+        timed = any(e.time is not None for _, e in listed)
+        evidence = tuple((name, e.text, e.episode, e.step, *((e.time,) if timed else ())) for name, e in listed)
+        heads = ("cause", "deviation", "episode", "step", *(("time s",) if timed else ()))
         actions = tuple((c.cause.name, c.next) for c in causes)
         return [
             *tables,
-            Table("Evidence", ("cause", "deviation", "episode", "step"), evidence),
+            Table("Evidence", heads, evidence),
             Table("Next", ("cause", "action"), actions),
         ]
 

@@ -76,7 +76,8 @@ def _evidence(case: Case, deviation: Deviation) -> Evidence:
     trace = case.traces[int(np.nanargmax(distance))]
     steps = localise(deviation.statistic, trace.episode, case.profile.reference)
     step = None if steps is None else steps[0]
-    return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step)
+    time = None if step is None else trace.episode.time_of(step)
+    return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step, time)
 
 
 def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int) -> str:

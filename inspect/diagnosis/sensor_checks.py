@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
-    AXES,
+    axis_index,
     contact_distance_statistics,
     free_motion,
     saturated,
@@ -73,12 +73,12 @@ def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | No
         case "frozen":
             return _in_runs(frozen_images(readings, episode.task.held_steps(key)), present)
         case "stuck" if axis:
-            return _in_runs(stuck(episode, key, AXES.index(axis)), present)
+            return _in_runs(stuck(episode, key, axis_index(axis)), present)
         case "stuck":
             return _in_runs(repeats(readings, episode.task.held_steps(key)), present)
         case "saturation":
             marked = np.zeros(len(present), dtype=bool)
-            marked[present] = saturated(readings[present, AXES.index(axis)].astype(np.float64))
+            marked[present] = saturated(readings[present, axis_index(axis)].astype(np.float64))
             return marked
     return None
 
@@ -104,7 +104,7 @@ def _series(kind: str, key: str, axis: str, episode: Episode, reference: Referen
     readings, present = episode.observations[key].astype(np.float64), episode.present(key)
     match kind:
         case "noise" | "position noise" if present.sum() > 2:
-            chosen = readings[:, [AXES.index(axis)]] if axis else readings.reshape(len(readings), -1)
+            chosen = readings[:, [axis_index(axis)]] if axis else readings.reshape(len(readings), -1)
             size = np.median(np.abs(np.diff(chosen[present], n=2, axis=0)), axis=1)
             series = np.log(np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12))
             steps = np.arange(len(readings))
@@ -112,5 +112,5 @@ def _series(kind: str, key: str, axis: str, episode: Episode, reference: Referen
         case "brightness" if reference is not None and reference.image.shape == readings.shape[1:]:
             return _without_lost(np.abs(brightness_of(readings, reference) - 1.0), episode.observations[key])
         case "level":
-            return np.where(free_motion(episode) & present, np.abs(readings[:, AXES.index(axis)]), 0.0)
+            return np.where(free_motion(episode) & present, np.abs(readings[:, axis_index(axis)]), 0.0)
     return None

@@ -225,5 +225,10 @@ def saturated(values: Array) -> Mask:
 
 
 def _axis(key: str, i: int, count: int) -> str:
-    """Display name of an axis: ``force x``."""
-    return f"{key} {AXES[i] if count <= 3 else i}"
+    """Display name of an axis: ``force x``, ``joints 4``; of a scalar, the key."""
+    return key if count == 1 else f"{key} {AXES[i] if count <= 3 else i}"
+
+
+def axis_index(axis: str) -> int:
+    """Index of an axis, from the part of its display name after the key."""
+    return int(axis) if axis.isdecimal() else AXES.index(axis)

@@ -10,6 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, compare
@@ -35,11 +38,15 @@ class Diagnostic(Views):
         """Significant deviations from the filter's healthy record, or without one from theory."""
         return ()
 
-    def plot(self) -> Figure:
-        """Curves, plots and image panels as a matplotlib figure of a paper's width."""
+    def plot(self, time: NDArray[np.float64] | None = None) -> Figure:
+        """Curves, plots and image panels as a matplotlib figure of a paper's width.
+
+        Args:
+            time: (T,) s, ``Episode.time`` of the trace: curves are drawn over it instead of the indices of the steps.
+        """
         from beliefscope.inspect.diagnostics.plotting import draw_figure  # matplotlib is slow to import
 
-        return draw_figure(self)
+        return draw_figure(self, time)
 
 
 @dataclass(frozen=True)

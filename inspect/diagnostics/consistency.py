@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
@@ -148,7 +148,7 @@ class Consistency(Diagnostic):
         columns = ("layer", "phase", "trajectories", "steps", "NEES/n", "95 % interval", "NIS/n", "95 % coverage")
         tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "result"), tuple(rows))]
         names = [
-            f"{c.label} ({unit}): {quantity}"
+            f"{with_unit(c.label, unit)}: {quantity}"
             for c, unit in zip(task.components, units, strict=True)
             for quantity in ERROR_QUANTITIES
         ]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
@@ -118,7 +118,7 @@ class Errors(Diagnostic):
     def tables(self) -> list[Table]:
         units, factors = measures.display_units(self.task)
         unit, scale = self._unit
-        names = [f"{c.label} ({u})" for c, u in zip(self.task.components, units, strict=True)]
+        names = [with_unit(c.label, u) for c, u in zip(self.task.components, units, strict=True)]
         heads = [f"{name}: {quantity}" for name in names for quantity in ("RMSE", "bias")]
         rows: list[tuple[Value, ...]] = [
             (
@@ -127,12 +127,19 @@ class Errors(Diagnostic):
             )
             for g in self.groups
         ]
-        columns = ("group", "steps", f"{self.task.main_error.name} RMSE ({unit})", "squared error (%)", *heads)
+        columns = ("group", "steps", with_unit(f"{self.task.main_error.name} RMSE", unit), "squared error (%)", *heads)
         tables = [Table("Errors by group", columns, tuple(rows))]
         if self.outages:
             columns = (
-                *("sensor", "outages", "steps (%)", "longest (s)", f"before ({unit})", f"during ({unit})"),
-                *(f"at the end ({unit})", "squared error (%)", "recovery (s)", "not recovered"),
+                *(
+                    "sensor",
+                    "outages",
+                    "steps (%)",
+                    "longest (s)",
+                    with_unit("before", unit),
+                    with_unit("during", unit),
+                ),
+                *(with_unit("at the end", unit), "squared error (%)", "recovery (s)", "not recovered"),
             )
             numbers = tuple(
                 (
@@ -143,10 +150,14 @@ class Errors(Diagnostic):
                 for o in self.outages
             )
             tables.append(Table("Outages", columns, numbers))
-            columns = ("sensor", "duration (s)", "outages", "steps (%)", f"RMSE ({unit})", "squared error (%)")
+            columns = ("sensor", "duration (s)", "outages", "steps (%)", with_unit("RMSE", unit), "squared error (%)")
             tables.append(Table("Outages by duration", columns, tuple(self._durations())))
         if self.readings:
-            columns = ("observation", f"RMSE of its readings ({unit})", f"RMSE of the estimate there ({unit})")
+            columns = (
+                "observation",
+                with_unit("RMSE of its readings", unit),
+                with_unit("RMSE of the estimate there", unit),
+            )
             numbers = tuple((key, scale * a, scale * b) for key, (a, b) in self.readings.items())
             tables.append(Table("Estimate and raw readings", columns, numbers))
         return tables

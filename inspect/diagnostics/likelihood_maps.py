@@ -72,17 +72,38 @@ class MapSurvey(Diagnostic):
 
     @property
     def verdict(self) -> str:
-        if not self.ridge_layers:
-            return "No modality observes the end effector, so there is no shape to evaluate."
         sentences = [
             self._shape(layer, phase)
             for layer in self.ridge_layers
             for phase in ("contact", "free motion")
             if phase in self.phases and self.phases[phase].any()
         ]
-        if np.isfinite(self.numbers.expected).any():
+        if sentences and np.isfinite(self.numbers.expected).any():
             sentences.append("A random orientation is 45° off in the median.")
-        return " ".join(sentences)
+        return " ".join(sentences) or self._regions()
+
+    @property
+    def has_shapes(self) -> bool:
+        """Whether directions and distances on the map are those of the state: two components of one unit."""
+        return len(self.components) == 2 and len({self.task.components[i].unit for i in self.components}) == 1
+
+    @property
+    def _region(self) -> str:
+        """Name of a region's size: that of a curve is a length."""
+        return "area" if len(self.components) == 2 else "region"
+
+    def _regions(self) -> str:
+        """Median 95 % region of the fused map, and the smallest and the largest one of the modalities."""
+        unit, factor = area_unit(self.task, self.components)
+        mask = next(iter(self.phases.values()))
+        *single, fused = factor * np.median(self.numbers.area95[mask], axis=0)
+        text = f"The median 95 % {self._region} of the fused {self.quantity} is {_text(fused, unit)}"
+        if len(single) < 2:
+            return f"{text}."
+        low, high = int(np.argmin(single)), int(np.argmax(single))
+        layers = self.numbers.layers
+        ends = (f"{_text(single[i], unit)} ({layers[i]})" for i in (low, high))
+        return f"{text}; of single modalities, {' to '.join(ends)}."
 
     def _shape(self, layer: str, phase: str) -> str:
         """Most frequent shape of a layer's map in a phase, and its measures."""
@@ -118,11 +139,14 @@ class MapSurvey(Diagnostic):
             for phase, mask in self.phases.items():
                 if not mask.any():
                     continue
-                values = (
+                shapes = (
                     np.degrees(n.deviation[:, i]),
                     n.elongation[:, i],
                     *(100.0 * (n.shape[:, i] == k) for k in range(len(SHAPES))),
                     length[1] * np.where(n.shape[:, i] == SHAPES.index("ring"), n.ring_radius[:, i], np.nan),
+                )
+                values = (
+                    *(shapes if self.has_shapes else ()),
                     factor * n.area50[:, i],
                     factor * n.area95[:, i],
                     n.entropy[:, i] + np.log(factor),
@@ -131,14 +155,15 @@ class MapSurvey(Diagnostic):
                     n.overlap[:, i, fused],
                 )
                 # Of a shape, the part of the steps; the radius is the median over rings.
-                parts = range(2, 2 + len(SHAPES))
+                parts = range(2, 2 + len(SHAPES)) if self.has_shapes else ()
                 medians = [
                     round(float((np.mean if k in parts else _median)(value[mask])), 3) for k, value in enumerate(values)
                 ]
                 rows.append((layer, phase, int(mask.sum()), *(v if np.isfinite(v) else None for v in medians)))
-        shapes = (*(f"{shape} (% of steps)" for shape in SHAPES), with_unit("ring radius", length[0]))
-        columns = ("map", "phase", "steps", "off expected ridge (deg)", "elongation", *shapes)
-        regions = (with_unit(f"{share} % area", area) for share in (50, 95))
+        named = (*(f"{shape} (% of steps)" for shape in SHAPES), with_unit("ring radius", length[0]))
+        directions = ("off expected ridge (deg)", "elongation", *named) if self.has_shapes else ()
+        columns = ("map", "phase", "steps", *directions)
+        regions = (with_unit(f"{share} % {self._region}", area) for share in (50, 95))
         more = (*regions, f"entropy (nats, per {area or 'unit'})", "ln p(true state) / max")
         last = ("KL to fused (nats)", "overlap with fused")
         return [Table(f"{self.title}. Medians over steps", (*columns, *more, *last), tuple(rows))]
@@ -153,13 +178,18 @@ class MapSurvey(Diagnostic):
                 Curve(layer, angle, "Angle between principal axis and expected ridge", "°", layer, (0.0, 45.0))
             )
         for i, layer in enumerate(n.layers):
-            curves.append(Curve(layer, factor * n.area95[:, i], "95 % area", area, layer))
+            curves.append(Curve(layer, factor * n.area95[:, i], f"95 % {self._region}", area, layer))
         for i, layer in enumerate(n.layers[:-1]):
             curves.append(Curve(layer, n.divergence[:, i, -1], "KL divergence to the fused map", "nats", layer))
         return curves
 
     def bands(self) -> dict[str, Mask]:
         return {} if self.trajectories > 1 else {"contact": self.contact, "blackout": self.blackout}
+
+
+def _text(value: float, unit: str) -> str:
+    """A number with three significant digits and its unit."""
+    return f"{value:.3g} {unit}".rstrip()
 
 
 def _median(values: NDArray[np.float64]) -> float:

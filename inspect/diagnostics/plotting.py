@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,8 +54,36 @@ BANDS = {
 }
 OTHER_BAND = {"facecolor": "#999999", "alpha": 0.25}
 
+LEGEND_ENTRY, LEGEND_ROW = 4.8, 1.5
+"""Width of a legend entry without its text, and height of a row, in font sizes."""
+
+MARGIN = 0.75
+"""Inches beside the axes of a chart."""
+
 PANEL_HEIGHT = 1.5
 """Inches, height of a full-width chart over time; plots and image panels are half as wide and 1.6 x as high."""
+
+
+@dataclass(frozen=True)
+class StepAxis:
+    """Horizontal axis of charts over the T steps of a trace.
+
+    Attributes:
+        positions: (T,) of the steps. edges: (T + 1,) between the steps, and as far before the first and after the last.
+    """
+
+    positions: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    label: str
+
+    @classmethod
+    def of(cls, steps: int, time: NDArray[np.float64] | None) -> StepAxis:
+        """The times (T,) in s where the data have timestamps, else the indices of the steps."""
+        positions = np.arange(steps, dtype=np.float64) if time is None else time
+        middles = 0.5 * (positions[1:] + positions[:-1])
+        half = (middles[:1] - positions[:1], positions[-1:] - middles[-1:]) if steps > 1 else (0.5, 0.5)
+        edges = np.concatenate([positions[:1] - half[0], middles, positions[-1:] + half[1]])
+        return cls(positions, edges, "step" if time is None else "time (s)")
 
 
 def write_figure(figure: Figure, path: Path) -> None:
@@ -86,25 +115,30 @@ def new_figure(**settings: Any) -> Figure:
     return figure
 
 
-def draw_figure(diagnostic: Views) -> Figure:
-    """Draw the verdict, charts below one another, then plots and image panels, two per row."""
+def draw_figure(diagnostic: Views, time: NDArray[np.float64] | None = None) -> Figure:
+    """Draw the verdict, charts below one another, then plots and image panels, two per row.
+
+    Args:
+        time: (T,) s, times of the steps of the charts; None to draw them over the indices of the steps.
+    """
     charts = charts_of(diagnostic)
     panels: list[Plot | ImagePanel] = [*diagnostic.plots(), *diagnostic.images()]
     rows = len(charts) + -(-len(panels) // 2)
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        height = PANEL_HEIGHT * (len(charts) + 1.6 * -(-len(panels) // 2)) + 0.5
+        heights = [PANEL_HEIGHT + legend_height([curve.name for curve in curves], name) for name, curves in charts]
+        heights += [1.6 * PANEL_HEIGHT] * (rows - len(charts))
+        height = sum(heights) + 0.5
         figure = new_figure(figsize=(WIDTH, height), layout="constrained")
         figure.suptitle(diagnostic.verdict, fontsize=8, x=0.01, ha="left", wrap=True)
         if not rows:
             return figure
-        ratios = [1.0] * len(charts) + [1.6] * (rows - len(charts))
-        grid = figure.add_gridspec(rows, 2, height_ratios=ratios)
+        grid = figure.add_gridspec(rows, 2, height_ratios=heights)
         first = None
         for row, (name, curves) in enumerate(charts):
             first = axes = figure.add_subplot(grid[row, :], sharex=first)
-            draw_chart(axes, name, curves, diagnostic)
+            draw_chart(axes, name, curves, diagnostic, time)
         for i, panel in enumerate(panels):
             axes = figure.add_subplot(grid[len(charts) + i // 2, i % 2])
             draw_panel(axes, panel)
@@ -128,29 +162,67 @@ def charts_of(diagnostic: Views) -> list[tuple[str, list[Curve]]]:
     return [(name, list(curves)) for name, curves in groupby(diagnostic.curves(), key=lambda curve: curve.chart)]
 
 
-def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Views) -> None:
-    """Draw curves over steps with shaded bands and dashed bounds."""
-    steps = np.arange(len(curves[0].values))
-    draw_bands(axes, diagnostic.bands())
+def draw_chart(
+    axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Views, time: NDArray[np.float64] | None
+) -> None:
+    """Draw curves over steps or their times with shaded bands and dashed bounds."""
+    axis = StepAxis.of(len(curves[0].values), time)
+    draw_bands(axes, diagnostic.bands(), axis)
     layers = [curve.layer for curve in curves]
     for i, curve in enumerate(curves):
         style = ("-", "--", ":", "-.")[layers[:i].count(curve.layer) % 4]
-        axes.plot(steps, curve.values, label=curve.name, color=colour_of(curve.layer, layers), lw=1.0, ls=style)
+        axes.plot(
+            axis.positions, curve.values, label=curve.name, color=colour_of(curve.layer, layers), lw=1.0, ls=style
+        )
     for bound in dict.fromkeys(b for curve in curves if curve.bounds for b in curve.bounds):
         axes.axhline(bound, color="black", lw=0.6, ls="--")
-    axes.set_title(name, loc="left")
     axes.set_ylabel(curves[0].unit)
-    axes.set_xlabel("step")
-    axes.set_xlim(-0.5, len(steps) - 0.5)
-    # Next to the title, clear of the curves.
-    axes.legend(frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
+    axes.set_xlabel(axis.label)
+    axes.set_xlim(axis.edges[0], axis.edges[-1])
+    draw_legend(axes, name)
 
 
-def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], labelled: bool = False) -> None:
+def draw_legend(axes: Axes, title: str = "") -> None:
+    """Draw the title above the axes, and the legend beside it where there is room, else in rows below it."""
+    labels = axes.get_legend_handles_labels()[1]
+    columns, rows = _legend_layout(labels, title)
+    style: dict[str, Any] = {"frameon": False, "ncols": columns, "borderaxespad": 0.0}
+    if rows == 0:
+        axes.set_title(title, loc="left")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), **style)
+    else:
+        axes.set_title(title, loc="left", pad=(LEGEND_ROW * rows + 1.0) * STYLE["font.size"])
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.97), **style)
+
+
+def legend_height(labels: Sequence[str], title: str = "") -> float:
+    """Inches that the rows of a legend below its title need."""
+    return _legend_layout(labels, title)[1] * LEGEND_ROW * float(STYLE["font.size"]) / 72.0
+
+
+def _legend_layout(labels: Sequence[str], title: str) -> tuple[int, int]:
+    """Columns of a legend, and rows between title and axes: 0 beside the title; as many columns as have room."""
+    from matplotlib.textpath import TextPath
+
+    size, available = float(STYLE["font.size"]), 72.0 * (WIDTH - MARGIN)
+    widths = [size * LEGEND_ENTRY + TextPath((0, 0), text, size=size).get_extents().width for text in labels if text]
+    head = TextPath((0, 0), title, size=STYLE["axes.titlesize"]).get_extents().width if title else 0.0
+    if head + 2.0 * size + sum(widths) <= available:
+        return max(1, len(widths)), 0
+    for columns in range(len(widths), 1, -1):
+        rows = -(-len(widths) // columns)
+        used = -(-len(widths) // rows)  # entries fill one column after the other
+        if sum(max(widths[i * rows : (i + 1) * rows]) for i in range(used)) <= available:
+            return used, rows
+    return 1, max(1, len(widths))
+
+
+def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], axis: StepAxis, labelled: bool = False) -> None:
     """Shade the steps of each phase, extended by half a step on both sides. ``labelled``: add legend entries."""
     for phase, mask in bands.items():
         if mask.any():
-            spans = [(first - 0.5, end - first) for first, end in intervals(mask)]
+            edges = axis.edges
+            spans = [(edges[first], edges[end] - edges[first]) for first, end in intervals(mask)]
             style = BANDS.get(phase, OTHER_BAND)
             shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **style}
             axes.broken_barh(spans, (0, 1), label=phase if labelled else None, **shade)

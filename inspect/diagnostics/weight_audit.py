@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
@@ -252,7 +252,7 @@ class WeightAudit(Diagnostic):
                     curves.append(Curve(name, values[:, k, w], chart, "", modality))
             unit, factor = (units[w], scale[w]) if column else (task.main_error.unit, task.main_error.factor)
             name = f"regret {column or task.main_error.name}"
-            regrets.append(Curve(name, factor * self.regret[:, w], f"Regret ({unit})", unit))
+            regrets.append(Curve(name, factor * self.regret[:, w], with_unit("Regret", unit), unit))
         # Curves of one chart must be consecutive: components with equal units share a chart.
         return curves + sorted(regrets, key=lambda curve: curve.unit)
 

@@ -22,6 +22,7 @@ class EpisodeErrors:
         steps: T.
         rmse: over all steps but those of the task's warm-up.
         worst, worst_step: maximum over all steps; NaN and None without known errors.
+        worst_time: s from the first step to ``worst_step``; None without timestamps.
         error: (P,) maximum in each of P equal parts of the episode.
         contact: (P,) whether there is contact in each part.
     """
@@ -31,6 +32,7 @@ class EpisodeErrors:
     rmse: float
     worst: float
     worst_step: int | None
+    worst_time: float | None
     error: Array
     contact: Mask
 
@@ -50,13 +52,15 @@ def _errors(survey: Survey, part: slice) -> EpisodeErrors:
     steps = len(error)
     counted = error[min(int(survey.phases["start"][part].sum()), steps - 1) :]
     has_errors = np.isfinite(error).any()
+    worst_step = int(np.nanargmax(error)) if has_errors else None
     starts = np.linspace(0, steps, min(steps, POINTS), endpoint=False).astype(int)
     return EpisodeErrors(
         index=int(survey.episode[part.start]),
         steps=steps,
         rmse=float(np.sqrt(np.mean(counted**2))),
         worst=float(np.nanmax(error)) if has_errors else np.nan,
-        worst_step=int(np.nanargmax(error)) if has_errors else None,
+        worst_step=worst_step,
+        worst_time=None if worst_step is None else survey.time_of(part.start + worst_step),
         error=np.fmax.reduceat(error, starts),
         contact=np.logical_or.reduceat(contact, starts),
     )

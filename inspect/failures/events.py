@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, step_text
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import display_name, with_unit
@@ -18,7 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
-from beliefscope.inspect.failures.step_scores import RECENT, Survey
+from beliefscope.inspect.failures.step_scores import RECENT, ROUNDING, Survey
 from beliefscope.inspect.failures.survey import check_applies, find_score, survey_of
 from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, layer_label
 
@@ -44,6 +44,7 @@ class Event:
     Attributes:
         episode: index in the data set.
         first, last, step: first and last step, and the peak.
+        first_time, last_time, time: s from the first step of the episode to them; None without timestamps.
         score: score at the peak, in the ``unit`` of its ``Failures``.
         phase: phase of the peak.
         other_phases: other phases that apply to the peak.
@@ -59,6 +60,9 @@ class Event:
     first: int
     last: int
     step: int
+    first_time: float | None
+    last_time: float | None
+    time: float | None
     score: float
     phase: str
     other_phases: tuple[str, ...]
@@ -106,6 +110,7 @@ class Failures(Diagnostic):
         shown, error_shown: units for display of the score and of the main error, and their factors.
         threshold: minimum score of an event.
         episodes, steps: numbers of episodes and steps.
+        timed: whether steps have times.
         layers: L names: the K modalities, then ``fused``.
         angles: names of the A components in rad.
         phase_names: of the survey. phases: statistics of phases with steps, in the order of ``phase_names``.
@@ -127,6 +132,7 @@ class Failures(Diagnostic):
     threshold: float
     episodes: int
     steps: int
+    timed: bool
     layers: tuple[str, ...]
     angles: tuple[str, ...]
     phase_names: tuple[str, ...]
@@ -147,13 +153,13 @@ class Failures(Diagnostic):
         if not self.events:
             return f"No events {scope}."
         worst = self.events[0]
-        where = f"{self.format(worst.score)} at step {worst.step} of episode {worst.episode} ({worst.phase})"
+        where = f"{step_text(worst.step, worst.time)} of episode {worst.episode} ({worst.phase})"
         count = f"{len(self.events)} event{'s' * (len(self.events) != 1)} {scope}, above {self.format(self.threshold)}"
         phases = "; ".join(
             f"{p.name}, {_percent(p.share)} of steps and {_percent(p.event_share)} of events ({p.lift:.1f} x)"
             for p in self.over_represented
         )
-        sentences = [f"{count}; worst: {where}."]
+        sentences = [f"{count}; worst: {self.format(worst.score)} at {where}."]
         sentences.append(f"Over-represented: {phases}." if phases else "No phase is over-represented.")
         sentences += [UPDATES_NOTE] if self.by in UPDATE_SCORES else []
         return " ".join(sentences)
@@ -193,7 +199,9 @@ class Failures(Diagnostic):
 
     def event_table(self, events: Sequence[Event]) -> Table:
         """One row per event with the values at its peak."""
-        columns: tuple[str, ...] = ("episode", "step", "from", "to", self._label, "phase")
+        columns: tuple[str, ...] = ("episode", "step", "from", "to")
+        columns += ("time s", "from s", "to s") if self.timed else ()
+        columns += (self._label, "phase")
         columns += tuple(f"{layer_label(layer)} {self.error_shown[0]}".rstrip() for layer in self.layers)
         columns += tuple(f"{display_name(name)} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
@@ -206,7 +214,8 @@ class Failures(Diagnostic):
         numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
         values = (float(value) if np.isfinite(value) else None for value in numbers)
         score = self.shown[1] * event.score
-        return (event.episode, event.step, event.first, event.last, score, event.phase, *values)
+        times = (event.time, event.first_time, event.last_time) if self.timed else ()
+        return (event.episode, event.step, event.first, event.last, *times, score, event.phase, *values)
 
     @property
     def _label(self) -> str:
@@ -280,7 +289,7 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
     gap = max(1, round(RECENT / survey.task.dt))
     has_score = np.isfinite(score) | ~np.isfinite(score).any()
     phase = np.where(has_score, survey.phase_index, -1)
-    spans = event_spans(score > threshold, survey.episode, gap)
+    spans = event_spans(score > threshold, survey.episode, gap, survey.position)
     events = [_event(survey, score, first, last) for first, last in spans]
     events.sort(key=lambda event: (-event.score, event.episode, event.step))
     quantiles = {"all": _quantiles(score)}
@@ -300,6 +309,7 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
         threshold=threshold,
         episodes=len(np.unique(survey.episode)),
         steps=len(score),
+        timed=survey.time is not None,
         layers=survey.layers,
         angles=survey.angles,
         phase_names=tuple(survey.phases),
@@ -313,15 +323,17 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
     )
 
 
-def event_spans(high: Mask, episode: NDArray[np.int_], gap: int) -> list[tuple[int, int]]:
+def event_spans(high: Mask, episode: NDArray[np.int_], gap: int, position: Array) -> list[tuple[int, int]]:
     """First and last index of each interval of high steps, merged across gaps of up to ``gap`` steps in an episode.
 
-    Since each interval has one peak, this is a non-maximum suppression. Arrays are (S,) over concatenated episodes.
+    Since each interval has one peak, this is a non-maximum suppression. Arrays are (S,) over concatenated episodes;
+    those of ``position`` are ``Episode.positions``.
     """
     at = np.flatnonzero(high)
     if not len(at):
         return []
-    breaks = (np.diff(at) > gap + 1) | (np.diff(episode[at]) != 0)
+    # Neighbouring steps are one interval, however long the time between them.
+    breaks = ((np.diff(position[at]) > gap + 1 + ROUNDING) & (np.diff(at) > 1)) | (np.diff(episode[at]) != 0)
     firsts, lasts = at[np.r_[True, breaks]], at[np.r_[breaks, True]]
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
 
@@ -338,6 +350,9 @@ def _event(survey: Survey, score: Array, first: int, last: int) -> Event:
         first=int(survey.step[first]),
         last=int(survey.step[last]),
         step=int(survey.step[peak]),
+        first_time=survey.time_of(first),
+        last_time=survey.time_of(last),
+        time=survey.time_of(peak),
         score=float(score[peak]),
         phase=phases[0],
         other_phases=tuple(phases[1:]),

@@ -20,6 +20,9 @@ from beliefscope.inspect.trace import Trace
 RECENT = 0.5
 """s, duration for which a change of contact counts as a phase."""
 
+ROUNDING = 1e-6
+"""Steps: errors of positions that are computed from times."""
+
 GROUP = "group "
 """Prefix of the columns of groups of covariates."""
 
@@ -66,6 +69,8 @@ class Survey:
         layers: L names: the K modalities, then ``fused``.
         angles: names of the A components in rad.
         episode, step: (S,) indices in the data set and in the episode.
+        position: (S,) ``Episode.positions``.
+        time: (S,) s since the first step of the episode, NaN without timestamps; None if no episode has any.
         scores: name -> (S,), for available scores; NaN at steps without a score.
         refused: name -> reason, for scores that do not apply.
         error: (S, L) main error (``Task.main_error``), in the unit of its components.
@@ -87,6 +92,8 @@ class Survey:
     angles: tuple[str, ...]
     episode: NDArray[np.int_]
     step: NDArray[np.int_]
+    position: Array
+    time: Array | None
     scores: dict[str, Array]
     refused: dict[str, str]
     error: Array
@@ -122,6 +129,8 @@ class Survey:
             phases=_phases(columns, task),
             episode=columns["episode"],
             step=columns["step"],
+            position=columns["position"],
+            time=None if np.isnan(columns["time"]).all() else columns["time"],
             error=columns["error"],
             angle_error=columns["angle_error"],
             nees=columns["nees"],
@@ -134,6 +143,10 @@ class Survey:
     def from_traces(cls, traces: Iterable[Trace]) -> Survey:
         """As ``from_episodes``, of traces, which are not kept."""
         return cls.from_episodes(map(EpisodeScores.from_trace, traces))
+
+    def time_of(self, index: int) -> float | None:
+        """s from the first step of its episode to one of the S steps; None without timestamps."""
+        return None if self.time is None or np.isnan(self.time[index]) else float(self.time[index])
 
     @property
     def phase_index(self) -> NDArray[np.int_]:
@@ -236,25 +249,28 @@ def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
     task, steps = trace.task, np.arange(len(trace))
     angles = [i for i, c in enumerate(task.components) if c.unit == "rad"]
     scores = {f"score {name}": s.values(trace) for name, s in scores_of(task).items() if s.why_not(trace) is None}
-    recent = max(1, round(RECENT / trace.episode.dt))
-    contact = trace.episode.contact.astype(bool)
+    episode = trace.episode
+    recent = max(1, round(RECENT / episode.dt))
+    contact = episode.contact.astype(bool)
     columns: dict[str, NDArray[Any]] = {
         **scores,
         "episode": np.full(len(trace), trace.episode_index),
         "step": steps,
+        "position": episode.positions,
+        "time": np.full(len(trace), np.nan) if episode.time is None else episode.time,
         "error": measures.main_error(trace),
         "angle_error": np.abs(measures.errors(trace)[..., angles]),
         "nees": measures.nees(trace),
         "contact": contact,
-        "made": _recently(contact[1:] & ~contact[:-1], recent),
-        "lost": _recently(~contact[1:] & contact[:-1], recent),
+        "made": _recently(contact[1:] & ~contact[:-1], episode.positions, recent),
+        "lost": _recently(~contact[1:] & contact[:-1], episode.positions, recent),
         "blackout": measures.blackout(trace),
         "start": steps < task.warmup,
         "speed": _speeds(trace, task),
     }
     for name, covariate in task.covariates.items():
         if name != "contact":
-            masks = covariate.masks(name, trace.episode.covariate(name))
+            masks = covariate.masks(name, episode.covariate(name))
             columns |= {f"{GROUP}{group}": mask for group, mask in masks}
     if trace.effective_sample_size is not None:
         columns["ess"] = trace.effective_sample_size
@@ -265,10 +281,14 @@ def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _recently(events: Mask, steps: int) -> Mask:
-    """(T,): whether there was an event in the last ``steps`` steps, including this one; events (T - 1,) from step 1."""
-    count = np.concatenate([np.zeros(steps + 1, int), np.cumsum(events)])
-    return count[steps:] > count[:-steps]
+def _recently(events: Mask, position: NDArray[Any], steps: int) -> Mask:
+    """(T,): whether there was an event in the last ``steps`` steps, including this one.
+
+    Args:
+        events: (T - 1,) from step 1. position: (T,) ``Episode.positions``.
+    """
+    latest = np.maximum.accumulate(np.where(np.concatenate([[False], events]), position, -np.inf))
+    return np.asarray(position - latest < steps - ROUNDING)
 
 
 def _speeds(trace: Trace, task: Task) -> Array:

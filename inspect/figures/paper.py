@@ -14,11 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
 from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine, Quantity
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
@@ -50,31 +51,35 @@ def middle_of_longest(mask: NDArray[np.bool_]) -> int | None:
     return int(first + end - 1) // 2
 
 
-def steps_by_contact(trace: Trace, selection: Sequence[int] = ()) -> dict[bool, int]:
+def steps_by_contact(episode: Episode, index: int, selection: Sequence[int] = ()) -> dict[bool, int]:
     """A step in free motion, if any, and a step in contact; one step, as if in free motion, of a task without contact.
 
     Steps that are not in ``selection`` are the middle of the longest interval after the warm-up steps, or of the whole
     episode if there is none.
 
+    Args:
+        index: of the episode in its data set.
+
     Raises:
         BadInput: a selected step is not in the episode, two are in the same state, or the episode has no contact.
     """
-    with_contact = "contact" in trace.task.covariates
-    contact = trace.episode.contact.astype(bool) & with_contact
+    with_contact = "contact" in episode.task.covariates
+    contact = episode.contact.astype(bool) & with_contact
+    counted = np.arange(len(episode)) >= episode.task.first_counted(len(episode))
     steps: dict[bool, int] = {}
     for step in selection:
-        if not 0 <= step < len(trace):
-            raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(trace) - 1}")
+        if not 0 <= step < len(episode):
+            raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(episode) - 1}")
         state = bool(contact[step])
         if state in steps:
             where = f"are both in {STATES[state]!r}: select one per state" if with_contact else "are two: select one"
             raise BadInput(f"steps {steps[state]} and {step} {where}")
         steps[state] = step
     if with_contact and not contact.any():
-        raise BadInput(f"episode {trace.episode_index} has no contact: select another one with --episode")
+        raise BadInput(f"episode {index} has no contact: select another one with --episode")
     for state in STATES:
         mask = contact == state
-        middle = middle_of_longest(mask & measures.counted(trace))
+        middle = middle_of_longest(mask & counted)
         middle = middle_of_longest(mask) if middle is None else middle
         if middle is not None:
             steps.setdefault(state, middle)
@@ -231,7 +236,9 @@ def weights_figure(trace: Trace) -> Figure:
     component_wise = trace.effective_weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.35 * (len(task.map_indices) + len(columns)) + 0.4), layout="constrained")
+        legends = 2.0 * legend_height([*map(measures.layer_label, measures.layers(trace)), "truth"])
+        height = 1.35 * (len(task.map_indices) + len(columns)) + 0.4 + legends
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
         FigureCanvasAgg(figure)
         charts = figure.subplots(len(task.map_indices) + len(columns), 1, sharex=True)
         for axes, i in zip(charts, task.map_indices, strict=False):
@@ -242,14 +249,17 @@ def weights_figure(trace: Trace) -> Figure:
             axes.set_ylabel(f"weight, {task.components[i].label}" if component_wise else "weight")
         for axes in charts:
             _shade_phases(axes, trace)
-        charts[-1].set_xlabel(f"step, {trace.episode.duration_text} each")
+        axis = _step_axis(trace)
+        charts[-1].set_xlabel(
+            axis.label if trace.episode.time is not None else f"step, {trace.episode.duration_text} each"
+        )
         for axes in (charts[0], charts[len(task.map_indices)]):
-            axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
+            draw_legend(axes)
     return figure
 
 
 def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
-    steps = np.arange(len(trace))
+    steps = _step_axis(trace).positions
     factor = trace.task.components[component].shown[1]
     *unimodal, fused = factor * measures.means(trace)[..., component].T
     axes.plot(
@@ -263,7 +273,7 @@ def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
 
 def _draw_weights(axes: Axes, trace: Trace, column: int) -> None:
     assert trace.effective_weights is not None
-    steps, beta = np.arange(len(trace)), trace.weights
+    steps, beta = _step_axis(trace).positions, trace.weights
     beta_is_effective = beta is not None and np.allclose(beta, trace.effective_weights, atol=1e-3)
     for k, modality in enumerate(trace.modalities):
         shade = colour(modality, trace.modalities)
@@ -280,7 +290,11 @@ def _draw_weights(axes: Axes, trace: Trace, column: int) -> None:
 
 def _shade_phases(axes: Axes, trace: Trace) -> None:
     """Shade contact and image blackout."""
-    draw_bands(
-        axes, {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}, labelled=True
-    )
-    axes.set_xlim(-0.5, len(trace) - 0.5)
+    axis = _step_axis(trace)
+    bands = {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}
+    draw_bands(axes, bands, axis, labelled=True)
+    axes.set_xlim(axis.edges[0], axis.edges[-1])
+
+
+def _step_axis(trace: Trace) -> StepAxis:
+    return StepAxis.of(len(trace), trace.episode.time)

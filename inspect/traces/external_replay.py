@@ -64,12 +64,8 @@ class ExternalReplay:
 
         Raises BadInput for weights, unknown sensors, and steps outside the trace.
         """
-        self.check_step(edit.first)
         original = self.original
-        if edit.to > len(original):
-            raise BadInput(f"step {edit.to} is after the last step of this trace, {len(original) - 1}")
-        if edit.weights:
-            raise BadInput(f"{original.filter} is an external filter: its fusion weights cannot be set; edit a sensor")
+        edit.check(self._external, len(original))
         episode = edit.timed_faults.apply(original.episode, original.seed)
         edits = [*original.settings.get("edits", []), edit.to_json()]
         provenance = {name: getattr(original, name) for name in PROVENANCE} | {

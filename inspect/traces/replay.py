@@ -18,6 +18,8 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.filter import WEIGHTED
 from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.inspect.traces.data import ARRAYS, Trace
@@ -85,6 +87,30 @@ class Edit:
     def timed_faults(self) -> Faults:
         """The faults, restricted to the edited steps."""
         return Faults(tuple(replace(fault, from_=self.first, to=self.to) for fault in self.faults))
+
+    def check(self, checkpoint: Checkpoint, steps: int) -> None:
+        """Raise BadInput if the edit does not fit a filter and an episode of that many steps."""
+        if self.first >= steps:
+            raise BadInput(f"step {self.first} is not in this episode: it has steps 0 to {steps - 1}")
+        if self.to > steps:
+            raise BadInput(f"step {self.to} is after the last step of this episode, {steps - 1}")
+        self.timed_faults.check(checkpoint.task)
+        self.check_weights(checkpoint)
+
+    def check_weights(self, checkpoint: Checkpoint) -> None:
+        """Raise BadInput for weights that the filter does not have."""
+        if not self.weights:
+            return
+        if isinstance(checkpoint, ExternalFilter):
+            raise BadInput(f"{checkpoint.name} is an external filter: its fusion weights cannot be set; edit a sensor")
+        names = checkpoint.filter.names
+        for name in self.weights:
+            check_name(f"modality of filter {checkpoint.name!r}", name, names)
+        if checkpoint.filter.architecture.fusion not in WEIGHTED:
+            raise BadInput(f"filter {checkpoint.name!r} has no fusion weights beta; only crossmodal filters have")
+        total = sum(self.weights.values())
+        if len(self.weights) == len(names) and total < 1.0 - 1e-6:
+            raise BadInput(f"weights of all modalities sum to {total:g}; they must sum to 1")
 
     def mask(self, steps: int) -> NDArray[np.bool_]:
         """(T,) mask of the edited steps."""
@@ -196,9 +222,7 @@ class Replay:
         Raises BadInput for an unknown sensor or modality, weights for a filter without a weight model, and steps
         outside the trace.
         """
-        self.check_step(edit.first)
-        if edit.to > len(self.beliefs):
-            raise BadInput(f"step {edit.to} is after the last step of this trace, {len(self.beliefs) - 1}")
+        edit.check(self.checkpoint, len(self.beliefs))
         filter_, original = self.checkpoint.filter, self.original
         episode = edit.timed_faults.apply(original.episode, original.seed)
         evidence = self.evidence
@@ -231,21 +255,17 @@ class Replay:
         """Replace beta in the evidence by the weights of an edit."""
         if not edit.weights:
             return evidence
-        names = self.checkpoint.filter.names
-        for name in edit.weights:
-            check_name(f"modality of filter {self.checkpoint.name!r}", name, names)
+        edit.check_weights(self.checkpoint)
         if self._standalone:
             raise BadInput(f"{self._standalone} standalone has no fusion weights: it uses one modality")
-        if evidence.log_weights is None:
-            raise BadInput(f"filter {self.checkpoint.name!r} has no fusion weights beta; only crossmodal filters have")
+        assert evidence.log_weights is not None
+        names = self.checkpoint.filter.names
         span = slice(edit.first, edit.to)
         beta = evidence.log_weights[span].exp()
         manual = torch.tensor([edit.weights.get(name, torch.nan) for name in names]).unsqueeze(-1)
         automatic = manual.isnan()
         remainder = max(0.0, 1.0 - sum(edit.weights.values()))
         others = (beta * automatic).sum(-2, keepdim=True).clamp_min(torch.finfo(beta.dtype).tiny)  # 0 if absent
-        if not automatic.any() and remainder > 1e-6:
-            raise BadInput(f"weights of all modalities sum to {1.0 - remainder:g}; they must sum to 1")
         log_weights = evidence.log_weights.clone()
         log_weights[span] = torch.where(automatic, remainder * beta / others, manual).log()
         return evidence.with_log_weights(log_weights)

@@ -25,6 +25,7 @@ import torch
 from matplotlib.figure import Figure
 
 from beliefscope import __version__
+from beliefscope.datasets.episode import step_text
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
@@ -220,7 +221,7 @@ class Writer:
             items.append(self.figure("estimates", caption, paper.weights_figure(worst)))
         if self.no_maps is None and worst.modalities_with_posterior and worst.episode.contact.any():
             assert self.report.checkpoint is not None
-            steps = paper.steps_by_contact(worst)
+            steps = paper.steps_by_contact(worst.episode, worst.episode_index)
             figure = paper.maps_figure(self.report.checkpoint, worst, steps, quantity=self.report.quantity)
             caption = (
                 "Likelihood or posterior (see the titles) of each modality around the true position, episode "
@@ -247,7 +248,7 @@ class Writer:
         data = self.write(f"data/{name}.json", _json(result.to_dict()))
         items = []
         if result.curves() or result.plots() or result.images():
-            figure = result.plot()
+            figure = result.plot(self.report.traces[0].episode.time)
             figure.suptitle("")  # the verdict is on the page as text
             names = [*(chart for chart, _ in charts_of(result)), *(plot.title for plot in result.plots())]
             names += [image.title for image in result.images()]
@@ -281,7 +282,7 @@ class Writer:
             self.figure(name, caption, event_figure(trace, step, zoomed, zoom), *data),
             self.table(name, event_table(trace, step, map_)),
         )
-        title = f"{index + 1}. Episode {trace.episode_index}, step {step}"
+        title = f"{index + 1}. Episode {trace.episode_index}, {step_text(step, trace.episode.time_of(step))}"
         return Section(name, title, "", event_summary(trace, step), items, event.link)
 
     def _engine(self, trace: int) -> MapEngine:

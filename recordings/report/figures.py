@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import with_unit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
@@ -22,6 +22,9 @@ from beliefscope.inspect.trace import Trace
 
 COLUMNS = 4
 """Maximum number of panels per row."""
+
+LEGEND = 1.5
+"""Inches of the legend beside estimates without a map."""
 
 ZOOMS = (6, 4, 2)
 MIN_SHARE = 0.98
@@ -42,34 +45,37 @@ def zoom_of(map_: LikelihoodMap) -> int:
 
 
 def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int, str]]]) -> Figure:
-    """Position error of each layer over time, one chart per trace.
+    """Position error of each layer over the steps, or over their times if the data have them, one chart per trace.
 
     Args:
         marks: index in ``traces`` -> (step, name) of marked events.
     """
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.55 * len(traces) + 0.3), layout="constrained")
+        labels = [*map(measures.layer_label, measures.layers(traces[0])), "contact", "blackout"]
+        height = 1.55 + legend_height(labels, "episode 0")
+        figure = Figure(figsize=(WIDTH, height * len(traces) + 0.3), layout="constrained")
         FigureCanvasAgg(figure)
         charts = figure.subplots(len(traces), 1, squeeze=False)[:, 0]
         for index, (axes, trace) in enumerate(zip(charts, traces, strict=True)):
-            main = trace.task.main_error
+            main, axis = trace.task.main_error, StepAxis.of(len(trace), trace.episode.time)
             error = main.factor * measures.main_error(trace)
             for layer, values in zip(measures.layers(trace), error.T, strict=True):
                 if layer == "fused" or layer in trace.modalities_with_posterior:
                     style = {"lw": 1.5, "zorder": 2.5} if layer == "fused" else {"lw": 0.9}
-                    axes.plot(values, label=measures.layer_label(layer), color=colour(layer, trace.modalities), **style)
+                    shade = colour(layer, trace.modalities)
+                    axes.plot(axis.positions, values, label=measures.layer_label(layer), color=shade, **style)
             bands = {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}
-            draw_bands(axes, bands, labelled=True)
+            draw_bands(axes, bands, axis, labelled=True)
             for step, name in marks.get(index, ()):
-                axes.axvline(step, color="black", lw=0.6, ls=":")
+                axes.axvline(axis.positions[step], color="black", lw=0.6, ls=":")
                 place = {"xytext": (2, -1), "textcoords": "offset points", "va": "top", "fontsize": 7}
-                axes.annotate(name, (step, 1.0), xycoords=axes.get_xaxis_transform(), **place)
-            axes.set_title(f"episode {trace.episode_index}", loc="left")
+                axes.annotate(name, (axis.positions[step], 1.0), xycoords=axes.get_xaxis_transform(), **place)
             axes.set_ylabel(with_unit(f"{main.name} error", main.unit))
-            axes.set_xlim(-0.5, len(trace) - 0.5)
+            axes.set_xlim(axis.edges[0], axis.edges[-1])
+            if trace is traces[-1] or any(other.episode.time is None for other in traces) == (axis.label != "step"):
+                axes.set_xlabel(axis.label)
             axes.set_ylim(0.0, 1.15 * float(np.nanmax(error)) or 1.0)
-            axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
-        charts[-1].set_xlabel("step")
+            draw_legend(axes, f"episode {trace.episode_index}")
     return figure
 
 
@@ -86,7 +92,8 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH * columns / COLUMNS, 2.05 * rows), layout="constrained")
+        beside = LEGEND if map_ is None and len(trace.task.map_indices) == 2 else 0.0
+        figure = Figure(figsize=(WIDTH * columns / COLUMNS + beside, 2.05 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, (key, image) in zip(grid, images.items(), strict=False):
@@ -118,7 +125,7 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
         axes.axvline(0.0, color=COLOURS["truth"], lw=0.6)
         for name in (*trace.modalities_with_posterior, "fused"):
             _draw_estimate(axes, positions[name], colour(name, trace.modalities), name)
-        axes.legend(frameon=False, fontsize=6)
+        axes.legend(frameon=False, fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     else:
         log = map_.log_likelihood[map_.layers.index(layer)]
         style: dict[str, Any] = {

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from beliefscope.datasets.episode import step_text
 from beliefscope.datasets.task import with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import metrics
@@ -188,7 +189,8 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
             row += [factor * float(statistics.area95[0, i])]
             row += [SHAPES[statistics.shape[0, i]]] if same_unit and len(where) == 2 else []
         rows.append(tuple(row))
-    title = f"Step {step} of episode {trace.episode_index}" + ("" if map_ is None else f". Maps: {map_.title}")
+    title = f"{step_text(step, trace.episode.time_of(step)).capitalize()} of episode {trace.episode_index}"
+    title += "" if map_ is None else f". Maps: {map_.title}"
     return Table(title, tuple(columns), tuple(rows))
 
 

@@ -22,12 +22,15 @@ from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
+from beliefscope.inspect.compare.counterfactual import compare
+from beliefscope.inspect.compare.two_runs import compare_runs
 from beliefscope.inspect.failures.events import find_failures
 from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of, scores_of
 from beliefscope.inspect.figures.paper import maps_figure, steps_by_contact
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
+from beliefscope.inspect.traces.replay import Edit
 from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.report.compose import compose, write_report
@@ -126,7 +129,9 @@ def test_a_single_model_has_no_weights(runs: list[Trace]) -> None:
 
 
 def test_the_figure_of_maps_has_curves(runs: list[Trace]) -> None:
-    figure = maps_figure(checkpoint(task()), runs[0], steps_by_contact(runs[0], [50]), size=101, quantity="posterior")
+    figure = maps_figure(
+        checkpoint(task()), runs[0], steps_by_contact(runs[0].episode, 0, [50]), size=101, quantity="posterior"
+    )
     (axes,) = figure.axes
     curve = axes.lines[0].get_xydata()
     expected = runs[0].estimate_mean[50, 0] - runs[0].episode.states[50, 0]
@@ -186,6 +191,24 @@ def test_every_diagnostic_is_computed_or_refused_with_a_reason(runs: list[Trace]
     text += str([table for result in results.values() for table in result.tables()])
     assert " cm" not in text
     assert "osition" not in text
+    (table,) = results["maps"].tables()
+    assert not [name for name in table.columns if any(word in name for word in ("ridge", "ring", "area", "elong"))]
+    assert {"50 % region (K)", "95 % region (K)"} <= set(table.columns)
+    size = table.rows[0][table.columns.index("95 % region (K)")]
+    assert size == pytest.approx(2.0 * 1.96 * NOISE, abs=2.0 * task().map_half_width / 41)  # of the Gaussian; a cell
+    assert results["maps"].verdict == f"The median 95 % region of the fused likelihood is {size:.3g} K."
+
+
+def test_columns_of_a_component_without_a_unit_name_none() -> None:
+    plain = task(unit="")
+    filter_ = ExternalFilter(Adapter(Kalman(), modalities=("thermometer",), initial_std=(0.3,)), plain, "kalman")
+    run = trace(filter_, episode(plain, 0))
+    results, _ = run_diagnostics([run], filter_, {name: {} for name in DIAGNOSTICS}, True)
+    edited = replace(run, estimate_mean=run.estimate_mean + 0.1)
+    compared = [compare_runs(run, edited), compare(run, edited, Edit(5, 9))]
+    for table in (table for result in (*results.values(), *compared) for table in result.tables()):
+        cells = [*table.columns, *(cell for row in table.rows for cell in row if isinstance(cell, str))]
+        assert not [text for text in cells if "()" in text or text != text.strip(", ")], table.title
 
 
 def test_start_offsets_have_the_unit_of_the_component() -> None:

@@ -23,6 +23,7 @@ const run = (last, contact = 5) =>
     modalities: ['image', 'haptics'],
     components: [{ name: 'x' }],
     header: {},
+    stepLabel: (/** @type {number} */ step) => `step ${step}`,
     weightWidth: 1,
     fuses: true,
     has: () => false,

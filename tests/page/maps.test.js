@@ -14,6 +14,7 @@ import {
   valuesAt,
 } from '../../app/page/maps/map_summary.js';
 import { moved, offsetAt } from '../../app/page/maps/crosshair.js';
+import { csv } from '../../app/page/maps/export_map.js';
 import { fitsCloseUp, mapLayout } from '../../app/page/maps/map_layout.js';
 import { comparable } from '../../app/page/maps/reference.js';
 import {
@@ -29,6 +30,7 @@ import {
   valueAt,
 } from '../../app/page/maps/map_values.js';
 import { SvgContext } from '../../app/page/maps/svg_context.js';
+import { FUSION, makeTrace } from './fixtures.js';
 
 const HEADER = {
   type: 'maps',
@@ -331,4 +333,27 @@ test('SVG drawing', () => {
   assert.match(svg, /d="M0 0L1\.23 5" fill="none" stroke="rgb\(0,0,0\)" stroke-opacity="0\.3"/);
   assert.match(svg, />a &#60; b</);
   assert.equal(svg.split('<g').length, svg.split('</g').length);
+});
+
+test('a table of several steps names their times where the data have timestamps', () => {
+  const later = readMaps(encodedMaps({ step: 3 }));
+  /** @param {import('../../app/page/data/trace.js').Trace} trace */
+  const lines = (trace) =>
+    csv(
+      [maps, later].map((sheet) => ({
+        ...{ trace, title: '', options: /** @type {any} */ ({}) },
+        maps: sheet,
+        layers: [/** @type {any} */ ({ name: 'fused', index: 2 })],
+      })),
+    ).split('\n');
+  const time = { shape: [4], values: [0, 0.25, 0.5, 1.5] };
+  const timed = lines(makeTrace({ ...FUSION, time }, { steps: 4 }));
+  assert.match(timed[0], /steps 2 \(0\.50 s\), 3 \(1\.50 s\)/);
+  assert.match(timed[2], /^step,time_s,hinge_x_offset_cm,/);
+  assert.match(timed[3], /^2,0\.5000,-/);
+  assert.match(timed[12], /^3,1\.5000,-/);
+  const plain = lines(makeTrace(FUSION));
+  assert.match(plain[0], /steps 2, 3/);
+  assert.match(plain[2], /^step,hinge_x_offset_cm,/);
+  assert.match(plain[3], /^2,-/);
 });

@@ -60,6 +60,10 @@ test('times of irregular steps', () => {
   const irregular = makeTrace({ ...FUSION, time: times });
   assert.equal(irregular.seconds(3), 1.5);
   assert.equal(irregular.stepText, '0.25 to 1.00 s');
+  assert.equal(irregular.timestamp(3), 1.5);
+  assert.equal(irregular.stepLabel(3), 'step 3 (1.50 s)');
+  assert.equal(trace.timestamp(3), null);
+  assert.equal(trace.stepLabel(3), 'step 3');
 });
 
 test('the axis in seconds is the inverse of its steps and keeps gaps', () => {

@@ -21,14 +21,20 @@ from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
+from beliefscope.inspect.catalog import run_diagnostics
+from beliefscope.inspect.compare.counterfactual import compare
+from beliefscope.inspect.compare.two_runs import compare_runs
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.slices.covariates import _step_columns
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader
+from beliefscope.inspect.traces.replay import Edit
 from beliefscope.recordings.export import as_parquet
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.live_episode import record_steps
 from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.report.figures import error_figure
+from beliefscope.recordings.report.sections import event_table
 from beliefscope.recordings.write import write_recording
 
 TASK = Task(
@@ -164,3 +170,35 @@ def test_a_slow_sensor_is_not_frozen(episode: Episode) -> None:
 def test_covariates_are_in_seconds(run: Trace, episode: Episode) -> None:
     values = {name: v for name, _, v in _step_columns(run, TASK)}
     np.testing.assert_array_equal(values["time since start"], episode.times)
+
+
+def test_figures_are_drawn_over_the_times(run: Trace, episode: Episode) -> None:
+    errors = run_diagnostics([run], None)[0]["errors"]
+    for figure in (errors.plot(episode.time), error_figure([run], {0: [(7, "1")]})):
+        chart = figure.axes[0]
+        assert chart.get_xlabel() == "time (s)"
+        np.testing.assert_array_equal(chart.lines[0].get_xdata(), episode.time)
+        assert chart.get_xlim()[0] < 0.0 < episode.times[-1] < chart.get_xlim()[1] < episode.times[-1] + 0.1
+    assert chart.lines[-1].get_xdata()[0] == episode.times[7]
+    (text,) = chart.texts
+    assert text.xy[0] == episode.times[7]
+    regular = replace(run, episode=replace(episode, time=None))
+    mixed = error_figure([run, regular], {})
+    assert [axes.get_xlabel() for axes in mixed.axes] == ["time (s)", "step"]
+    plain = error_figure([regular], {})
+    assert plain.axes[0].get_xlabel() == "step"
+    np.testing.assert_array_equal(plain.axes[0].lines[0].get_xdata(), np.arange(60))
+    assert errors.plot().axes[0].get_xlabel() == "step"
+
+
+def test_tables_name_the_times(run: Trace, episode: Episode) -> None:
+    edited = replace(run, estimate_mean=run.estimate_mean + np.where(np.arange(60) == 9, 0.5, 0.0)[:, None])
+    edited = replace(edited, estimate_mean=edited.estimate_mean.astype(np.float32))
+    result = compare(run, edited, Edit(5, 9, Faults.parse("sensor_bias=range:offset=1")))
+    assert f"(step 9, {episode.times[9]:.2f} s)" in result.verdict
+    table = next(table for table in result.tables() if table.title == "Largest difference of the estimates")
+    assert (table.columns[-1], table.rows[0][-2:]) == ("time s", (9, episode.times[9]))
+    assert f"(step 9, {episode.times[9]:.2f} s)" in compare_runs(run, edited).verdict
+    assert event_table(run, 9, None).title == f"Step 9 ({episode.times[9]:.2f} s) of episode 0"
+    plain = replace(run, episode=replace(episode, time=None))
+    assert event_table(plain, 9, None).title == "Step 9 of episode 0"

@@ -85,9 +85,11 @@ class PhaseInfo(Reply):
     over_represented: bool
 
 
-@fields_of(Event, "episode", "step", "first", "last", "phase", "other_phases", "error")
+@fields_of(
+    Event, "episode", "step", "first", "last", "time", "first_time", "last_time", "phase", "other_phases", "error"
+)
 class FailureEvent(Reply):
-    """A failure event. error: per layer, m. link: the page's address that opens it."""
+    """A failure event. error: per layer, m. link: the page's address that opens it. Times: s, or None."""
 
     value: Number
     nees: Number

@@ -54,7 +54,7 @@ def change(
 
     if output is not None and (output.exists() or not output.parent.is_dir()):
         raise BadInput(f"output {str(output)!r} exists, or its parent folder does not; give the name of a new folder")
-    checkpoints = open_filters(task, before, after)
+    checkpoints = open_filters(None if task is None else opt.definition_of(task, data), before, after)
     target = checkpoints[0].task
     selection = parse_slices(slices or (), (), target)
     with opt.open_episodes(target, data, skip_bad) as episodes, console.progress("Comparing") as advance:

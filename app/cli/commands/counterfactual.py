@@ -48,13 +48,14 @@ def counterfactual(
     if not edit.faults and not edit.weights:
         raise BadInput("no intervention: give --faults, --weights or both")
     recorded, index = run.read_episode(checkpoint.task)
+    edit.check(checkpoint, len(recorded))
     with console.progress("Filtering") as advance:
         original = trace(checkpoint, recorded, index, run.seed, run.particles)
         replay = open_replay(checkpoint, original, progress=advance)
         edited = replay.edited(edit)
     result = compare(replay.original, edited, edit)
     if output is not None:
-        write_figure(result.plot(), output)
+        write_figure(result.plot(result.time), output)
     if trace_path is not None:
         save_trace(edited, trace_path)
     document = {

@@ -45,12 +45,14 @@ def figure(
         raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")
     if kind == "weights" and quantity:
         raise BadInput(f"--map {quantity}: only the figure maps has a quantity")
-    checkpoint, trace = run.trace()
+    checkpoint, faults = run.open()
+    episode, index = run.read_episode(checkpoint.task)
+    selection = paper.steps_by_contact(episode, index, steps or ()) if kind == "maps" else {}
+    trace = run.over(checkpoint, episode, index, faults)
     extra: dict[str, Any] = {}
     if kind == "maps":
         if reason := no_maps(checkpoint, trace, quantity):
             raise BadInput(reason)
-        selection = paper.steps_by_contact(trace, steps or ())
         with_contact = "contact" in trace.task.covariates
         if with_contact and False not in selection:
             console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")

@@ -63,7 +63,7 @@ def inspect(
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         for name, result in results.items():
-            write_figure(result.plot(), figures / f"{name}.{format}")
+            write_figure(result.plot(traces[0].episode.time), figures / f"{name}.{format}")
     text = [
         "\n\n".join([f"{DIAGNOSTICS[name].title}: {result.verdict}", *console.grids(result.tables())])
         for name, result in results.items()

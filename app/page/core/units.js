@@ -94,6 +94,14 @@ export function significant(value) {
 }
 
 /**
+ * Names a step, with its time where the data have timestamps: step 12, or step 12 (3.40 s).
+ * @param {number} step
+ * @param {number | null | undefined} time s
+ */
+export const stepLabel = (step, time) =>
+  `step ${step}${Number.isFinite(time) ? ` (${fixed(time, 2)} s)` : ''}`;
+
+/**
  * Formats a share from 0 to 1 in percent.
  * @param {number | null | undefined} share
  */

@@ -4,7 +4,7 @@
 /** @import { Column, Series } from './arrays.js' */
 /** @import { Block, LiveStream } from './live_stream.js' */
 
-import { displayUnit, fixed, mainUnit, wrapDegrees } from '../core/units.js';
+import { displayUnit, fixed, mainUnit, stepLabel, wrapDegrees } from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
@@ -97,7 +97,7 @@ export class Trace {
    * @param {number} step
    */
   seconds(step) {
-    return this.#slice('time')?.[step] ?? step * this.dt;
+    return this.timestamp(step) ?? step * this.dt;
   }
 
   /**
@@ -107,6 +107,22 @@ export class Trace {
   timeText(step) {
     const digits = Math.max(1, Math.ceil(-Math.log10(this.dt) - 1e-9));
     return `${fixed(this.seconds(step), Math.min(digits, MAX_TIME_DIGITS))} s`;
+  }
+
+  /**
+   * Returns the time of a step in s since step 0; null if the data have no timestamps.
+   * @param {number} step
+   */
+  timestamp(step) {
+    return this.#slice('time')?.[step] ?? null;
+  }
+
+  /**
+   * Names a step, with its time where the data have timestamps.
+   * @param {number} step
+   */
+  stepLabel(step) {
+    return stepLabel(step, this.timestamp(step));
   }
 
   /** Duration of the steps: `0.10 s`, or the shortest and the longest. */

@@ -84,17 +84,17 @@ function caption(sheets) {
   const { unit, scale } = off < 0 ? { unit: '', scale: 1 } : trace.unitOf(off);
   const angle =
     maps.angle === null ? '' : `, cross-section at ${fixed(maps.angle * scale, 1)}${unit}`;
-  const steps = sheets.map((sheet) => sheet.maps.step).join(', ');
+  const steps = sheets.map(({ maps: { step } }) => trace.stepLabel(step).slice(5)).join(', ');
   const named = `${sheets.length > 1 ? 'steps' : 'step'} ${steps}`;
   return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `faults ${faults}, ` : ''}${named}${angle}`;
 }
 
 /**
- * Writes a table with one row per cell. With several steps, the first column is the step.
+ * Writes a table with one row per cell. With several steps, the first columns are the step and its timestamp, if any.
  * @param {DisplayedMaps[]} sheets
  */
 export function csv(sheets) {
-  const [{ maps, layers }] = sheets;
+  const [{ trace, maps, layers }] = sheets;
   const several = sheets.length > 1;
   const lowest = sheets.map(({ maps: { step, log_max: max, log_range: range }, layers: drawn }) => {
     const values = drawn.map(({ name, index }) => `${name} ${fixed(max[index] - range[index], 3)}`);
@@ -105,14 +105,17 @@ export function csv(sheets) {
     `# offset: from the true value. Values are clipped at: ${lowest.join('; ')}`,
   ];
   const columns = [
-    ...(several ? ['step'] : []),
+    ...(several ? ['step', ...(trace.timestamp(maps.step) === null ? [] : ['time_s'])] : []),
     ...maps.axes.map(({ name, shown }) => columnName(`${name}_offset`, shown)),
     ...maps.axes.map(({ name, shown }) => columnName(name, shown)),
     ...layers.map(({ name }) => `${name}_ln_${maps.quantity}_nats`),
   ];
-  const rows = sheets.flatMap((sheet) =>
-    several ? csvRows(sheet).map((row) => `${sheet.maps.step},${row}`) : csvRows(sheet),
-  );
+  const rows = sheets.flatMap((sheet) => {
+    const { step } = sheet.maps;
+    const time = trace.timestamp(step);
+    const start = `${step},${time === null ? '' : `${time.toFixed(4)},`}`;
+    return csvRows(sheet).map((row) => (several ? start : '') + row);
+  });
   const head = [...comments.map((line) => line.replaceAll('−', '-')), columns.join(',')];
   return `${[...head, ...rows].join('\n')}\n`;
 }

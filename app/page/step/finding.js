@@ -67,7 +67,7 @@ function worstFinding(trace, component) {
     return { tone: 'none', headline, evidence: '', step };
   }
   const { tone, text } = stepSummary(trace, step, component);
-  return { tone, headline: `Largest error at step ${step}.`, evidence: text, step };
+  return { tone, headline: `Largest error at ${trace.stepLabel(step)}.`, evidence: text, step };
 }
 
 /**
@@ -91,7 +91,10 @@ export function outageFinding(trace, component) {
       return [{ name, before, during: mean(values.subarray(first, last + 1)) }];
     });
   const successor = weights.find(({ before, during }) => during > before && during > 0.5);
-  const end = last + 1 < trace.steps ? `until the image returns at step ${last + 1}` : 'to the end';
+  const end =
+    last + 1 < trace.steps
+      ? `until the image returns at ${trace.stepLabel(last + 1)}`
+      : 'to the end';
   const action = successor ? `; ${successor.name} takes over ${end}` : `, ${end}`;
   const evidence = weights.map(
     ({ name, before, during }) => `the effective weight of ${name} ${change(before, during)}`,
@@ -102,7 +105,7 @@ export function outageFinding(trace, component) {
       `the ${trace.task.main.name} error stays below ${withUnit(fixed(Math.ceil(10 * worst) / 10), trace.mainUnit)}`,
     );
   return {
-    headline: `The camera goes dark at step ${first}, in contact${action}.`,
+    headline: `The camera goes dark at ${trace.stepLabel(first)}, in contact${action}.`,
     evidence: sentence(evidence.join('; ')),
     step: first,
   };

@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, html } from '../core/dom.js';
-import { fixed, percent, sentence } from '../core/units.js';
+import { fixed, percent, sentence, stepLabel } from '../core/units.js';
 import * as api from '../data/api.js';
 import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
@@ -184,10 +184,11 @@ export class Diagnosis {
   }
 
   /** @param {DiagnosisEvidence} evidence */
-  #evidence({ text, episode, step }) {
+  #evidence({ text, episode, step, time }) {
     const item = create('li', { textContent: sentence(text) });
     if (episode === null) return item;
-    const label = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;
+    const label =
+      step === null ? `episode ${episode}` : `episode ${episode}, ${stepLabel(step, time)}`;
     const link = create('button', { type: 'button', className: 'text quiet', textContent: label });
     link.addEventListener('click', () =>
       this.#store.set({ episode, step: step ?? 0, playing: false }),

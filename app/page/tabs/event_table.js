@@ -4,7 +4,7 @@
 
 import { copyText } from '../core/clipboard.js';
 import { create, element } from '../core/dom.js';
-import { fixed, percent, significant, withUnit } from '../core/units.js';
+import { fixed, percent, significant, stepLabel, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { formatScore, scoreUnit } from './failure_scores.js';
@@ -90,13 +90,13 @@ export class EventTable {
    * @returns {EventRow}
    */
   #row(columns, event, score, i) {
-    const { episode, step, phase } = event;
+    const { episode, step, time, phase } = event;
     const row = document.createElement('tr');
     const button = create('button', {
       type: 'button',
       className: 'title',
       textContent: columns[0].content(event),
-      ariaLabel: `Episode ${episode}, step ${step}: ${score.title} ${formatScore(score, event.value)}, ${phase}`,
+      ariaLabel: `Episode ${episode}, ${stepLabel(step, time)}: ${score.title} ${formatScore(score, event.value)}, ${phase}`,
     });
     button.addEventListener('click', ({ timeStamp }) => this.#open(event, timeStamp));
     columns.forEach(({ content, hint, number }, c) => {
@@ -128,8 +128,8 @@ export function markRow(row, button, current) {
  * Creates the button that copies the permalink of an event.
  * @param {FailureEvent} event
  */
-function linkButton({ episode, step, link }) {
-  const title = `Copy link to episode ${episode}, step ${step}`;
+function linkButton({ episode, step, time, link }) {
+  const title = `Copy link to episode ${episode}, ${stepLabel(step, time)}`;
   const button = create('button', {
     type: 'button',
     className: 'quiet link',
@@ -175,6 +175,13 @@ function eventColumns({ layers, scores }, score, events) {
       hint: ({ phase, other_phases: others }) => [phase, ...others].join(', '),
     },
   ];
+  if (events.some(({ time }) => Number.isFinite(time)))
+    columns.splice(2, 0, {
+      title: 'time s',
+      content: ({ time }) => fixed(time, 2),
+      number,
+      hint: ({ first_time: first, last_time: last }) => `${fixed(first, 2)} to ${fixed(last, 2)} s`,
+    });
   const modalities = layers.slice(0, -1); // the last layer is the fused estimate
   const fuses = modalities.length > 1;
   const label = (/** @type {string} */ layer) => (layer === 'fused' ? layer : updateLabel(layer));

@@ -291,8 +291,9 @@ export class Failures {
     const { episode } = this.#trace.selection;
     const events = score ? this.#events.filter((event) => event.episode === episode) : [];
     this.#timeline.mark(
-      events.map(({ step, value, phase }) => ({
+      events.map(({ step, value, phase, time }) => ({
         step,
+        time,
         label: score ? `${score.title} ${formatScore(score, value)}, ${phase}` : '',
         measure: score?.title,
       })),

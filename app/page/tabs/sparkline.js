@@ -2,7 +2,7 @@
 
 /** @import { EpisodeErrors, Task } from '../types/server.js' */
 
-import { mainText } from '../core/units.js';
+import { mainText, stepLabel } from '../core/units.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
 const HEIGHT = 20; // in units of the view box
@@ -24,9 +24,9 @@ export function sparklineScale(errors) {
  * @param {(step: number, inputTime: number) => void} open called with the step that was clicked
  */
 export function sparkline(task, errors, scale, open) {
-  const { steps, error, contact, worst, worst_step: worstStep } = errors;
+  const { steps, error, contact, worst, worst_step: worstStep, worst_time: time } = errors;
   const svg = document.createElementNS(SVG, 'svg');
-  const description = `Largest error ${mainText(task, worst)}, at step ${worstStep}`;
+  const description = `Largest error ${mainText(task, worst)}, at ${stepLabel(Number(worstStep), time)}`;
   svg.setAttribute('viewBox', `0 0 ${error.length} ${HEIGHT}`);
   svg.setAttribute('preserveAspectRatio', 'none');
   svg.setAttribute('role', 'img');

@@ -3,10 +3,12 @@
 /** @import { Store } from '../core/state.js' */
 
 import { create } from '../core/dom.js';
+import { stepLabel } from '../core/units.js';
 
 /**
  * @typedef {object} EventMark
  * @property {number} step
+ * @property {number | null} time s; null without timestamps
  * @property {string} label description with a value and its unit
  * @property {string} [measure] that selected the event: error, NEES …
  *
@@ -72,12 +74,13 @@ export class EventMarks {
    * @param {EventMark} event
    * @returns {Mark}
    */
-  #mark({ step, label, measure }) {
+  #mark({ step, time, label, measure }) {
+    const name = stepLabel(step, time);
     const prefix = measure && !label.startsWith(measure) ? `${measure}, ` : '';
     const button = create('button', {
       type: 'button',
       tabIndex: -1,
-      ariaLabel: `Step ${step}: ${prefix}${label}`,
+      ariaLabel: `${name[0].toUpperCase()}${name.slice(1)}: ${prefix}${label}`,
     });
     button.addEventListener('pointerdown', (event) => event.stopPropagation()); // no scrubbing
     button.addEventListener('click', (event) => {

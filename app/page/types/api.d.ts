@@ -208,6 +208,8 @@ export interface components {
             episode: number | null;
             /** Step */
             step: number | null;
+            /** Time */
+            time: number | null;
         };
         /**
          * DiagnosisJob
@@ -320,6 +322,8 @@ export interface components {
             worst: number | null;
             /** Worst Step */
             worst_step: number | null;
+            /** Worst Time */
+            worst_time: number | null;
             /** Error */
             error: (number | null)[];
             /** Contact */
@@ -462,7 +466,7 @@ export interface components {
         };
         /**
          * FailureEvent
-         * @description A failure event. error: per layer, m. link: the page's address that opens it.
+         * @description A failure event. error: per layer, m. link: the page's address that opens it. Times: s, or None.
          */
         FailureEvent: {
             /** Value */
@@ -483,6 +487,12 @@ export interface components {
             first: number;
             /** Last */
             last: number;
+            /** Time */
+            time: number | null;
+            /** First Time */
+            first_time: number | null;
+            /** Last Time */
+            last_time: number | null;
             /** Phase */
             phase: string;
             /** Other Phases */
@@ -1374,6 +1384,8 @@ export interface components {
             last: number;
             /** Step */
             step: number;
+            /** Time */
+            time: number | null;
             /** Contact */
             contact: boolean;
             /** Before */

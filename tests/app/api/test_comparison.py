@@ -127,7 +127,7 @@ def test_compare_with_another_filter_or_other_faults(
         ("from=40&to=60", "is empty: give faults"),
         ("from=40&faults=blackout", "'to' of edit"),
         ("from=60&to=40&faults=blackout", "has no steps"),
-        ("from=40&to=5000&faults=blackout", "after the last step of this trace"),
+        ("from=40&to=5000&faults=blackout", "after the last step of this episode"),
         ("from=40&to=60&weights=touch=1", "touch"),
         ("from=40&to=60&weights=image=2", "must be between 0 and 1"),
         ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part of an edit"),

@@ -335,7 +335,7 @@ def test_every_fault_is_documented() -> None:
 BAD = {
     "blakout": r"fault 'blakout' does not exist\. Did you mean blackout\? Available: blackout, .*control_scale\.",
     "blackout,,": r"fault '' does not exist\. Available",
-    "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, gray, from, to\.",
+    "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, gray, key, from, ",
     "blackout=1.5": r"blackout's 'probability' is 1\.5, not a number from 0 to 1",
     "blackout=nan": r"blackout's 'probability' is nan, not a number from 0 to 1",
     "blackout=much": r"blackout's 'probability' is 'much', not a number from 0 to 1",
@@ -376,7 +376,7 @@ def test_faults_of_missing_sensors_are_rejected(episode: Episode) -> None:
     with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist\. Available: image, haptics\."):
         Faults.parse("delay=touch").check(DOOR)
     no_image = replace(DOOR, observations={"force": (3,)})
-    with pytest.raises(BadInput, match=r"sensor of task 'door' 'image' does not exist\. Available: force\."):
+    with pytest.raises(BadInput, match=r"blackout needs an image sensor; task 'door' has none\. Its sensors: force\."):
         Faults.parse("force_bias,blackout").check(no_image)
     flat = replace(episode, observations=dict(episode.observations) | {"force": np.zeros((100, 2), np.float32)})
     with pytest.raises(BadInput, match=r"z=1 uses an axis that the sensor does not have\. Available: x, y\."):

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.external import adapter
-from beliefscope.filters.external.ancestors import ancestors
+from beliefscope.filters.external.ancestors import ancestors as search, new_table, words_of
 from beliefscope.filters.external.hooks import RESAMPLED
 from beliefscope.filters.external.step_values import BLOCK, StepValues, with_ancestors
+
+
+def ancestors(after: Tensor, before: Tensor) -> Tensor:
+    return search(words_of(after), words_of(before))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
@@ -38,6 +43,30 @@ def test_ancestors_of_many_particles_with_equal_rows(distinct: int) -> None:
     wanted = torch.randint(distinct, (20_000,), generator=generator)
     first = torch.full((distinct,), 20_000).scatter_reduce_(0, rows, torch.arange(20_000), "amin")
     assert torch.equal(ancestors(values[wanted][None], values[rows][None])[0], first[wanted].int())
+
+
+def test_rows_with_equal_hashes_are_compared() -> None:
+    """Words that are multiples of 2^30 have four hashes in all, so that rows are found by comparison."""
+    generator = torch.Generator().manual_seed(2)
+    values = torch.tensor([0.0, 2.0, -2.0])  # 2.0 is 2^30 as a word, and -2.0 is 3 x 2^30
+    before = values[torch.randint(3, (300, 6), generator=generator)]
+    wanted = torch.randint(300, (200,), generator=generator)
+    pairs = (before[wanted][:, None] == before[None]).all(-1)
+    assert torch.equal(ancestors(before[wanted][None], before[None])[0], pairs.int().argmax(-1).int())
+    assert (ancestors(torch.full((1, 4, 6), 7.0), before[None]) == 300).all()
+    before[:, 0] = 0.0
+    assert (ancestors(torch.full((1, 4, 6), 2.0), before[None]) == 300).all()
+
+
+def test_a_table_may_have_entries_of_an_earlier_search() -> None:
+    generator = torch.Generator().manual_seed(3)
+    table = new_table(500)
+    for _ in range(4):
+        before = words_of(torch.randn(1, 500, 3, generator=generator))
+        index = torch.randint(500, (500,), generator=generator)
+        after = np.ascontiguousarray(before[:, :, index.numpy()])
+        assert torch.equal(search(after, before, table)[0], index.int())
+        assert (search(after + np.uint32(1), before, table) == 500).all()
 
 
 def test_diverged_particles_have_ancestors() -> None:

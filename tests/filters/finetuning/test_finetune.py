@@ -316,6 +316,18 @@ def test_settings_survive_json_and_invalid_ones_are_rejected(episodes: list[Epis
         run(episodes, replace(SMALL, events=(StepRange(99),)))
     with pytest.raises(BadInput, match="begins after its episode's 60 steps"):
         run(episodes, replace(SMALL, events=(StepRange(9, 70),)))
+    with pytest.raises(BadInput, match="event 9:5-70 ends after its episode's 60 steps"):
+        run(episodes, replace(SMALL, events=(StepRange(9, 5, 70),)))
+
+
+def test_rates_and_windows_are_checked_before_any_evaluation(
+    episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("beliefscope.filters.finetuning.finetune.validate", lambda *_: pytest.fail("evaluated"))
+    with pytest.raises(BadInput, match=r"rate nope=0\.1 matches no trained parameter: "):
+        run(episodes, replace(SMALL, rates=(("nope", 0.1),)))
+    with pytest.raises(BadInput, match="windows of 9999 steps are longer than every training episode: 60 steps"):
+        run(episodes, replace(SMALL, length=9999))
 
 
 def test_a_run_that_ruins_the_weights_keeps_the_base_and_says_so(episodes: list[Episode]) -> None:

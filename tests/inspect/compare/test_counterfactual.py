@@ -65,7 +65,7 @@ def test_invalid_edits(replay: Replay) -> None:
         Edit(40, 60, Faults.parse("blackout:from=3"))
     with pytest.raises(BadInput, match="must be between 0 and 1"):
         Edit(40, 60, weights={"image": 1.5})
-    with pytest.raises(BadInput, match="after the last step of this trace"):
+    with pytest.raises(BadInput, match="after the last step of this episode"):
         replay.edited(Edit(40, 101))
     with pytest.raises(BadInput, match="'touch' does not exist"):
         replay.edited(Edit(40, 60, weights={"touch": 0.5}))

@@ -15,6 +15,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 from beliefscope.datasets.store import open_dataset
+from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.vector_checks import saturated
 from beliefscope.inspect.diagnosis.window_checks import LENGTH, STRIDE, deviating_windows
@@ -296,3 +297,20 @@ def test_empty_and_other_tasks() -> None:
     bare = replace(first, observations={"sound": np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)})
     values = sensor_statistics(bare, reference("push"))
     assert {name.split("/")[1] for name in values} == {"sound x", "sound y"}
+
+
+def test_axes_of_any_number_of_channels_are_named_and_localised() -> None:
+    rng = np.random.default_rng(0)
+    sizes = {"level": 1, "pair": 2, "joints": 5}
+    task = Task("tank", (Component("x", "m"),), {k: (d,) for k, d in sizes.items()}, {k: (k,) for k in sizes}, 0, 0.1)
+    readings = {key: rng.normal(size=(60, d)).astype(np.float32) for key, d in sizes.items()}
+    for key, d in sizes.items():
+        readings[key][20:40, d - 1] = readings[key][20, d - 1]
+    episode = Episode(task, np.zeros((60, 1)), observations=readings)
+    statistics = sensor_statistics(episode, None)
+    for axis in ("level", "pair y", "joints 4"):
+        assert statistics[f"stuck/{axis}/all"] > 0.2
+        first, last = localise(f"stuck/{axis}/all", episode, None) or (0, 0)
+        assert (abs(first - 20) <= 1, abs(last - 39) <= 1) == (True, True)
+        for kind in ("noise", "level", "saturation"):
+            localise(f"{kind}/{axis}/all", episode, None)

@@ -103,7 +103,7 @@ def test_events_are_disjoint_and_cover_high_steps(seed: int) -> None:
     rng = np.random.default_rng(seed)
     episode = np.repeat(np.arange(6), rng.integers(1, 60, 6))
     high, gap_limit = rng.random(len(episode)) < rng.choice([0.05, 0.3, 0.9]), int(rng.integers(0, 8))
-    spans = event_spans(high, episode, gap_limit)
+    spans = event_spans(high, episode, gap_limit, np.arange(len(episode), dtype=float))
     inside = np.zeros(len(high), dtype=int)
     for first, last in spans:
         inside[first : last + 1] += 1
@@ -181,6 +181,62 @@ def test_contact_changes_last_half_a_second(traces: list[Trace]) -> None:
     assert np.flatnonzero(phases["contact made"]).tolist() == [20, 21, 22, 23, 24]
     assert np.flatnonzero(phases["contact lost"]).tolist() == [30, 31, 32, 33, 34]
     assert np.flatnonzero(phases["start"]).tolist() == list(range(30))
+
+
+def timed(run: Trace, times: np.ndarray) -> Trace:
+    return replace(run, episode=replace(run.episode, time=times))
+
+
+def test_timestamps_give_events_and_phases_their_times(traces: list[Trace]) -> None:
+    """Steps of 0.1 s, then a gap of 3 s, then steps of 0.02 s."""
+    contact = np.zeros(CUT, dtype=bool)
+    contact[20:30] = True
+    duration = np.r_[np.full(40, 0.1), np.full(CUT - 40, 0.02)]
+    duration[26] = 3.0
+    times = np.cumsum(duration) - duration[0]
+    shifted_trace = shifted(with_contact(traces[0], contact), 37, 47, 1.0)
+    survey = Survey.from_traces([timed(shifted_trace, times)])
+    assert Survey.from_traces([shifted_trace]).time is None
+    assert np.flatnonzero(survey.phases["contact made"]).tolist() == [20, 21, 22, 23, 24]
+    contact[20:25], contact[25:45] = False, True
+    brief = timed(with_contact(traces[0], contact), times)
+    assert np.flatnonzero(Survey.from_traces([brief]).phases["contact made"]).tolist() == [25]  # then 3 s have passed
+    lost = Survey.from_traces([brief]).phases["contact lost"]
+    assert np.flatnonzero(lost).tolist() == list(range(45, CUT))  # 15 steps of 0.02 s
+    before = failures_of(Survey.from_traces([shifted_trace, *traces[1:]]))
+    after = failures_of(Survey.from_traces([timed(shifted_trace, times), *traces[1:]]))
+    worst = after.events[0]
+    assert (worst.first, worst.last, worst.step) == (37, 47, 42)
+    assert (before.events[0].time, before.events[0].first_time) == (None, None)
+    assert (worst.first_time, worst.last_time, worst.time) == (times[37], times[47], times[42])
+    assert f"at step 42 ({times[42]:.2f} s) of episode" in after.verdict
+    assert " s)" not in before.verdict
+    columns = after.tables()[1].columns
+    assert columns[:7] == ("episode", "step", "from", "to", "time s", "from s", "to s")
+    assert after.tables()[1].rows[0][4:7] == (times[42], times[37], times[47])
+    assert before.tables()[1].columns == tuple(name for name in columns if name not in {"time s", "from s", "to s"})
+    assert all(len(row) == len(columns) for row in after.tables()[1].rows)
+
+
+def test_regular_timestamps_change_no_event(traces: list[Trace]) -> None:
+    regular = [timed(run, run.episode.dt * np.arange(CUT)) for run in traces]
+    plain, with_times = (failures_of(Survey.from_traces(runs)) for runs in (traces, regular))
+    spans = [
+        [(event.episode, event.first, event.last, event.step, event.phase, event.score) for event in failures.events]
+        for failures in (plain, with_times)
+    ]
+    assert spans[0] == spans[1]
+    mixed = failures_of(Survey.from_traces([*traces[:2], *regular[2:]]))
+    without = {event.episode for event in mixed.events if event.time is None}
+    assert without <= {run.episode_index for run in traces[:2]}
+    assert mixed.timed
+
+
+def test_intervals_merge_across_half_a_second_not_across_long_gaps() -> None:
+    high = np.array([1, 0, 1, 0, 1, 1], bool)
+    episode = np.zeros(6, int)
+    assert event_spans(high, episode, 5, np.arange(6.0)) == [(0, 5)]
+    assert event_spans(high, episode, 5, np.array([0.0, 1, 2, 30, 60, 90])) == [(0, 2), (4, 5)]
 
 
 def test_fast_motion_is_the_fastest_twentieth_of_each_speed(traces: list[Trace], survey: Survey) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +41,10 @@ def ekf() -> tuple[Checkpoint, Trace]:
     return run("crossmodal-ekf", "push")
 
 
+def steps_by_contact(traced: Trace, selection: Sequence[int] = ()) -> dict[bool, int]:
+    return paper.steps_by_contact(traced.episode, traced.episode_index, selection)
+
+
 def planted(traced: Trace, *spans: tuple[int, int]) -> Trace:
     """A copy of a trace with contact in the given spans."""
     contact = np.zeros(len(traced), dtype=bool)
@@ -66,30 +71,30 @@ def test_middle_of_the_longest_interval(mask: str, middle: int | None) -> None:
     ],
 )
 def test_default_steps(pf: tuple[Checkpoint, Trace], spans: list[tuple[int, int]], steps: dict[bool, int]) -> None:
-    assert paper.steps_by_contact(planted(pf[1], *spans)) == steps
+    assert steps_by_contact(planted(pf[1], *spans)) == steps
 
 
 def test_steps_of_a_task_without_contact(pf: tuple[Checkpoint, Trace]) -> None:
     traced = planted(pf[1], (50, 61))
     task = replace(traced.task, covariates={})
     traced = replace(traced, episode=replace(traced.episode, task=task))
-    assert paper.steps_by_contact(traced) == {False: 64}
-    assert paper.steps_by_contact(traced, [51]) == {False: 51}
+    assert steps_by_contact(traced) == {False: 64}
+    assert steps_by_contact(traced, [51]) == {False: 51}
     assert [panel.modality for panel in paper.panels(task, traced.modalities, {False: 51})] == ["image", "haptics"]
     with pytest.raises(BadInput, match="steps 51 and 52 are two: select one"):
-        paper.steps_by_contact(traced, [51, 52])
+        steps_by_contact(traced, [51, 52])
 
 
 def test_selected_steps(pf: tuple[Checkpoint, Trace]) -> None:
     traced = planted(pf[1], (50, 61))
-    assert paper.steps_by_contact(traced, [51]) == {False: 80, True: 51}
-    assert paper.steps_by_contact(traced, [51, 3]) == {False: 3, True: 51}
+    assert steps_by_contact(traced, [51]) == {False: 80, True: 51}
+    assert steps_by_contact(traced, [51, 3]) == {False: 3, True: 51}
     with pytest.raises(BadInput, match="51 and 52 are both in 'contact'"):
-        paper.steps_by_contact(traced, [51, 52])
+        steps_by_contact(traced, [51, 52])
     with pytest.raises(BadInput, match="steps 0 to 99"):
-        paper.steps_by_contact(traced, [100])
+        steps_by_contact(traced, [100])
     with pytest.raises(BadInput, match="has no contact"):
-        paper.steps_by_contact(planted(traced))
+        steps_by_contact(planted(traced))
 
 
 def test_panels_by_modality_and_contact_state() -> None:
@@ -110,7 +115,7 @@ def test_panels_by_modality_and_contact_state() -> None:
 
 def test_drawn_maps_equal_the_engine(pf: tuple[Checkpoint, Trace]) -> None:
     checkpoint, traced = pf
-    steps = paper.steps_by_contact(traced)
+    steps = steps_by_contact(traced)
     figure = paper.maps_figure(checkpoint, traced, steps, SIZE)
     engine = MapEngine(checkpoint, traced)
     expected = [("image", True), ("haptics", False), ("haptics", True)]
@@ -166,9 +171,7 @@ def test_bands_cover_the_steps_in_contact(pf: tuple[Checkpoint, Trace]) -> None:
 def test_figures_are_reproducible(pf: tuple[Checkpoint, Trace], tmp_path: Path) -> None:
     checkpoint, traced = pf
     for i in range(2):
-        write_figure(
-            paper.maps_figure(checkpoint, traced, paper.steps_by_contact(traced), SIZE), tmp_path / f"maps{i}.svg"
-        )
+        write_figure(paper.maps_figure(checkpoint, traced, steps_by_contact(traced), SIZE), tmp_path / f"maps{i}.svg")
         write_figure(paper.weights_figure(traced), tmp_path / f"weights{i}.svg")
     for name in ("maps", "weights"):
         first, second = ((tmp_path / f"{name}{i}.svg").read_bytes() for i in range(2))
