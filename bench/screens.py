@@ -85,6 +85,14 @@ def job_running(page: Page) -> None:
     page.evaluate("document.querySelector('#jobs-button').click()")
 
 
+def slices(page: Page) -> None:
+    """Open the slices of a field task and the worst step of the first one."""
+    query = "?task=push-field&filter=information-ekf&tab=failures&list=slices"
+    page.goto(page.url.partition("?")[0] + query, timeout=TIMEOUT)
+    tab("failures", state("#failures"), "Search for failures")(page)
+    page.locator("#failures .slices .title").first.click()
+
+
 VIEWS: dict[str, Callable[[Page], None]] = {
     "diagnosis": tab("diagnosis", "!['loading', 'active'].includes(diagnosis.dataset.state)"),
     "failures": tab("failures", state("#failures"), "Search for failures"),
@@ -98,6 +106,7 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "jobs": click("#jobs-button"),
     "commands": click("#find"),
     "maps-several": click("#maps-tiles input[value=several]"),
+    "slices": slices,
     "job": job_running,
 }
 """View -> function that opens it; every tab is a view as well."""

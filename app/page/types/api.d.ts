@@ -520,6 +520,48 @@ export interface components {
             phases?: components["schemas"]["PhaseInfo"][] | null;
             /** Events */
             events?: components["schemas"]["FailureEvent"][] | null;
+            slices?: components["schemas"]["FailureSlices"] | null;
+        };
+        /**
+         * FailureSlice
+         * @description A data slice with a larger score. worst: episode and step of the largest one.
+         */
+        FailureSlice: {
+            /** Conditions */
+            conditions: components["schemas"]["SliceCondition"][];
+            /** Inside */
+            inside: number | null;
+            /** Outside */
+            outside: number | null;
+            /** Ratio */
+            ratio: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Episodes */
+            episodes: number[];
+            /** Worst */
+            worst: [
+                number,
+                number
+            ];
+            /** Steps */
+            steps: number;
+            /** Share */
+            share: number | null;
+            /** P Value */
+            p_value: number | null;
+        };
+        /**
+         * FailureSlices
+         * @description Data slices in which a score is larger. summary: their number and the searched data, or why there are none.
+         */
+        FailureSlices: {
+            /** Summary */
+            summary: string;
+            /** Rows */
+            rows: components["schemas"]["FailureSlice"][];
         };
         /**
          * Failures
@@ -1608,6 +1650,22 @@ export interface components {
             outcome: "met" | "not met" | "inconclusive";
         };
         /**
+         * SliceCondition
+         * @description Values of a covariate: ``low < value <= high`` in its SI unit, either may be None; or a category.
+         */
+        SliceCondition: {
+            /** Covariate */
+            covariate: string;
+            /** Unit */
+            unit: string;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Category */
+            category: string | null;
+        };
+        /**
          * SliceInfo
          * @description A slice of a data set (``filters.finetuning.slices``).
          */
@@ -1999,6 +2057,8 @@ export type ExperimentRow = components['schemas']['ExperimentRow'];
 export type Experiments = components['schemas']['Experiments'];
 export type FailureEvent = components['schemas']['FailureEvent'];
 export type FailureScore = components['schemas']['FailureScore'];
+export type FailureSlice = components['schemas']['FailureSlice'];
+export type FailureSlices = components['schemas']['FailureSlices'];
 export type Failures = components['schemas']['Failures'];
 export type FaultInfo = components['schemas']['FaultInfo'];
 export type FaultParameter = components['schemas']['FaultParameter'];
@@ -2047,6 +2107,7 @@ export type ResultViews = components['schemas']['ResultViews'];
 export type Row = components['schemas']['Row'];
 export type RunNames = components['schemas']['RunNames'];
 export type SliceChangeInfo = components['schemas']['SliceChangeInfo'];
+export type SliceCondition = components['schemas']['SliceCondition'];
 export type SliceInfo = components['schemas']['SliceInfo'];
 export type SmallestRepair = components['schemas']['SmallestRepair'];
 export type StudyFilter = components['schemas']['StudyFilter'];
