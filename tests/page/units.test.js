@@ -10,6 +10,7 @@ import {
   signed,
   significant,
   wrapDegrees,
+  withMinus,
 } from '../../app/page/core/units.js';
 
 test('fixed uses a true minus sign and a dash for missing values', () => {
@@ -47,4 +48,17 @@ test('percentages, sizes, angles and names', () => {
   assert.equal(sentence('door.h5 has no episodes.'), 'door.h5 has no episodes.');
   assert.equal(sentence('nothing. at all'), 'Nothing. at all.');
   assert.equal(sentence(''), '');
+});
+
+test('numbers in texts of the server have true minus signs', () => {
+  assert.equal(withMinus('-0.3 (-.5 to 2)'), '−0.3 (−.5 to 2)');
+  for (const text of [
+    'steps 3-5',
+    'image-only',
+    '2026-11-25',
+    '1e-05',
+    'force_bias:x=-3',
+    '--seed',
+  ])
+    assert.equal(withMinus(text), text);
 });

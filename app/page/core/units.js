@@ -62,6 +62,12 @@ export function sentence(text) {
 }
 
 /**
+ * Replaces the hyphens before numbers in a text of the server by minus signs, but not those in names and ranges.
+ * @param {string} text
+ */
+export const withMinus = (text) => text.replace(/(?<![\w).:=-])-(?=\.?\d)/g, '−');
+
+/**
  * Formats a number with fixed digits and a true minus sign; a dash for a missing number.
  * @param {number | null | undefined} value
  * @param {number} [digits]

@@ -12,6 +12,7 @@ import {
   percent,
   significant,
   withUnit,
+  withMinus,
 } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
@@ -123,7 +124,7 @@ export class FinetuneRun {
 
   /** @param {string} text */
   showVerdict(text) {
-    html('.verdict', this.#host).textContent = text;
+    html('.verdict', this.#host).textContent = withMinus(text);
   }
 
   /** @param {FineTuneDetails} run */

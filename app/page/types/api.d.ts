@@ -172,11 +172,15 @@ export interface components {
         };
         /**
          * DiagnosisCause
-         * @description A ranked cause. steps: first affected step, and first step after it; None for complete episodes.
+         * @description A ranked cause. cause: its name in the catalog. title: in words.
+         *
+         *     steps: first affected step, and first step after it; None for complete episodes.
          */
         DiagnosisCause: {
             /** Cause */
             cause: string;
+            /** Title */
+            title: string;
             /** Component */
             component: string;
             /** Probability */
