@@ -10,7 +10,7 @@ import {
   signed,
   significant,
   wrapDegrees,
-  withMinus,
+  typeset,
 } from '../../app/page/core/units.js';
 
 test('fixed uses a true minus sign and a dash for missing values', () => {
@@ -50,8 +50,9 @@ test('percentages, sizes, angles and names', () => {
   assert.equal(sentence(''), '');
 });
 
-test('numbers in texts of the server have true minus signs', () => {
-  assert.equal(withMinus('-0.3 (-.5 to 2)'), '−0.3 (−.5 to 2)');
+test('numbers in texts of the server are set', () => {
+  assert.equal(typeset('angle 1.67 -> 1.95 deg'), 'angle 1.67 → 1.95°');
+  assert.equal(typeset('-0.3 (-.5 to 2)'), '−0.3 (−.5 to 2)');
   for (const text of [
     'steps 3-5',
     'image-only',
@@ -60,5 +61,5 @@ test('numbers in texts of the server have true minus signs', () => {
     'force_bias:x=-3',
     '--seed',
   ])
-    assert.equal(withMinus(text), text);
+    assert.equal(typeset(text), text);
 });

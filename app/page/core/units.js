@@ -62,10 +62,14 @@ export function sentence(text) {
 }
 
 /**
- * Replaces the hyphens before numbers in a text of the server by minus signs, but not those in names and ranges.
+ * Sets the numbers of a text of the server: minus signs in place of hyphens, but not in names and ranges; arrows; degrees.
  * @param {string} text
  */
-export const withMinus = (text) => text.replace(/(?<![\w).:=-])-(?=\.?\d)/g, '−');
+export const typeset = (text) =>
+  text
+    .replace(/(?<![\w).:=-])-(?=\.?\d)/g, '−')
+    .replaceAll(' -> ', ' → ')
+    .replace(/(?<=\d) deg\b/g, '°');
 
 /**
  * Formats a number with fixed digits and a true minus sign; a dash for a missing number.

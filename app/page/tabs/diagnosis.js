@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, html } from '../core/dom.js';
-import { fixed, percent, sentence, withMinus } from '../core/units.js';
+import { fixed, percent, sentence, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
@@ -185,7 +185,7 @@ export class Diagnosis {
 
   /** @param {DiagnosisEvidence} evidence */
   #evidence({ text, episode, step }) {
-    const item = create('li', { textContent: withMinus(sentence(text)) });
+    const item = create('li', { textContent: typeset(sentence(text)) });
     if (episode === null) return item;
     const label = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;
     const link = create('button', { type: 'button', className: 'text quiet', textContent: label });

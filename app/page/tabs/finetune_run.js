@@ -12,7 +12,7 @@ import {
   percent,
   significant,
   withUnit,
-  withMinus,
+  typeset,
 } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
@@ -124,7 +124,7 @@ export class FinetuneRun {
 
   /** @param {string} text */
   showVerdict(text) {
-    html('.verdict', this.#host).textContent = withMinus(text);
+    html('.verdict', this.#host).textContent = typeset(text);
   }
 
   /** @param {FineTuneDetails} run */

@@ -53,7 +53,7 @@ export function missingStudy(study, catalog, store) {
       `To make one, collect data of ${name}, train, and serve the results `,
       copyButton('Copy', 'Copy the commands', () => commands),
     ),
-    create('pre', { textContent: commands, tabIndex: 0 }),
+    create('pre', { textContent: commands }),
   ];
 }
 
