@@ -102,6 +102,21 @@ def slices(page: Page) -> None:
     page.locator("#failures .slices .title").first.click()
 
 
+def finetune(end: str, seed: int | None = None) -> Callable[[Page], None]:
+    """Return a function that starts a fine-tuning, or opens the one with this seed, and waits for a condition."""
+
+    def show(page: Page) -> None:
+        page.goto(f"{page.url.partition('?')[0]}?task=door&filter=crossmodal-ekf&tab=finetune", timeout=TIMEOUT)
+        page.wait_for_function(f"() => {state('#finetune')}", timeout=TIMEOUT)
+        page.locator("#finetune summary").click()
+        page.locator("#finetune input[name=steps]").fill("50")
+        page.locator("#finetune input[name=seed]").fill(str(int(time.time()) if seed is None else seed))
+        page.locator("#finetune .start").click()
+        page.wait_for_function(f"() => {end}", timeout=TIMEOUT)
+
+    return show
+
+
 VIEWS: dict[str, Callable[[Page], None]] = {
     "diagnosis": tab("diagnosis", "!['loading', 'active'].includes(diagnosis.dataset.state)"),
     "failures": tab("failures", state("#failures"), "Search for failures"),
@@ -116,6 +131,8 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "commands": click("#find"),
     "maps-several": click("#maps-tiles input[value=several]"),
     "slices": slices,
+    "finetune-running": finetune("document.querySelector('#finetune .verdict').textContent.includes('step')"),
+    "finetune-finished": finetune(state("#finetune article"), seed=0),
     "job": job_running,
 }
 """View -> function that opens it; every tab is a view as well."""
@@ -131,11 +148,13 @@ READ_ONLY_VIEWS = ("first", "diagnosis", "diagnostics", "finetune", "rerun", "re
 
 
 def close(page: Page) -> None:
-    """Close dialogs and popovers."""
+    """Close dialogs and popovers, and pause a fine-tuning."""
     page.evaluate(
         "() => { document.querySelector('dialog[open]')?.close();"
         " document.querySelector('[popover]:popover-open')?.hidePopover();"
-        " if (!document.querySelector('#jobs').hidden) document.querySelector('#jobs-button').click(); }"
+        " if (!document.querySelector('#jobs').hidden) document.querySelector('#jobs-button').click();"
+        " const pause = document.querySelector('#finetune article .doing button');"
+        " if (pause?.textContent === 'Pause') pause.click(); }"
     )
 
 

@@ -108,7 +108,7 @@ export function significant(value) {
  * @param {number | null | undefined} share
  */
 export const percent = (share) =>
-  Number.isFinite(share) ? `${Math.round(100 * Number(share))} %` : '–';
+  Number.isFinite(share) ? `${fixed(100 * Number(share), 0)} %` : '–';
 
 /**
  * Wraps the difference of two angles to -180..180 degrees.

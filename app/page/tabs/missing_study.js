@@ -4,10 +4,12 @@
 /** @import { Catalog, StudyInfo } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
-import { copyButton } from '../widgets/copy_button.js';
+import { emptyNote } from '../widgets/empty_note.js';
 import { firstRun } from '../widgets/pickers.js';
 
 const SINGLE = ['image', 'haptics']; // modalities with a filter of their own
+const ABOUT =
+  'A study trains several filters with several seeds and compares their errors, so that differences between filters are not those of one training.';
 
 /**
  * Returns the elements of the note.
@@ -18,43 +20,24 @@ const SINGLE = ['image', 'haptics']; // modalities with a filter of their own
 export function missingStudy(study, catalog, store) {
   const { task: name } = store.state;
   const selected = catalog.tasks.find((task) => task.name === name);
-  const tasks = catalog.tasks.filter((task) =>
-    study.tasks.some((other) => other.name === task.name),
-  );
-  const buttons = tasks.map((task) => {
-    const button = create('button', {
-      type: 'button',
-      className: 'text',
-      textContent: `Show ${task.name}`,
+  const buttons = catalog.tasks
+    .filter((task) => study.tasks.some((other) => other.name === task.name))
+    .map((task) => {
+      const textContent = `Show ${task.name}`;
+      const button = create('button', { type: 'button', className: 'text', textContent });
+      button.addEventListener('click', () => store.set(firstRun(task, store.state)));
+      return button;
     });
-    button.addEventListener('click', () => store.set(firstRun(task, store.state)));
-    return button;
+  const source = study.name === 'shipped' ? 'included study' : `study ${study.name}`;
+  return emptyNote({
+    title: `No study of ${name} yet`,
+    paragraphs: [
+      [ABOUT],
+      ...(buttons.length ? [[`The ${source} has results for `, ...buttons]] : []),
+    ],
+    purpose: `To make one, collect data of ${name}, train, and serve the results.`,
+    commands: studyCommands(name, selected?.modalities ?? []),
   });
-  const commands = studyCommands(name, selected?.modalities ?? []);
-  return [
-    create('h4', { textContent: `No study of ${name} yet` }),
-    create('p', {
-      textContent:
-        'A study trains several filters with several seeds and compares their errors, so that differences between filters are not those of one training.',
-    }),
-    ...(tasks.length
-      ? [
-          create(
-            'p',
-            {},
-            `The ${study.name === 'shipped' ? 'included study' : `study ${study.name}`} has results for `,
-            ...buttons,
-          ),
-        ]
-      : []),
-    create(
-      'p',
-      {},
-      `To make one, collect data of ${name}, train, and serve the results `,
-      copyButton('Copy', 'Copy the commands', () => commands),
-    ),
-    create('pre', { textContent: commands }),
-  ];
 }
 
 /**
@@ -69,5 +52,5 @@ export function studyCommands(task, modalities) {
     `beliefscope collect ${task} --episodes 300 -o ${task}.h5`,
     `beliefscope study --task ${task} --data ${task}=${task}.h5${filters} -o study`,
     'beliefscope serve --study study',
-  ].join('\n');
+  ];
 }
