@@ -92,7 +92,7 @@ export class Page {
     const refreshPickers = connectPickers(catalog, store, faultDialog, () =>
       this.commands.toggle('episode '),
     );
-    this.finding = new FindingBar(html('#finding'), catalog, store);
+    this.finding = new FindingBar(html('#finding'), store);
     this.intro = new Intro(html('#intro'), catalog, store, () => this.tour.start());
     this.tour = new Tour();
     this.splitters = new Splitters();

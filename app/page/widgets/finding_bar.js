@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Finding } from '../step/finding.js' */
-/** @import { Catalog, Diagnosis } from '../types/server.js' */
+/** @import { Diagnosis } from '../types/server.js' */
 
 import { useful } from '../core/common_panels.js';
 import { html } from '../core/dom.js';
@@ -12,7 +12,6 @@ import { finding } from '../step/finding.js';
 
 export class FindingBar {
   #host;
-  #catalog;
   #store;
   #loading = new AbortController();
   /** @type {number | null} */
@@ -22,12 +21,10 @@ export class FindingBar {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    */
-  constructor(host, catalog, store) {
+  constructor(host, store) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#store = store;
     html('.moment', host).addEventListener('click', ({ timeStamp }) => this.goToMoment(timeStamp));
     html('.why', host).addEventListener('click', () => store.set({ tab: 'diagnosis' }));
@@ -44,7 +41,7 @@ export class FindingBar {
     this.#host.classList.toggle('stale', !trace);
     if (!trace) return;
     this.#draw(trace, null);
-    if (trace.live || !this.#isDiagnosable(trace)) return;
+    if (trace.live || trace.header.no_diagnosis) return;
     await useful;
     if (signal.aborted) return;
     const reply = await api.diagnosis(trace.selection, 'episode', signal).catch(() => null);
@@ -75,12 +72,6 @@ export class FindingBar {
   /** @param {number} inputTime */
   goToMoment(inputTime) {
     if (this.#step !== null) this.#store.set({ step: this.#step, playing: false }, { inputTime });
-  }
-
-  /** @param {Trace} trace */
-  #isDiagnosable({ selection: { task, filter } }) {
-    const { filters = [] } = this.#catalog.tasks.find(({ name }) => name === task) ?? {};
-    return filters.some(({ name, has_profile: has }) => name === filter && has);
   }
 
   /**
