@@ -23,7 +23,6 @@ from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.external.load import load_external
 from beliefscope.filters.names import is_path
-from beliefscope.inspect.diagnostics.healthy_profile import has_profile
 
 SAMPLE = "sample"
 """Name of the data set that ships with a task."""
@@ -127,7 +126,7 @@ class TaskCatalog:
                 "indices": main.indices,
             },
             "fault_presets": [{"name": name, "faults": text} for name, text in available_presets(task).items()],
-            "filters": [_filter_json(name, filter_, self.paths.get(name)) for name, filter_ in self.filters.items()],
+            "filters": [_filter_json(name, filter_) for name, filter_ in self.filters.items()],
             "data": [_data_json(name, data) for name, data in self.data.items()],
         }
 
@@ -219,14 +218,13 @@ def _name_parts(path: Path) -> tuple[str, ...]:
     return (valid if valid.is_dir() else valid.with_suffix("")).parts[1:]
 
 
-def _filter_json(name: str, checkpoint: Checkpoint, path: Path | None) -> dict[str, Any]:
+def _filter_json(name: str, checkpoint: Checkpoint) -> dict[str, Any]:
     record = dict(checkpoint.record)
     metrics = record.pop("metrics", {})
     return {
         "name": name,
         "kind": checkpoint.kind,
         "checkpoint_hash": checkpoint.hash,
-        "has_profile": has_profile(checkpoint, path),
         "training": record,
         "metrics": metrics,
     }

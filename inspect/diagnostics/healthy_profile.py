@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,12 +76,6 @@ class HealthyProfile:
             if values.shape != (count,) or name.count("/") != 2:
                 raise BadInput(f"the healthy profile is malformed: {name!r} has {len(values)} values of {count}")
         return cls(data, count, None if particles is None else int(particles), rows, reference)
-
-
-def has_profile(checkpoint: Checkpoint, path: Path | None) -> bool:
-    """Whether a checkpoint has a healthy profile, in its header or beside its file, without reading that."""
-    inside = isinstance(checkpoint, Checkpoint) and checkpoint.healthy_profile is not None
-    return inside or (path is not None and path.with_name(path.stem + SUFFIX).is_file())
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:

@@ -19,7 +19,6 @@ export const TASK = {
     name,
     kind: name.slice(-3),
     checkpoint_hash: '',
-    has_profile: false,
     training: {},
     metrics: {},
   })),

@@ -104,12 +104,11 @@ class MainError(Reply):
 
 
 class FilterInfo(Reply):
-    """A filter in the catalog. has_profile: whether it can be diagnosed. training, metrics: its training record."""
+    """A filter in the catalog. training, metrics: its training record."""
 
     name: str
     kind: str
     checkpoint_hash: str
-    has_profile: bool
     training: dict[str, Any]
     metrics: dict[str, Any]
 

@@ -634,7 +634,7 @@ export interface components {
         };
         /**
          * FilterInfo
-         * @description A filter in the catalog. has_profile: whether it can be diagnosed. training, metrics: its training record.
+         * @description A filter in the catalog. training, metrics: its training record.
          */
         FilterInfo: {
             /** Name */
@@ -643,8 +643,6 @@ export interface components {
             kind: string;
             /** Checkpoint Hash */
             checkpoint_hash: string;
-            /** Has Profile */
-            has_profile: boolean;
             /** Training */
             training: {
                 [key: string]: unknown;
