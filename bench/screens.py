@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import sensor_rigs
 from playwright.sync_api import Page, sync_playwright
 from served import serving
 
@@ -39,12 +40,20 @@ LINKS = {
     "push": f"?task=push&filter=crossmodal-ekf&{FROZEN}",
     "comparison": "?task=door&filter=crossmodal-pf&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
     "no-weights": "?task=push&filter=feature-ekf",
+    "no-study": "?task=push-field&tab=study",
+    "one-sensor": "?task=well&step=40",
+    "three-sensors": "?task=cart&step=40",
+    "six-sensors": "?task=submarine&step=40",
     "external": "?task=door&filter=hand-on-arc&step=29",
     "live": "?data=live:go",
     "bad-link": "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp",
 }
 """View -> address that opens it: the first visit, an injected fault on each task, a comparison run, a
-filter without weights, one without an image, a run in progress, and a selection that does not exist."""
+filter without weights, a task without a study, external filters of other tasks, one without an image, a run in
+progress, and a selection that does not exist."""
+
+FIRST_VISIT = ("first",)
+"""Views of a server without filters or data of the user: only this one has an introduction with examples."""
 
 PENDING = {
     "loading": lambda route: None,
@@ -85,6 +94,29 @@ def job_running(page: Page) -> None:
     page.evaluate("document.querySelector('#jobs-button').click()")
 
 
+def slices(page: Page) -> None:
+    """Open the slices of a field task and the worst step of the first one."""
+    query = "?task=push-field&filter=information-ekf&tab=failures&list=slices"
+    page.goto(page.url.partition("?")[0] + query, timeout=TIMEOUT)
+    tab("failures", state("#failures"), "Search for failures")(page)
+    page.locator("#failures .slices .title").first.click()
+
+
+def finetune(end: str, seed: int | None = None) -> Callable[[Page], None]:
+    """Return a function that starts a fine-tuning, or opens the one with this seed, and waits for a condition."""
+
+    def show(page: Page) -> None:
+        page.goto(f"{page.url.partition('?')[0]}?task=door&filter=crossmodal-ekf&tab=finetune", timeout=TIMEOUT)
+        page.wait_for_function(f"() => {state('#finetune')}", timeout=TIMEOUT)
+        page.locator("#finetune summary").click()
+        page.locator("#finetune input[name=steps]").fill("50")
+        page.locator("#finetune input[name=seed]").fill(str(int(time.time()) if seed is None else seed))
+        page.locator("#finetune .start").click()
+        page.wait_for_function(f"() => {end}", timeout=TIMEOUT)
+
+    return show
+
+
 VIEWS: dict[str, Callable[[Page], None]] = {
     "diagnosis": tab("diagnosis", "!['loading', 'active'].includes(diagnosis.dataset.state)"),
     "failures": tab("failures", state("#failures"), "Search for failures"),
@@ -98,46 +130,59 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "jobs": click("#jobs-button"),
     "commands": click("#find"),
     "maps-several": click("#maps-tiles input[value=several]"),
+    "slices": slices,
+    "finetune-running": finetune("document.querySelector('#finetune .verdict').textContent.includes('step')"),
+    "finetune-finished": finetune(state("#finetune article"), seed=0),
     "job": job_running,
 }
 """View -> function that opens it; every tab is a view as well."""
+
+USEFUL = "() => window.beliefscope?.stats.useful || document.querySelector('#finding').dataset.source === 'error'"
+"""Condition: a run is displayed, or why there is none."""
+
+READY = {"comparison": state("#compare .result")}
+"""View in ``LINKS`` -> further condition."""
 
 READ_ONLY_VIEWS = ("first", "diagnosis", "diagnostics", "finetune", "rerun", "recordings", "bad-link")
 """Views of a read-only server: the others need a computation."""
 
 
 def close(page: Page) -> None:
-    """Close dialogs and popovers."""
+    """Close dialogs and popovers, and pause a fine-tuning."""
     page.evaluate(
         "() => { document.querySelector('dialog[open]')?.close();"
         " document.querySelector('[popover]:popover-open')?.hidePopover();"
-        " if (!document.querySelector('#jobs').hidden) document.querySelector('#jobs-button').click(); }"
+        " if (!document.querySelector('#jobs').hidden) document.querySelector('#jobs-button').click();"
+        " const pause = document.querySelector('#finetune article .doing button');"
+        " if (pause?.textContent === 'Pause') pause.click(); }"
     )
 
 
-def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, views: list[str]) -> None:
+def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, wanted: Callable[[str], bool]) -> None:
     width, height = map(int, size.split("x"))
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=theme)
     page.goto(f"{url}?task=door&step=40", timeout=TIMEOUT)
-    page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=TIMEOUT)
+    page.wait_for_function(USEFUL, timeout=TIMEOUT)
+    page.wait_for_timeout(3 * SETTLE)
     tabs = [
         name.removeprefix("tab-") for name in page.eval_on_selector_all("[role=tab]", "all => all.map((t) => t.id)")
     ]
     for name in [*tabs, *(name for name in VIEWS if name not in tabs)]:
-        if views and name not in views:
+        if not wanted(name):
             continue
         VIEWS.get(name, tab(name))(page)
         page.wait_for_timeout(SETTLE)
         page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
         close(page)
     for name, link in LINKS.items():
-        if not views or name in views:
+        if wanted(name):
             page.goto(url + link, timeout=TIMEOUT)
-            page.wait_for_function("() => window.beliefscope?.stats.useful", timeout=TIMEOUT)
+            page.wait_for_function(USEFUL, timeout=TIMEOUT)
+            page.wait_for_function(f"() => {READY.get(name, 'true')}", timeout=TIMEOUT)
             page.wait_for_timeout(3 * SETTLE)
             page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
     for name, answer in PENDING.items():
-        if not views or name in views:
+        if wanted(name):
             page.route("**/api/trace/**", answer)
             page.goto(f"{url}?task=push&step=20", timeout=TIMEOUT)
             page.wait_for_timeout(3 * SETTLE)
@@ -177,10 +222,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as files, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
 
-        def shoot_all(url: str) -> None:
+        def shoot_all(
+            url: str, wanted: Callable[[str], bool] = lambda name: not args.view or name in args.view
+        ) -> None:
             for size in args.size or SIZES:
                 for theme in args.theme or THEMES:
-                    shoot(browser, url, args.folder, size, theme, args.view)
+                    shoot(browser, url, args.folder, size, theme, wanted)
 
         if args.url:
             shoot_all(args.url)
@@ -193,8 +240,12 @@ def main() -> None:
         filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(files) / f"{LONG}.safetensors")
         data = shutil.copy(sample_path("door"), Path(files) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
         workspace = Path(files) / "workspace"
-        with live_run(workspace), serving("--filter", str(filter_), "--data", str(data), workspace=workspace) as server:
-            shoot_all(server.url)
+        options = ["--filter", str(filter_), "--data", str(data), *sensor_rigs.options(Path(files))]
+        with live_run(workspace), serving(*options, workspace=workspace) as server:
+            shoot_all(server.url, lambda name: name not in FIRST_VISIT and (not args.view or name in args.view))
+        if not args.view or set(FIRST_VISIT) & set(args.view):
+            with serving() as server:
+                shoot_all(server.url, lambda name: name in FIRST_VISIT)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.failures.step_scores import Survey
 
 Among = Literal["held-out", "all"]
 
@@ -76,8 +75,7 @@ def _live_failures(store: TraceStore, request: SurveyRequest) -> Response:
     faults = Faults.parse(request.faults)
     episode = store.live.ended_run(request.data).template.episode_index
     run = finished_run(store, Selection(request.task, request.filter, episode, faults, request.data))
-    survey = Survey.from_traces([run.trace])
-    return JSONResponse(failure_document(survey, asdict(request) | {"faults": str(faults)}))
+    return JSONResponse(failure_document([run.trace], asdict(request) | {"faults": str(faults)}))
 
 
 def _arguments(store: TraceStore, request: SurveyRequest) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Job that runs a filter over a data set and ranks its failure events by every score."""
+"""Job that runs a filter over a data set, ranks its failure events by every score and searches for slices."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -8,11 +8,18 @@ from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.failures.events import Event
-from beliefscope.inspect.failures.step_scores import Survey
-from beliefscope.inspect.failures.survey import survey_of
+from beliefscope.inspect.diagnostics.views import as_json
+from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
 from beliefscope.inspect.failures.survey_json import survey_document
+from beliefscope.inspect.slices.covariates import EpisodeCovariates
+from beliefscope.inspect.slices.report import check_episodes, slices_of_survey
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
+
+MAX_STEPS = 200_000
+"""Largest number of steps in which slices are searched; limits memory."""
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -21,10 +28,10 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     def progress(share: float) -> None:
         at = min(int(share * len(episodes)), len(episodes) - 1)
-        report(share, f"running the filter over episode {episodes[at]}, {at + 1} of {len(episodes)}")
+        report(0.95 * share, f"running the filter over episode {episodes[at]}, {at + 1} of {len(episodes)}")
 
     with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
-        survey = survey_of(
+        traces = trace_all(
             store.checkpoint(arguments["task"], arguments["filter"]),
             store.dataset(arguments["task"], arguments["data"])[1],
             episodes,
@@ -33,14 +40,39 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             particles=store.settings.particles,
             progress=progress,
         )
-    return failure_document(survey, arguments)
+        return failure_document(traces, arguments, lambda: report(0.95, "searching for slices"))
 
 
-def failure_document(survey: Survey, selection: Mapping[str, Any]) -> dict[str, Any]:
-    """The survey's document with permalinks. selection: ``filter``, ``data``, ``faults`` and ``among``, as text."""
-    filter_, data = selection["filter"], selection["data"]
+def failure_document(
+    traces: Iterable[Trace], selection: Mapping[str, Any], traced: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
+    """Failures and slices of traces, which are not kept, with permalinks.
 
-    def link(event: Event, by: str) -> str:
-        return permalink(survey.task, filter_, data, event.episode, event.step, survey.faults, by)
+    selection: ``filter``, ``data``, ``faults`` and ``among``, as text. traced: called after the last trace.
+    """
+    parts = [(EpisodeScores.from_trace(trace), EpisodeCovariates.from_trace(trace)) for trace in traces]
+    traced()
+    survey = Survey.from_episodes(scores for scores, _ in parts)
 
-    return {name: selection[name] for name in ("filter", "data", "faults", "among")} | survey_document(survey, link)
+    def link(episode: int, step: int, by: str) -> str:
+        return permalink(survey.task, selection["filter"], selection["data"], episode, step, survey.faults, by)
+
+    document = {name: selection[name] for name in ("filter", "data", "faults", "among")}
+    document |= survey_document(survey, lambda event, by: link(event.episode, event.step, by))
+    covariates = [covariates for _, covariates in parts]
+    for score in document["scores"]:
+        if not score["why_not"]:
+            score["slices"] = _slices(survey, covariates, score["name"])
+    return document
+
+
+def _slices(survey: Survey, covariates: Sequence[EpisodeCovariates], by: str) -> dict[str, Any]:
+    """The slices of a score, or why they were not searched."""
+    try:
+        check_episodes(len(covariates))
+        if len(survey.step) > MAX_STEPS:
+            raise BadInput(f"{len(survey.step)} steps; slices are searched in at most {MAX_STEPS}")
+        slices = slices_of_survey(survey, covariates, by)
+    except BadInput as error:
+        return {"summary": f"Slices were not searched: {error}.", "rows": []}
+    return {"summary": slices.summary, "rows": as_json(slices.slices)}

@@ -5,7 +5,7 @@ Encoding images takes nearly all of a training step's time, and the output of a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -39,31 +39,36 @@ def index_images(sets: Sequence[Steps]) -> tuple[list[Steps], Images]:
     return [replace(steps, observations=indexed) for steps, indexed in zip(sets, observations, strict=True)], images
 
 
+Tables = dict[tuple[str, bytes, bytes], Tensor]
+"""Modality, weights of an encoder, and mean and standard deviation of its images -> features (P, units) of these."""
+
+
 @contextmanager
-def cached_encoders(
-    filter_: Filter, images: Images, progress: Callable[[float], None] = lambda share: None
-) -> Iterator[None]:
+def cached_encoders(filter_: Filter, images: Images, tables: Tables | None = None) -> Iterator[None]:
     """Within this context the filter takes image indices: frozen encoders look up features, others encode the image.
 
     An encoder counts as frozen if none of its parameters requires a gradient on entry. Results differ from those on
     images only by rounding, since sums are taken in another order.
+
+    Args:
+        tables: features of these images that are known; new ones are added.
     """
     encoders = [
         (name.rpartition(".by_modality.")[2], module)
         for name, module in filter_.named_modules()
         if isinstance(module, ImageEncoder)
     ]
-    tables: dict[tuple[str, bytes], Tensor] = {}
+    tables = {} if tables is None else tables
     try:
-        for count, (modality, encoder) in enumerate(encoders, 1):
+        for modality, encoder in encoders:
             if any(parameter.requires_grad for parameter in encoder.parameters()):
                 encoder.images = lambda n, m=modality: filter_.statistics.standardise(m, images[m][n])
                 continue
-            key = modality, weights_key(encoder)
+            scaling = torch.stack(filter_.statistics.mean_std(modality)).cpu().numpy().tobytes()
+            key = modality, weights_key(encoder), scaling
             if key not in tables:
                 tables[key] = encode_images(filter_, modality, encoder, images[modality])
             encoder.table = tables[key]
-            progress(count / len(encoders))
         yield
     finally:
         for _, encoder in encoders:

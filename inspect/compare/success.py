@@ -113,5 +113,7 @@ def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference |
 
 def _description(row: SliceChange) -> str:
     values = f"{row.before:.3g} to {row.after:.3g} {row.unit}".rstrip()
-    interval = "" if math.isnan(row.low) else f", 95 % interval {100 * row.low:+.0f} to {100 * row.high:+.0f} %"
+    interval = ""
+    if not math.isnan(row.low):
+        interval = f", 95 % interval {round(100 * row.low):+d} to {round(100 * row.high):+d} %"
     return f"{row.slice} {100 * row.change:+.1f} % ({values}{interval})"

@@ -140,6 +140,7 @@ class Candidate:
         """JSON values, except that numbers may be NaN."""
         return {
             "cause": self.cause.name,
+            "title": self.cause.title,
             "component": self.cause.component,
             "probability": self.probability,
             "episodes": list(self.episodes),

@@ -89,15 +89,20 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
         return f"Fault of unknown cause: {case.alarms[0].text}."
     first = candidates[0]
     if first.probability < SURE and len(candidates) > 1 and candidates[1].probability > COMPARABLE * first.probability:
-        return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
+        return f"{first.cause.title} or {_lower(candidates[1].cause.title)}, not separable; try: {first.next}"
     since = _since(case, first)
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {first.cause.title}"
     text = f"{title}{since}{where}, probability {first.probability:.2f}"
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
-        text += f"; and {second.cause.title[0].lower()}{second.cause.title[1:]}, probability {second.probability:.2f}"
+        text += f"; and {_lower(second.cause.title)}, probability {second.probability:.2f}"
     return f"{text}; the filter is unaffected" if masked else text
+
+
+def _lower(title: str) -> str:
+    """A title within a sentence; abbreviations such as NLL keep their capitals."""
+    return title if title[:2].isupper() else title[0].lower() + title[1:]
 
 
 def _since(case: Case, candidate: Candidate) -> str:

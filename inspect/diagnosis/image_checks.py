@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import fft
 
 from beliefscope.datasets.episode import Episode, lost_images
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
@@ -125,9 +126,9 @@ def registration(reference: Array, images: Array) -> tuple[float, float]:
     shape, rows, columns = (2 * height, 2 * width), height // 4, width // 4
     spectrum = np.zeros((shape[0], width + 1), dtype=np.complex128)
     for axis in (1, 2):
-        a, b = (np.fft.rfft2(np.gradient(stack, axis=axis), shape) for stack in (images, reference))
+        a, b = (fft.rfft2(np.gradient(stack, axis=axis), shape) for stack in (images, reference))
         spectrum += (a * np.conj(b)).sum(0)
-    product = np.roll(np.fft.irfft2(spectrum, shape), (rows, columns), axis=(0, 1))
+    product = np.roll(fft.irfft2(spectrum, shape), (rows, columns), axis=(0, 1))
     power = product[: 2 * rows + 1, : 2 * columns + 1]
     i, j = (int(k) for k in np.unravel_index(int(power.argmax()), power.shape))
     return j - columns + _vertex(power[i], j), i - rows + _vertex(power[:, j], i)

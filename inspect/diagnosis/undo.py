@@ -47,8 +47,8 @@ def undo(name: str, setting: Setting, deviations: Deviations, base: Checkpoint |
 
 def brings_back(name: str, base: Checkpoint | None = None) -> bool:
     """Whether an intervention brings back healthy readings, modules or equations; others only remove a sensor."""
-    removes = BY_SUBJECT.get(name.rpartition(" ")[0]) is drop or UNDO.get(name) is skip_lost_images
-    return not removes or (base is not None and name in MODULES)
+    function = UNDO.get(name) or BY_SUBJECT[name.rpartition(" ")[0]]
+    return function not in (drop, skip_lost_images) or (base is not None and name in MODULES)
 
 
 def _with_modules(setting: Setting, base: Checkpoint, prefixes: Sequence[str]) -> Setting | None:

@@ -38,11 +38,34 @@ class StepCovariate:
     categories: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class EpisodeCovariates:
+    """Covariates of one trace.
+
+    Attributes:
+        index: of the episode. counted: (T,) steps that metrics use.
+        columns: name -> SI unit, values (T',) at the counted steps.
+    """
+
+    index: int
+    counted: Mask
+    columns: Mapping[str, tuple[str, NDArray[Any]]]
+
+    @classmethod
+    def from_trace(cls, trace: Trace) -> EpisodeCovariates:
+        return cls(trace.episode_index, measures.counted(trace), dict(_columns(trace)))
+
+
 def covariates_of(traces: Sequence[Trace]) -> list[StepCovariate]:
     """Covariates of the concatenated counted steps of traces of one task, without constant ones."""
-    columns = [dict(_columns(trace)) for trace in traces]
+    return join_covariates([EpisodeCovariates.from_trace(trace) for trace in traces])
+
+
+def join_covariates(episodes: Sequence[EpisodeCovariates]) -> list[StepCovariate]:
+    """As ``covariates_of``."""
+    columns = [episode.columns for episode in episodes]
     names = dict.fromkeys(name for column in columns for name in column)
-    lengths = [int(measures.counted(trace).sum()) for trace in traces]
+    lengths = [int(episode.counted.sum()) for episode in episodes]
     result = []
     for name in names:
         parts = [column.get(name, ("", np.full(n, np.nan))) for column, n in zip(columns, lengths, strict=True)]

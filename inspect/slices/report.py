@@ -15,13 +15,16 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
+from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
 from beliefscope.inspect.failures.survey import check_applies, find_score, try_score
-from beliefscope.inspect.slices.covariates import covariates_of
+from beliefscope.inspect.slices.covariates import EpisodeCovariates, join_covariates
 from beliefscope.inspect.slices.search import ALPHA, Candidate, Condition, Index, find_candidates
-from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
+
+MIN_SEARCHED = 8
+"""Smallest number of episodes in which a search without a request by the user is worthwhile."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class ErrorSlice:
         inside, outside: mean score of its steps, and of all others; SI units.
         ratio, low, high: inside / outside with its 95 % interval over episodes; NaN below five episodes.
         episodes: indices in the data set of the episodes with steps in the slice.
+        worst: episode and step of its largest score.
         steps, share: number of its steps, and their share of all.
         p_value: of the search, see ``inspect/slices/search.py``.
     """
@@ -44,6 +48,7 @@ class ErrorSlice:
     low: float
     high: float
     episodes: tuple[int, ...]
+    worst: tuple[int, int]
     steps: int
     share: float
     p_value: float
@@ -86,11 +91,14 @@ class ErrorSlices(Diagnostic):
     @property
     def verdict(self) -> str:
         """One sentence for each slice."""
+        return " ".join([self.summary, *map(self.sentence, self.slices)])
+
+    @property
+    def summary(self) -> str:
+        """``3 slices with a larger position error in 60 episodes, 12000 steps and 31 covariates.``"""
         scope = f"{self.episodes} episodes, {self.steps} steps and {len(self.covariates)} covariates"
-        if not self.slices:
-            return f"No slice with a larger {self.title} in {scope}."
-        count = f"{len(self.slices)} slice{'s' * (len(self.slices) != 1)} with a larger {self.title} in {scope}."
-        return " ".join([count, *map(self.sentence, self.slices)])
+        count = len(self.slices) or "No"
+        return f"{count} slice{'s' * (len(self.slices) > 1)} with a larger {self.title} in {scope}."
 
     def sentence(self, slice_: ErrorSlice) -> str:
         """``Position error is 2.3 x larger (1.8 to 2.9) where friction > 2.1: 14 of 60 episodes, 23 % of steps.``"""
@@ -153,56 +161,84 @@ def find_slices(
     settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
     try_score(by, checkpoint, data, indices[:1], **settings)
     runs = trace_all(checkpoint, data, indices, **settings, progress=lambda share: progress(0.8 * share))
-    return slices_of(list(runs), by, alpha=alpha, progress=lambda share: progress(0.8 + 0.2 * share))
+    return slices_of(runs, by, alpha=alpha, progress=lambda share: progress(0.8 + 0.2 * share))
 
 
 def slices_of(
-    traces: Sequence[Trace],
+    traces: Iterable[Trace],
     by: str = "error",
     *,
     alpha: float = ALPHA,
     progress: Callable[[float], None] = lambda share: None,
 ) -> ErrorSlices:
-    """Search slices of the counted steps of the traces of one filter.
+    """Search slices of the counted steps of the traces of one filter, which are not kept.
+
+    Raises BadInput for an unknown score, one that does not apply, and as ``Survey.from_episodes``.
+    """
+    parts = [(EpisodeScores.from_trace(trace), EpisodeCovariates.from_trace(trace)) for trace in traces]
+    if not parts:
+        raise BadInput("the search for slices needs at least one trace")
+    survey = Survey.from_episodes(scores for scores, _ in parts)
+    return slices_of_survey(survey, [covariates for _, covariates in parts], by, alpha=alpha, progress=progress)
+
+
+def check_episodes(count: int) -> None:
+    """Raise BadInput if a search in this number of episodes is unlikely to find a slice."""
+    if count < MIN_SEARCHED:
+        raise BadInput(f"{count} episode{'s' * (count != 1)}; a search for slices needs at least {MIN_SEARCHED}")
+
+
+def slices_of_survey(
+    survey: Survey,
+    episodes: Iterable[EpisodeCovariates],
+    by: str = "error",
+    *,
+    alpha: float = ALPHA,
+    progress: Callable[[float], None] = lambda share: None,
+) -> ErrorSlices:
+    """Search slices of the counted steps of a survey.
 
     The search compares ranks. Slices whose ratio of means has an interval that contains 1 are omitted.
+
+    Args:
+        episodes: covariates of all episodes of the survey.
+
+    Raises BadInput for an unknown score, one that does not apply, and one that is not finite.
     """
-    if not traces:
-        raise BadInput("the search for slices needs at least one trace")
-    first = traces[0]
-    definition = find_score(by, first.task)
-    check_applies(by, definition.why_not(first))
-    keep = [measures.counted(trace) for trace in traces]
-    score = np.concatenate([definition.values(trace)[mask] for trace, mask in zip(traces, keep, strict=True)])
-    number = np.repeat(np.arange(len(traces)), [mask.sum() for mask in keep])
-    covariates = covariates_of(traces)
+    definition = find_score(by, survey.task)
+    check_applies(by, survey.refused.get(by))
+    ordered = sorted(episodes, key=lambda episode: episode.index)
+    keep = np.concatenate([episode.counted for episode in ordered])
+    score, episode, step = survey.scores[by][keep], survey.episode[keep], survey.step[keep]
     if not np.isfinite(score).all():
         raise BadInput(f"no slices by {by}: the score is not finite at {np.sum(~np.isfinite(score))} steps")
-    candidates = find_candidates(score, number, covariates, alpha=alpha, seed=first.seed, progress=progress)
-    indices = np.array([trace.episode_index for trace in traces])
-    slices = [_error_slice(candidate, score, number, indices) for candidate in candidates]
+    covariates = join_covariates(ordered)
+    candidates = find_candidates(score, episode, covariates, alpha=alpha, seed=survey.seed, progress=progress)
+    slices = [_error_slice(candidate, score, episode, step) for candidate in candidates]
     return ErrorSlices(
-        task=first.task.name,
-        filter=first.filter,
-        checkpoint_hash=first.checkpoint_hash,
-        faults=str(first.faults),
-        seed=first.seed,
-        particles=first.particle_count,
+        task=survey.task.name,
+        filter=survey.filter,
+        checkpoint_hash=survey.checkpoint_hash,
+        faults=survey.faults,
+        seed=survey.seed,
+        particles=survey.particles,
         by=by,
         title=definition.title,
         unit=definition.unit,
         shown=definition.shown,
         alpha=alpha,
-        episodes=len(traces),
+        episodes=len(ordered),
         steps=len(score),
         covariates=tuple(covariate.name for covariate in covariates),
         slices=tuple(slice_ for slice_ in slices if not slice_.low <= 1.0),
     )
 
 
-def _error_slice(candidate: Candidate, score: Array, number: Index, indices: Index) -> ErrorSlice:
-    """Effect of a slice with its interval over episodes."""
+def _error_slice(candidate: Candidate, score: Array, episode: Index, step: Index) -> ErrorSlice:
+    """Effect of a slice with its interval over episodes. episode, step: (S,) indices."""
     inside = candidate.steps
+    worst = int(np.where(inside, score, -np.inf).argmax())
+    indices, number = np.unique(episode, return_inverse=True)
     columns = np.stack([inside, ~inside, inside * score, ~inside * score], axis=1)
     sums = np.zeros((len(indices), 4))
     np.add.at(sums, number, columns)
@@ -221,6 +257,7 @@ def _error_slice(candidate: Candidate, score: Array, number: Index, indices: Ind
         low=low,
         high=high,
         episodes=tuple(indices[np.unique(number[inside])].tolist()),
+        worst=(int(episode[worst]), int(step[worst])),
         steps=int(inside.sum()),
         share=float(inside.mean()),
         p_value=candidate.p_value,

@@ -255,8 +255,10 @@ def random_pairings(episode: Index, count: int, rng: np.random.Generator) -> Ind
     other = rng.permuted(np.broadcast_to(np.arange(len(first))[:, None], (len(first), count)), axis=0)  # (E, P)
     rotation = rng.integers(0, length[other])
     local = np.arange(len(episode)) - first[number]
-    source = other[number]
-    index: Index = first[source] + (local[:, None] + rotation[number]) % length[source]
+    index = np.empty((len(episode), count), np.int64)
+    for p in range(count):  # limits memory
+        source = other[number, p]
+        index[:, p] = first[source] + (local + rotation[number, p]) % length[source]
     return index
 
 
@@ -265,7 +267,8 @@ def _test(families: Sequence[_Family], value: Array, pairing: Index, alpha: floa
 
     Returns its family, its index there and its p-value; None if there is no such candidate.
     """
-    table = np.concatenate([value[:, None], value[pairing]], axis=1).astype(np.float32)
+    single = value.astype(np.float32)
+    table = np.concatenate([single[:, None], single[pairing]], axis=1)
     observed: list[tuple[Array, Array]] = []
     largest = np.full(pairing.shape[1], -np.inf)
     totals: dict[int, Array] = {}

@@ -24,6 +24,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.filters.rollout import first_belief, rollout
+from beliefscope.filters.training.encoder_cache import Images, Tables, cached_encoders, index_images
 from beliefscope.inspect.statistics.calibration import LEVELS, gaussian_level
 from beliefscope.inspect.statistics.measures import Array
 
@@ -173,12 +174,14 @@ def _sum_block(
     for s, slice_ in enumerate(slices):
         by_faults.setdefault(str(slice_.faults), []).append(s)
     total, done, first = len(distance) * len(filters), 0, task.first_counted(length)
-    for faults, fault_slices in by_faults.items():
-        faulty = slices[fault_slices[0]].apply_faults(episodes, seed)
-        steps = Steps.from_episodes(task, faulty)
+    faulty = {faults: slices[members[0]].apply_faults(episodes, seed) for faults, members in by_faults.items()}
+    # Many faults leave most images as they are, and most fine-tuned filters have the image encoders of their bases.
+    indexed, images = index_images([Steps.from_episodes(task, members) for members in faulty.values()])
+    tables: Tables = {}
+    for (faults, fault_slices), steps in zip(by_faults.items(), indexed, strict=True):
         batch = steps.windows(steps.first, length)
         for f, filter_ in enumerate(filters):
-            run = _runner(filter_, faulty, batch, particles, seed)
+            run = _runner(filter_, faulty[faults], batch, images, tables, particles, seed)
             for only in dict.fromkeys(slices[s].only for s in fault_slices):
                 run_slices = [s for s in fault_slices if slices[s].only == only]
                 columns = _columns(task, *run(slices[run_slices[0]], _scaled_progress(progress, done, total)))
@@ -195,12 +198,23 @@ def _width(task: Task) -> int:
 
 
 def _runner(
-    checkpoint: Checkpoint, episodes: Sequence[Episode], batch: Batch, particles: int, seed: int
+    checkpoint: Checkpoint,
+    episodes: Sequence[Episode],
+    batch: Batch,
+    images: Images,
+    tables: Tables,
+    particles: int,
+    seed: int,
 ) -> Callable[[Slice, Progress], tuple[Array, Tensor]]:
-    """Runs a filter with the modalities of a slice: errors (T, N, n) and covariances (T, N, n, n), SI units."""
+    """Runs a filter with the modalities of a slice: errors (T, N, n) and covariances (T, N, n, n), SI units.
+
+    batch: with indices in place of the images. tables: features of images that are known, to which it adds others.
+    """
     if isinstance(checkpoint, ExternalFilter):
         return partial(_run_external, checkpoint, episodes, batch, seed)
-    return partial(_run, checkpoint.filter, checkpoint.filter.encode(batch), batch, particles, seed)
+    with cached_encoders(checkpoint.filter, images, tables):
+        evidence = checkpoint.filter.encode(batch)
+    return partial(_run, checkpoint.filter, evidence, batch, particles, seed)
 
 
 def _run(

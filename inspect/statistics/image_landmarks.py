@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from beliefscope.inspect.statistics.signals import Array
 
@@ -107,11 +108,7 @@ class LandmarkFilter:
 
     def _response(self, images: Array) -> Array:
         """(T, H, W): convolution of the images without the background, which is zero around them."""
-        contrasts = images - self.background
-        height, width = contrasts.shape[1:]
-        shape = (height + 2 * RADIUS, width + 2 * RADIUS)
-        full = np.fft.irfft2(np.fft.rfft2(contrasts, shape) * np.fft.rfft2(self.kernel, shape), shape)
-        return full[:, RADIUS : RADIUS + height, RADIUS : RADIUS + width]
+        return _convolution(_spectrum(images - self.background), self.kernel, images.shape[1:])
 
 
 def fit_landmark_filter(images: Array, positions: Array, others: Array | None = None) -> LandmarkFilter | None:
@@ -140,22 +137,38 @@ def fit_landmark_filter(images: Array, positions: Array, others: Array | None = 
     power /= np.maximum(power.sum((1, 2), keepdims=True), 1e-12)
     seen = np.stack([(power * columns).sum((1, 2)), (power * rows).sum((1, 2))], axis=1)
     shape = (height + 2 * RADIUS, width + 2 * RADIUS)
-    spectrum = np.fft.rfft2(contrasts, shape)
+    spectrum = _spectrum(contrasts)
     density = np.square(np.abs(spectrum)).mean(0)
     density += RIDGE * density.mean()
     for size in WIDTHS:
         camera, weights = _robust_fit(terms, seen)
         x, y = (terms @ camera).T[:, :, None, None]
-        target = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * size**2)) * weights[:, None, None]
-        cross = (np.fft.rfft2(target, shape) * np.conj(spectrum)).sum(0) / weights.sum()
-        full = np.roll(np.fft.irfft2(cross / density, shape), (RADIUS, RADIUS), axis=(0, 1))
+        # The target, a Gaussian at the landmark, is a product of its parts along y and x, and so is its spectrum.
+        along_y = fft.fft(np.exp(-((np.arange(height) - y[:, 0]) ** 2) / (2.0 * size**2)) * weights[:, None], shape[0])
+        along_x = fft.rfft(np.exp(-((np.arange(width) - x[:, 0]) ** 2) / (2.0 * size**2)), shape[1])
+        cross = np.einsum("ti,tj,tij->ij", along_y, along_x, np.conj(spectrum), optimize=True) / weights.sum()
+        full = np.roll(fft.irfft2(cross / density, shape), (RADIUS, RADIUS), axis=(0, 1))
         result = LandmarkFilter(background, full[: 2 * RADIUS + 1, : 2 * RADIUS + 1], camera, scale)
         near = (np.abs(columns - x) <= SEARCH) & (np.abs(rows - y) <= SEARCH)
-        response = result._response(images)
+        response = _convolution(spectrum, result.kernel, (height, width))
         seen = _peaks(np.where(near, response, -np.inf))
     if np.median(np.linalg.norm(seen - terms @ camera, axis=1)) > MAX_DISTANCE:
         return None
     return replace(result, height=float(_around(response, terms @ camera).mean(axis=0).max()))
+
+
+def _spectrum(contrasts: Array) -> NDArray[np.complex128]:
+    """Fourier transform of contrasts (T, H, W), which are zero around the images, for convolutions with a kernel."""
+    height, width = contrasts.shape[1:]
+    return np.asarray(fft.rfft2(contrasts, (height + 2 * RADIUS, width + 2 * RADIUS)))
+
+
+def _convolution(spectrum: NDArray[np.complex128], kernel: Array, size: tuple[int, ...]) -> Array:
+    """(T, H, W): convolution of contrasts of this size (H, W), given by their spectrum, with a kernel."""
+    height, width = size
+    shape = (height + 2 * RADIUS, width + 2 * RADIUS)
+    full = fft.irfft2(spectrum * fft.rfft2(kernel, shape), shape)
+    return np.asarray(full[:, RADIUS : RADIUS + height, RADIUS : RADIUS + width])
 
 
 def _terms(values: Array) -> tuple[Array, Array]:

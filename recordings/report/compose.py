@@ -35,7 +35,7 @@ from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.figures.top_view import draw_step
 from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
-from beliefscope.inspect.slices.report import slices_of
+from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -66,9 +66,6 @@ MAP_CAPTION = (
 )
 SLICES = ("Slices", "Under which conditions is the error larger?")
 """Title of the section on data slices, and the question that it answers."""
-
-MIN_EPISODES = 8
-"""Minimum number of episodes in which slices are searched."""
 
 MAX_CHARTS = 8
 """Maximum number of error charts; shows the traces with the largest RMSE."""
@@ -107,7 +104,7 @@ def compose(
     titles = {name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results}
     reasons = {DIAGNOSTICS[name].title: reason for name, reason in reasons.items()}
     try:
-        _check_slices(traces)
+        check_episodes(len({trace.episode_index for trace in traces}))
         results["slices"] = slices_of(traces, progress=lambda share: progress(0.9 + 0.1 * share))
         titles["slices"] = SLICES
     except BadInput as error:
@@ -135,15 +132,6 @@ def compose(
             "matplotlib": matplotlib.__version__,
         },
     )
-
-
-def _check_slices(traces: Sequence[Trace]) -> None:
-    """Raise BadInput with the reason if the traces are not suited to a search for slices."""
-    different = len({trace.episode_index for trace in traces})
-    if different < MIN_EPISODES:
-        raise BadInput(
-            f"{different} episode{'s' * (different != 1)}; a search for slices needs at least {MIN_EPISODES}"
-        )
 
 
 def parse_event(text: str, traces: Sequence[Trace]) -> tuple[int, int]:

@@ -64,6 +64,27 @@ def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
     assert other.state["filter"] == "crossmodal-ekf"
 
 
+def test_worst_step_of_a_slice_is_opened(open_page: Any) -> None:
+    page = open_page("?tab=failures&list=slices&task=push-field&filter=information-ekf", size=(1280, 720))
+    page.page.get_by_role("button", name="Search for failures").click()
+    page.until(READY, 240)
+    result = page.page.request.get(page.url + "api/failures/push-field/information-ekf").json()
+    slices = result["scores"][0]["slices"]
+    assert page.page.locator("#failures .verdict").text_content() == slices["summary"]
+    rows = page.page.locator("#failures .slices tbody tr")
+    assert rows.count() == len(slices["rows"]) > 0
+    first = slices["rows"][0]
+    texts = rows.first.locator("td").all_text_contents()
+    assert texts[1] == f"{100 * first['inside']:.3g}"
+    assert texts[3] == f"{first['ratio']:.2g} \N{MULTIPLICATION SIGN} ({first['low']:.2g} to {first['high']:.2g})"
+    assert texts[4] == f"{len(first['episodes'])} of {len(result['episodes'])}"
+    rows.first.get_by_role("button").click()
+    wait_for_step(page, *first["worst"])
+    page.settle(first["worst"][1])
+    assert rows.first.get_attribute("class") == "here"
+    page.screenshot("slices")
+
+
 def column(page: Any, name: str) -> list[str]:
     """Cells of a column of the table of episodes."""
     table = page.page.locator("#failures .episodes")

@@ -54,7 +54,8 @@ def test_filter_is_finetuned_promoted_and_discarded(
     )
     assert panel.locator(".verdict").text_content().startswith(("Not met: contact ", "Inconclusive: contact "))
     assert panel.locator(".slices tbody tr").count() == 6
-    assert "contact:by=20%:others=5%" in panel.locator(".runs tbody tr.here").text_content()
+    row = panel.locator(".runs tbody tr.here").text_content()
+    assert "contact at least 20 % better, others at most 5 % worse" in row
     assert panel.locator("h3").text_content() == "crossmodal-ekf: virtual_sensors.haptics.state on haptics only"
     assert "virtual sensors.image" in panel.get_by_label("Modules", exact=True).last.text_content()
     page.until("() => document.querySelectorAll('#finetune .live canvas').length === 2")

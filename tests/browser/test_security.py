@@ -56,7 +56,7 @@ def test_access_link_opens_a_read_only_page_with_names_as_text(
     assert page.page.evaluate("window.hacked") is None
     assert page.page.locator("img[src=x]").count() == 0
 
-    assert page.page.inner_text("#read-only") == "read-only"
+    assert page.page.text_content("#read-only") == "read-only"
     for button in ("#save", "#report"):
         assert page.page.locator(button).is_disabled()
         assert "Read-only server" in page.page.get_attribute(button, "title")

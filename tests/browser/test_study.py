@@ -72,3 +72,16 @@ def test_bar_opens_the_largest_error(open_page: Any) -> None:
         "component": "angle",
     }
     assert page.state.items() >= {**expected, "episode": worst["episode"]}.items()
+
+
+def test_a_task_without_a_study_says_how_to_make_one(open_page: Any) -> None:
+    page = open_page("?task=push-field&tab=study", size=(1280, 720))
+    page.until("() => document.querySelector('#study').dataset.state === 'empty'")
+    note = page.page.locator("#study .note")
+    command = "beliefscope study --task push-field --data push-field=push-field.h5 --filter crossmodal-ekf"
+    assert command in note.locator("pre").text_content()
+    assert not page.violations()
+    page.screenshot("no-study")
+    note.get_by_role("button", name="Show push", exact=True).click()
+    page.until("() => document.querySelector('#study').dataset.state === 'ready'")
+    assert page.state["task"] == "push"

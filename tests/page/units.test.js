@@ -10,6 +10,7 @@ import {
   signed,
   significant,
   wrapDegrees,
+  typeset,
 } from '../../app/page/core/units.js';
 
 test('fixed uses a true minus sign and a dash for missing values', () => {
@@ -47,4 +48,18 @@ test('percentages, sizes, angles and names', () => {
   assert.equal(sentence('door.h5 has no episodes.'), 'door.h5 has no episodes.');
   assert.equal(sentence('nothing. at all'), 'Nothing. at all.');
   assert.equal(sentence(''), '');
+});
+
+test('numbers in texts of the server are set', () => {
+  assert.equal(typeset('angle 1.67 -> 1.95 deg'), 'angle 1.67 → 1.95°');
+  assert.equal(typeset('-0.3 (-.5 to 2)'), '−0.3 (−.5 to 2)');
+  for (const text of [
+    'steps 3-5',
+    'image-only',
+    '2026-11-25',
+    '1e-05',
+    'force_bias:x=-3',
+    '--seed',
+  ])
+    assert.equal(typeset(text), text);
 });

@@ -17,9 +17,13 @@ class DiagnosisRecovery(Reply):
 
 
 class DiagnosisCause(Reply):
-    """A ranked cause. steps: first affected step, and first step after it; None for complete episodes."""
+    """A ranked cause. cause: its name in the catalog. title: in words.
+
+    steps: first affected step, and first step after it; None for complete episodes.
+    """
 
     cause: str
+    title: str
     component: str
     probability: float
     episodes: list[int]

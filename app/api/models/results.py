@@ -7,6 +7,8 @@ from beliefscope.inspect.diagnostics import views
 from beliefscope.inspect.diagnostics.base import Entry
 from beliefscope.inspect.failures import by_episode
 from beliefscope.inspect.failures.events import Event, PhaseStatistics
+from beliefscope.inspect.slices.report import ErrorSlice
+from beliefscope.inspect.slices.search import Condition
 
 
 @fields_of(views.Curve)
@@ -98,6 +100,25 @@ class FailureEvent(Reply):
     link: str
 
 
+@fields_of(Condition)
+class SliceCondition(Reply):
+    """Values of a covariate: ``low < value <= high`` in its SI unit, either may be None; or a category."""
+
+
+@fields_of(ErrorSlice)
+class FailureSlice(Reply):
+    """A data slice with a larger score. worst: episode and step of the largest one."""
+
+    conditions: list[SliceCondition]
+
+
+class FailureSlices(Reply):
+    """Data slices in which a score is larger. summary: their number and the searched data, or why there are none."""
+
+    summary: str
+    rows: list[FailureSlice]
+
+
 class FailureScore(Reply):
     """Failures ranked by one score. why_not: why the filter does not have it; the other fields are absent then."""
 
@@ -113,6 +134,7 @@ class FailureScore(Reply):
     counts: dict[str, int] | None = None
     phases: list[PhaseInfo] | None = None
     events: list[FailureEvent] | None = None
+    slices: FailureSlices | None = None
 
 
 @fields_of(by_episode.EpisodeErrors)

@@ -6,6 +6,9 @@
   if (theme === 'light' || theme === 'dark') root.dataset.theme = theme;
   const isClosed = localStorage.getItem('beliefscope.intro') === 'closed';
   root.classList.toggle('first-visit', !location.search && !isClosed);
+  // A part of the header would be centred until the rest has arrived.
+  root.classList.add('incomplete');
+  document.addEventListener('readystatechange', () => root.classList.remove('incomplete'));
   try {
     const sizes = JSON.parse(localStorage.getItem('beliefscope.sizes') ?? '{}');
     for (const [name, share] of Object.entries(sizes))

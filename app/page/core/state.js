@@ -29,7 +29,7 @@ import { displayName } from './units.js';
  * @property {string} options of the diagnostic, URL-encoded: size=21
  * @property {string} over episodes of the diagnosis and of diagnostics: `episode` (the selected one) or `held-out`
  * @property {string} among episodes searched for failures: `held-out` or `all`
- * @property {string} list content of the list of failures: `events` or `episodes`
+ * @property {string} list content of the list of failures: `events`, `episodes` or `slices`
  * @property {string} by score that ranks failures
  * @property {string} phase of the failures in the list, empty for all
  * @property {'likelihood' | 'posterior'} map quantity of the maps
@@ -88,7 +88,7 @@ const CHOICES = {
   track: Object.keys(TRACKS),
   time: ['steps', 'seconds'],
   over: ['episode', 'held-out'],
-  list: ['events', 'episodes'],
+  list: ['events', 'episodes', 'slices'],
   among: ['held-out', 'all'],
   map: MAP_QUANTITIES,
   others: ['auto', 'fixed', 'marginal'],

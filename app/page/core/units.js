@@ -62,6 +62,16 @@ export function sentence(text) {
 }
 
 /**
+ * Sets the numbers of a text of the server: minus signs in place of hyphens, but not in names and ranges; arrows; degrees.
+ * @param {string} text
+ */
+export const typeset = (text) =>
+  text
+    .replace(/(?<![\w).:=-])-(?=\.?\d)/g, '−')
+    .replaceAll(' -> ', ' → ')
+    .replace(/(?<=\d) deg\b/g, '°');
+
+/**
  * Formats a number with fixed digits and a true minus sign; a dash for a missing number.
  * @param {number | null | undefined} value
  * @param {number} [digits]
@@ -106,7 +116,7 @@ export const stepLabel = (step, time) =>
  * @param {number | null | undefined} share
  */
 export const percent = (share) =>
-  Number.isFinite(share) ? `${Math.round(100 * Number(share))} %` : '–';
+  Number.isFinite(share) ? `${fixed(100 * Number(share), 0)} %` : '–';
 
 /**
  * Wraps the difference of two angles to -180..180 degrees.

@@ -4,7 +4,14 @@
 /** @import { Column, Series } from './arrays.js' */
 /** @import { Block, LiveStream } from './live_stream.js' */
 
-import { displayUnit, fixed, mainUnit, stepLabel, wrapDegrees } from '../core/units.js';
+import {
+  displayName,
+  displayUnit,
+  fixed,
+  mainUnit,
+  stepLabel,
+  wrapDegrees,
+} from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
@@ -14,7 +21,7 @@ const MAX_TIME_DIGITS = 4;
  * Returns the label of a modality's estimate: the prior of the fused filter, updated with this modality only.
  * @param {string} modality
  */
-export const updateLabel = (modality) => `${modality}-only update`;
+export const updateLabel = (modality) => `${displayName(modality)}-only update`;
 
 export class Trace {
   /** Source of further steps of a live run. @type {LiveStream | undefined} */

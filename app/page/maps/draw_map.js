@@ -180,10 +180,15 @@ export function drawXAxis(context, x, side, textColour, named) {
   context.lineWidth = 1;
   context.textBaseline = 'top';
   context.beginPath();
+  let free = -Infinity; // px from which there is room for a label
   for (const [text, place, end] of x.ticks) {
     context.textAlign = ALIGN[end];
     context.moveTo(place, side);
     context.lineTo(place, side + 3);
+    const { width } = context.measureText(text);
+    const start = place - (end * width) / 2;
+    if (start < free) continue; // no room for this label
+    free = start + width + scaled(3);
     context.fillText(text, place, side + scaled(5));
   }
   context.stroke();

@@ -6,6 +6,7 @@
 
 import { create, html } from '../core/dom.js';
 import { cssVariable, gradient } from '../core/palette.js';
+import { displayName } from '../core/units.js';
 
 /**
  * @typedef {object} Figure of a layer
@@ -27,7 +28,7 @@ import { cssVariable, gradient } from '../core/palette.js';
  * @returns {Figure}
  */
 export function createFigure(name, fuses) {
-  const label = fuses || name !== 'fused' ? name.replaceAll('+', ' + ') : 'estimate';
+  const label = fuses || name !== 'fused' ? displayName(name).replaceAll('+', ' + ') : 'estimate';
   const shape = create('span', { className: 'shape' });
   const head = create('div', { className: 'head' }, create('h3', { textContent: label }), shape);
   const canvas = create('canvas', { role: 'img', tabIndex: 0 });

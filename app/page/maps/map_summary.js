@@ -173,7 +173,7 @@ export function tilesScale(quantity, scale, range, shade) {
   const [low, high] = rangeLabels(shade, 0);
   const peak = range === 'same' ? "the step's highest peak" : 'each peak';
   const log = scale === 'log';
-  const label = log ? `log ${quantity} below ${peak}, nats` : `${quantity} relative to ${peak}`;
+  const label = log ? `log ${quantity} below ${peak}, nats` : `of ${peak}`;
   return { low, high, label };
 }
 

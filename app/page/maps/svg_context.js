@@ -75,6 +75,16 @@ export class SvgContext {
     );
   }
 
+  /**
+   * Estimates the width of a text of digits from the size of the font.
+   * @param {string} text
+   */
+  measureText(text) {
+    return {
+      width: 0.6 * (parseFloat(this.font.match(/[\d.]+(?=px)/)?.[0] ?? '') || 10) * text.length,
+    };
+  }
+
   /** @param {number[]} dash */
   setLineDash(dash) {
     this.#dash = dash;

@@ -3,7 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Diagnosis } from '../types/server.js' */
 
-import { fixed, percent, sentence, withUnit } from '../core/units.js';
+import { fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { stepSummary } from './step_summary.js';
 
@@ -49,7 +49,7 @@ function faultFinding({ state, masked, headline, causes }) {
   return {
     tone: state === 'fault' && !masked ? 'bad' : 'warn',
     headline: sentence(headline),
-    evidence: evidence.map(({ text }) => sentence(text)).join(' '),
+    evidence: typeset(evidence.map(({ text }) => sentence(text)).join(' ')),
     step,
   };
 }

@@ -34,7 +34,7 @@ export function stepSummary(trace, step, component) {
         trace.weightWidth > 1 ? ` in ${displayName(trace.components[component].name)}` : '';
       const reasons = [uninformative, better].filter(Boolean).join(' and ');
       sentences.push(
-        `Dominated by ${dominant.name} (${percent(dominant.weight)}${scope})${reasons && `, although ${reasons}`}.`,
+        `Dominated by ${displayName(dominant.name)} (${percent(dominant.weight)}${scope})${reasons && `, although ${reasons}`}.`,
       );
     }
   }

@@ -6,7 +6,7 @@
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { element, html, isAbort, messageOf } from '../core/dom.js';
-import { percent } from '../core/units.js';
+import { percent, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
 import { setPanelState } from '../widgets/panel_state.js';
@@ -152,7 +152,7 @@ export class ComparisonTab {
 
   /** @param {Comparison | null} result */
   #show(result) {
-    html('.verdict', this.#result).textContent = result?.verdict ?? '';
+    html('.verdict', this.#result).textContent = typeset(result?.verdict ?? '');
     this.#figures.show(result, this.#trace);
     if (this.#open) this.#figures.move(this.#store.state.step);
   }

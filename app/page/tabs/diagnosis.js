@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, html } from '../core/dom.js';
-import { fixed, percent, sentence, stepLabel } from '../core/units.js';
+import { fixed, percent, sentence, stepLabel, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
@@ -162,7 +162,7 @@ export class Diagnosis {
   #row(cause, isFirst) {
     const { probability, recovered, evidence, steps } = cause;
     const bar = create('meter', { min: 0, max: 1, value: probability });
-    bar.setAttribute('aria-label', `Probability of ${cause.cause}`);
+    bar.setAttribute('aria-label', `Probability of ${cause.title}`);
     const where = [`${plural('episode', cause.episodes)} ${cause.episodes.join(', ')}`];
     if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
     /** @type {HTMLElement[]} */
@@ -176,7 +176,7 @@ export class Diagnosis {
     return create(
       'li',
       {},
-      create('h4', { textContent: cause.cause }),
+      create('h4', { textContent: cause.title, title: cause.cause }),
       bar,
       create('output', { textContent: `probability ${probability.toFixed(2)}` }),
       create('div', { className: 'details' }, ...lines),
@@ -185,7 +185,7 @@ export class Diagnosis {
 
   /** @param {DiagnosisEvidence} evidence */
   #evidence({ text, episode, step, time }) {
-    const item = create('li', { textContent: sentence(text) });
+    const item = create('li', { textContent: typeset(sentence(text)) });
     if (episode === null) return item;
     const label =
       step === null ? `episode ${episode}` : `episode ${episode}, ${stepLabel(step, time)}`;

@@ -7,7 +7,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, element, html, isAbort, messageOf } from '../core/dom.js';
-import { sentence } from '../core/units.js';
+import { sentence, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
@@ -310,7 +310,7 @@ export class Diagnostics {
   #drawState(host, entry, result) {
     const verdict = html('.verdict', host);
     const { state } = result;
-    const text = summary(result);
+    const text = typeset(summary(result));
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
     host.dataset.state = state;
     host.setAttribute('aria-busy', String(state === 'loading' || state === 'active'));

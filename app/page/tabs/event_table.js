@@ -4,7 +4,7 @@
 
 import { copyText } from '../core/clipboard.js';
 import { create, element } from '../core/dom.js';
-import { fixed, percent, significant, stepLabel, withUnit } from '../core/units.js';
+import { displayName, fixed, percent, significant, stepLabel, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { formatScore, scoreUnit } from './failure_scores.js';
@@ -220,5 +220,5 @@ function eventColumns({ layers, scores }, score, events) {
 function dominantModality(modalities, { effective_weights: weights }) {
   const values = (weights ?? []).map(Number);
   const largest = values.indexOf(Math.max(...values));
-  return `${modalities[largest]} ${percent(values[largest])}`;
+  return `${displayName(modalities[largest])} ${percent(values[largest])}`;
 }

@@ -7,6 +7,7 @@ import { create, element, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { displayName, fixed, sentence, significant } from '../core/units.js';
 import * as api from '../data/api.js';
+import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
@@ -23,9 +24,19 @@ import {
 } from './experiment_rows.js';
 import { drawScatter, seriesOf } from './scatter.js';
 
-const EMPTY =
-  'No sweep yet. Run many checkpoints over many episodes, then serve the results: ' +
-  "beliefscope sweep --checkpoints 'runs/*.safetensors' -o sweep, and beliefscope serve --sweep sweep";
+const EMPTY = {
+  title: 'No sweep yet',
+  paragraphs: [
+    [
+      'A sweep runs many checkpoints over many episodes. Its table answers which of them fail, where and under which sensor faults; each row opens its worst moment.',
+    ],
+  ],
+  purpose: 'To make one, run your checkpoints and serve the results.',
+  commands: [
+    "beliefscope sweep --checkpoints 'runs/*.safetensors' -o sweep",
+    'beliefscope serve --sweep sweep',
+  ],
+};
 const EPISODES = 50; // listed for a checkpoint, the worst first
 
 const BODY = `
@@ -145,7 +156,11 @@ export class Experiments {
       this.#sweeps = sweeps;
       html('.problems', this.#host).textContent = problems.map(sentence).join(' ');
       const sweep = this.#sweep;
-      if (!sweep) return setPanelState(this.#host, 'empty', EMPTY);
+      if (!sweep) {
+        setPanelState(this.#host, 'empty');
+        html('.note', this.#host).replaceChildren(...emptyNote(EMPTY));
+        return;
+      }
       const wanted = `${sweep.name} ${this.#steps}`;
       const { rows, count } = await api.experiments(sweep.name, this.#steps);
       if (wanted !== `${this.#sweep?.name} ${this.#steps}`) return; // another choice was made meanwhile

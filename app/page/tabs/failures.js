@@ -1,4 +1,4 @@
-/** The Failures tab: a ranked list of failure events over a data set, or a table of its episodes. The search is a job. */
+/** The Failures tab: failure events over a data set, its episodes, or slices with larger errors. The search is a job. */
 
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
@@ -16,11 +16,13 @@ import { choice } from '../widgets/pickers.js';
 import { Episodes } from './episodes.js';
 import { EventTable } from './event_table.js';
 import { formatScore, scoreName, viewOf } from './failure_scores.js';
+import { SliceTable } from './slice_table.js';
 
 /** @type {[string, string][]} */
 const LISTS = [
   ['events', 'Events'],
   ['episodes', 'Episodes'],
+  ['slices', 'Slices'],
 ];
 /** @type {[string, string][]} */
 const AMONG = [
@@ -34,6 +36,8 @@ const ACTIONS = {
   error: 'Try again',
   active: 'Cancel',
 };
+const SLICES_NOTE =
+  'A slice is a condition, or two, under which the score is larger, tested over episodes. A click opens its worst step.';
 const MAX_RESULTS = 8; // in the cache
 
 /**
@@ -47,6 +51,7 @@ export class Failures {
   #timeline;
   #episodes;
   #table;
+  #slices;
   /** @type {Trace | null} */
   #trace = null;
   /** @type {JobResults<Search>} */
@@ -70,6 +75,9 @@ export class Failures {
     this.#episodes = new Episodes(element('.episodes', HTMLTableElement, host), store, catalog);
     this.#table = new EventTable(element('.events', HTMLTableElement, host), (event, time) =>
       this.#open(event, time),
+    );
+    this.#slices = new SliceTable(element('.slices', HTMLTableElement, host), (worst, time) =>
+      this.#open(worst, time),
     );
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
       finished.includes(this.#key) ? this.load() : this.draw(),
@@ -95,7 +103,9 @@ export class Failures {
     const isCurrent = (event) => event.episode === episode && event.step === step;
     const index = this.#events.findIndex(isCurrent);
     if (index >= 0) this.#last = index;
-    if (!this.#host.hidden) this.#table.mark(isCurrent);
+    if (this.#host.hidden) return;
+    this.#table.mark(isCurrent);
+    this.#slices.mark(episode, step);
   }
 
   /** Loads the result for the current selection. */
@@ -152,8 +162,7 @@ export class Failures {
     const set = (key) => (/** @type {string} */ value) => this.#store.set({ [key]: value });
     choice(html('#list', this.#host), LISTS, state.list, set('list'));
     choice(html('#among', this.#host), this.#isLive ? [] : AMONG, state.among, set('among'));
-    html('.events', this.#host).hidden = state.list !== 'events';
-    html('.episodes', this.#host).hidden = state.list !== 'episodes';
+    for (const [name] of LISTS) html(`.${name}`, this.#host).hidden = state.list !== name;
     this.#host.dataset.state = result.state;
     this.#host.ariaBusy = String(result.state === 'loading' || result.state === 'active');
     showJobButton(html('.doing', this.#host), result, {
@@ -163,10 +172,11 @@ export class Failures {
       next: html('.scroll', this.#host),
     });
     this.#drawScores(failures?.scores ?? []);
-    const text = score ? scoreSummary(score) : statusText(result);
+    const text = score ? scoreSummary(score, state.list) : statusText(result);
     const verdict = html('.verdict', this.#host);
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
     this.#drawPhases(score);
+    this.#slices.show(score, failures?.episodes.length ?? 0);
     this.#drawTable(failures, score);
     this.#episodes.show(failures ?? null, score && !score.why_not ? score : null);
   }
@@ -272,12 +282,14 @@ export class Failures {
     }
     const total = this.#phase?.events ?? score?.total ?? 0;
     const limit = `${events.length} of ${total} listed: those among the worst ${score?.events?.length} of all phases.`;
-    html('.rest', this.#host).textContent = events.length < total ? limit : '';
-    this.move(this.#store.state.step);
+    const { list, step } = this.#store.state;
+    const notes = { events: events.length < total ? limit : '', slices: score ? SLICES_NOTE : '' };
+    html('.rest', this.#host).textContent = notes[/** @type {keyof notes} */ (list)] ?? '';
+    this.move(step);
   }
 
   /**
-   * @param {FailureEvent} event
+   * @param {{episode: number, step: number}} event
    * @param {number | null} inputTime
    */
   #open({ episode, step }, inputTime) {
@@ -301,9 +313,14 @@ export class Failures {
   }
 }
 
-/** @param {FailureScore} score */
-const scoreSummary = (score) =>
-  score.why_not ? `No ${scoreName(score)}: ${score.why_not}.` : (score.verdict ?? '');
+/**
+ * @param {FailureScore} score
+ * @param {string} list
+ */
+function scoreSummary(score, list) {
+  if (score.why_not) return `No ${scoreName(score)}: ${score.why_not}.`;
+  return (list === 'slices' ? score.slices?.summary : score.verdict) ?? '';
+}
 
 /** @param {Result} result */
 function statusText(result) {

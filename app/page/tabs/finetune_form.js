@@ -6,7 +6,7 @@
 
 import { CLEAN_WEIGHT } from '../core/constants.js';
 import { create, element, html } from '../core/dom.js';
-import { displayName } from '../core/units.js';
+import { displayName, typeset } from '../core/units.js';
 import { checkSelection } from '../data/api.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { ModuleDiagram } from './module_diagram.js';
@@ -216,7 +216,7 @@ export class FinetuneForm {
       'div',
       { className: 'item' },
       create('label', {}, input, create('strong', { textContent: title })),
-      create('p', { textContent: evidence }),
+      create('p', { textContent: typeset(evidence) }),
     );
     if (episode !== null) {
       const textContent = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;

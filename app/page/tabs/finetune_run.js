@@ -12,11 +12,12 @@ import {
   percent,
   significant,
   withUnit,
+  typeset,
 } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { trainingData } from './finetune_form.js';
-import { changeText, changes, criterionSlice } from './finetune_runs.js';
+import { changeText, changes, criterionSlice, criterionText, limits } from './finetune_runs.js';
 
 /** @typedef {'promote' | 'save' | 'discard'} Decision */
 
@@ -123,7 +124,7 @@ export class FinetuneRun {
 
   /** @param {string} text */
   showVerdict(text) {
-    html('.verdict', this.#host).textContent = text;
+    html('.verdict', this.#host).textContent = typeset(text);
   }
 
   /** @param {FineTuneDetails} run */
@@ -215,18 +216,7 @@ function stateText(job) {
 function statement(text, success) {
   if (!text) return 'This run has no success criterion.';
   if (success) return `Criterion: ${success.statement}`;
-  const { by, others } = limits(text);
-  const [slice] = text.split(':');
-  return `Criterion: ${slice} at least ${by} % better, no other slice more than ${others} % worse.`;
-}
-
-/**
- * Returns the limits of a criterion in percent.
- * @param {string} text
- */
-function limits(text) {
-  const value = (/** @type {string} */ key) => text.match(`:${key}=([\\d.e+-]+)`)?.[1];
-  return { by: Number(value('by') ?? 10), others: Number(value('others') ?? 5) };
+  return `Criterion: ${criterionText(text)}.`;
 }
 
 /**

@@ -90,7 +90,7 @@ export class FinetuneRuns {
       run.filter,
       settings.train.join(', '),
       trainingData(run),
-      settings.success ?? '–',
+      settings.success ? criterionText(settings.success) : '–',
       success?.outcome ?? state,
       target ? changeText(target) : '',
       worst ? `${worst.slice} ${changeText(worst)}` : '',
@@ -141,6 +141,25 @@ function overlay(runs, names, base, key, quantity) {
  * @param {FineTuneSettings} settings
  */
 export const criterionSlice = ({ success }) => (success ?? '').split(':')[0];
+
+/**
+ * Returns the limits of a criterion in percent.
+ * @param {string} text
+ */
+export function limits(text) {
+  const value = (/** @type {string} */ key) => text.match(`:${key}=([\\d.e+-]+)`)?.[1];
+  return { by: Number(value('by') ?? 10), others: Number(value('others') ?? 5) };
+}
+
+/**
+ * Describes a criterion: image noisy at least 10 % better, others at most 5 % worse.
+ * @param {string} text
+ */
+export function criterionText(text) {
+  const { by, others } = limits(text);
+  const [slice] = text.split(':');
+  return `${slice} at least ${by} % better, others at most ${others} % worse`;
+}
 
 /**
  * Returns the change of the error in a slice since the first validation, in percent.

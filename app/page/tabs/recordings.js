@@ -198,7 +198,8 @@ export class Recordings {
     const used = reports.reports.reduce((sum, { bytes }) => sum + bytes, recordings.bytes);
     html('.summary', this.#host).textContent =
       `${count} · ${formatBytes(used)} used, ${formatBytes(recordings.free)} free`;
-    const hint = all.length ? 'No recording matches all words.' : NO_RECORDINGS;
+    const none = this.#catalog.read_only ? 'No recordings.' : NO_RECORDINGS;
+    const hint = all.length ? 'No recording matches all words.' : none;
     html('.rest', this.#host).textContent = matches.length ? '' : hint;
     this.#trash.show([
       ...recordings.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('recordings') })),

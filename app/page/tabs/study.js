@@ -16,6 +16,7 @@ import { BarChart } from '../widgets/bar_chart.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
+import { missingStudy } from './missing_study.js';
 import { blackoutLabel, failuresOf, startLabel, studyQuantities } from './study_quantities.js';
 import { StudyTable } from './study_table.js';
 
@@ -139,10 +140,9 @@ export class Study {
     const results = study.tasks.find(({ name }) => name === state.task);
     const task = this.#catalog.tasks.find(({ name }) => name === state.task);
     if (!results || !task) {
-      const tasks = study.tasks.map(({ name }) => name).join(', ');
-      const hint = `Select another task${this.#studies.length > 1 ? ' or study' : ''}.`;
-      const text = `This study does not contain task ${state.task}. It contains ${tasks}. ${hint}`;
-      setPanelState(this.#host, 'empty', text);
+      setPanelState(this.#host, 'empty');
+      const note = html('.note', this.#host);
+      note.replaceChildren(...missingStudy(study, this.#catalog, this.#store));
       return;
     }
     const quantities = studyQuantities(results.rows, task);

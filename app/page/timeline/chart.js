@@ -4,6 +4,7 @@
 
 import { context2d } from '../core/dom.js';
 import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
+import { typeset } from '../core/units.js';
 import { drawStack } from './stack.js';
 import { STEPS } from './step_axis.js';
 
@@ -181,7 +182,7 @@ export function chartData({ series }, steps, axis = STEPS) {
  */
 function valueAxis({ log, note }, { grid, ticks }) {
   if (note) return { values: (_, splits) => splits.map(() => '') };
-  if (!log) return {};
+  if (!log) return { values: tickLabels };
   /** @type {uPlot.Axis.Filter} */
   const filter = (_, splits) =>
     splits.map((v) => {
@@ -195,6 +196,14 @@ function valueAxis({ log, note }, { grid, ticks }) {
     values: (_, splits) => splits.map((v) => (v ? String(Number(v.toPrecision(1))) : '')),
   };
 }
+
+/**
+ * Labels of ticks, with true minus signs.
+ * @param {uPlot} _
+ * @param {number[]} splits
+ */
+export const tickLabels = (_, splits) =>
+  splits.map((value) => (value === null ? '' : typeset(String(Number(value.toPrecision(6))))));
 
 /**
  * Returns the step axis. Only the lowest chart has its numbers; the others have the same grid. (uPlot draws no axis after a hidden one.)
@@ -294,10 +303,11 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
     const bottom = bbox.top + bbox.height - strip;
     shade(contact, colour('contact'), strip, bottom);
     labelIntervals(plot, axis, contact, shading.label ?? '', bottom, colour('surface'), null);
-    shade(blackout, hatching(ctx), strip);
-    labelIntervals(plot, axis, blackout, 'no image', bbox.top, colour('ink'), colour('surface'));
+    const below = bbox.top + (faulty.length ? line : 0);
+    shade(blackout, hatching(ctx), strip, below);
+    labelIntervals(plot, axis, blackout, 'no image', below, colour('ink'), colour('surface'));
     shade(faulty, colour('bad'), line);
-    const top = bbox.top + (blackout.length ? strip : 0);
+    const top = below + (blackout.length ? strip : 0);
     const { faultLabel = '' } = shading;
     labelIntervals(plot, axis, faulty, faultLabel, top, colour('bad'), colour('surface'));
   } else {

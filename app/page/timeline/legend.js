@@ -5,7 +5,7 @@
 
 import { create } from '../core/dom.js';
 import { cssVariable, lineSample } from '../core/palette.js';
-import { fixed, significant } from '../core/units.js';
+import { displayName, fixed, significant } from '../core/units.js';
 import { seriesStyle } from './chart.js';
 import { areaSample } from './stack.js';
 
@@ -36,8 +36,9 @@ export function legend(track, trace, compared, compact) {
     const sample = first.stacked
       ? areaSample(name, index)
       : lineSample(cssVariable(name), dash, width);
-    const label = track.ofModalities ? name : trace.label(name);
-    list.append(create('dt', { title: label }, sample, compact && trace.fuses ? name : label));
+    const short = displayName(name);
+    const label = track.ofModalities ? short : trace.label(name);
+    list.append(create('dt', { title: label }, sample, compact && trace.fuses ? short : label));
     for (const comparison of compared ? [false, true] : [false]) {
       const text = new Text();
       const index = series.findIndex(

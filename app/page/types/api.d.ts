@@ -172,11 +172,15 @@ export interface components {
         };
         /**
          * DiagnosisCause
-         * @description A ranked cause. steps: first affected step, and first step after it; None for complete episodes.
+         * @description A ranked cause. cause: its name in the catalog. title: in words.
+         *
+         *     steps: first affected step, and first step after it; None for complete episodes.
          */
         DiagnosisCause: {
             /** Cause */
             cause: string;
+            /** Title */
+            title: string;
             /** Component */
             component: string;
             /** Probability */
@@ -531,6 +535,48 @@ export interface components {
             phases?: components["schemas"]["PhaseInfo"][] | null;
             /** Events */
             events?: components["schemas"]["FailureEvent"][] | null;
+            slices?: components["schemas"]["FailureSlices"] | null;
+        };
+        /**
+         * FailureSlice
+         * @description A data slice with a larger score. worst: episode and step of the largest one.
+         */
+        FailureSlice: {
+            /** Conditions */
+            conditions: components["schemas"]["SliceCondition"][];
+            /** Inside */
+            inside: number | null;
+            /** Outside */
+            outside: number | null;
+            /** Ratio */
+            ratio: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Episodes */
+            episodes: number[];
+            /** Worst */
+            worst: [
+                number,
+                number
+            ];
+            /** Steps */
+            steps: number;
+            /** Share */
+            share: number | null;
+            /** P Value */
+            p_value: number | null;
+        };
+        /**
+         * FailureSlices
+         * @description Data slices in which a score is larger. summary: their number and the searched data, or why there are none.
+         */
+        FailureSlices: {
+            /** Summary */
+            summary: string;
+            /** Rows */
+            rows: components["schemas"]["FailureSlice"][];
         };
         /**
          * Failures
@@ -1619,6 +1665,22 @@ export interface components {
             outcome: "met" | "not met" | "inconclusive";
         };
         /**
+         * SliceCondition
+         * @description Values of a covariate: ``low < value <= high`` in its SI unit, either may be None; or a category.
+         */
+        SliceCondition: {
+            /** Covariate */
+            covariate: string;
+            /** Unit */
+            unit: string;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Category */
+            category: string | null;
+        };
+        /**
          * SliceInfo
          * @description A slice of a data set (``filters.finetuning.slices``).
          */
@@ -2010,6 +2072,8 @@ export type ExperimentRow = components['schemas']['ExperimentRow'];
 export type Experiments = components['schemas']['Experiments'];
 export type FailureEvent = components['schemas']['FailureEvent'];
 export type FailureScore = components['schemas']['FailureScore'];
+export type FailureSlice = components['schemas']['FailureSlice'];
+export type FailureSlices = components['schemas']['FailureSlices'];
 export type Failures = components['schemas']['Failures'];
 export type FaultInfo = components['schemas']['FaultInfo'];
 export type FaultParameter = components['schemas']['FaultParameter'];
@@ -2058,6 +2122,7 @@ export type ResultViews = components['schemas']['ResultViews'];
 export type Row = components['schemas']['Row'];
 export type RunNames = components['schemas']['RunNames'];
 export type SliceChangeInfo = components['schemas']['SliceChangeInfo'];
+export type SliceCondition = components['schemas']['SliceCondition'];
 export type SliceInfo = components['schemas']['SliceInfo'];
 export type SmallestRepair = components['schemas']['SmallestRepair'];
 export type StudyFilter = components['schemas']['StudyFilter'];

@@ -98,6 +98,6 @@ export class FindingBar {
     this.#step = step;
     const moment = html('.moment', this.#host);
     moment.classList.toggle('none', step === null);
-    moment.textContent = `Step ${step ?? ''}`;
+    moment.textContent = `Go to step ${step ?? ''}`;
   }
 }

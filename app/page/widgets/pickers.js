@@ -154,7 +154,7 @@ const swapped = (state, key, value) =>
  * @param {Task} task
  * @param {State} state
  */
-function firstRun(task, state) {
+export function firstRun(task, state) {
   const [{ name: data, first, first_step: step }] = task.data;
   const hasFaults = task.fault_presets.some(({ faults }) => faults === state.faults);
   return {

@@ -12,7 +12,7 @@ import {
   scaled,
 } from '../core/palette.js';
 import { displayName, significant } from '../core/units.js';
-import { FONT, LABEL } from '../timeline/chart.js';
+import { FONT, LABEL, tickLabels } from '../timeline/chart.js';
 
 /** @typedef {[low: number, high: number]} Range */
 /** @typedef {{property: string, stroke: string, dash: number[], width: number}} LineStyle */
@@ -183,6 +183,7 @@ export function axisStyle() {
     grid: { stroke: colour('grid'), width: 1 },
     ticks: { stroke: colour('grid'), size: 4, width: 1 },
     font: FONT,
+    values: tickLabels,
   };
 }
 

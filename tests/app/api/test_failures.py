@@ -15,8 +15,12 @@ from beliefscope.app.jobs.failures import failure_document
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.failures.survey import survey_of
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.survey_json import MAX_EVENTS
+from beliefscope.inspect.slices.report import find_slices
+from beliefscope.inspect.traces.batch import trace_all
 
 pytestmark = pytest.mark.slow
 
@@ -25,10 +29,10 @@ URL = "/api/failures/door/crossmodal-ekf"
 FAULTS = "blackout=0.5"
 
 
-def wait_for_failures(client: TestClient, **query: str) -> Any:
+def wait_for_failures(client: TestClient, url: str = URL, **query: str) -> Any:
     """The result when the job is done."""
     end = time.monotonic() + TIMEOUT
-    while (answer := client.get(URL, params=query)).status_code == 202:
+    while (answer := client.get(url, params=query)).status_code == 202:
         assert answer.json()["job"]["state"] in ("waiting", "running"), answer.json()
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -54,16 +58,18 @@ def test_survey_is_a_job_and_stores_no_traces(
     assert not (settings.workspace / "traces").exists()
 
     store = TraceStore(settings)
-    survey = survey_of(
+    traces = trace_all(
         store.checkpoint("door", "crossmodal-ekf"),
         store.dataset("door", "")[1],
         [0, 1],
         faults=Faults.parse(FAULTS),
         particles=settings.particles,
     )
-    store.close()
     selection = {"filter": "crossmodal-ekf", "data": "mine", "faults": FAULTS, "among": "all"}
-    assert result == json.loads(json.dumps(failure_document(survey, selection)))
+    assert result == json.loads(json.dumps(failure_document(traces, selection)))
+    store.close()
+    few = "Slices were not searched: 2 episodes; a search for slices needs at least 8."
+    assert result["scores"][0]["slices"] == {"summary": few, "rows": []}
     assert [(e["index"], e["steps"]) for e in result["episodes"]] == [(0, steps), (1, steps)]
     with open_client(settings) as client:  # another server on the same workspace
         assert client.get(URL, params=query).json() == result
@@ -91,6 +97,22 @@ def test_every_score_is_ranked_or_has_a_reason(client: TestClient) -> None:
             assert event["first"] <= event["step"] <= event["last"]
             if name == "error":
                 assert event["value"] == event["error"][result["layers"].index("fused")]
+
+
+def test_slices_are_those_of_the_command(client: TestClient) -> None:
+    url = "/api/failures/push-field/information-ekf"
+    client.post(url)
+    result = wait_for_failures(client, url)
+    (score,) = (score for score in result["scores"] if score["name"] == "error")
+    with open_dataset(sample_path("push-field")) as data:
+        report = find_slices(load_checkpoint(shipped("push-field", "information-ekf")), data, data.held_out())
+    assert report.slices
+    assert score["slices"]["summary"] == report.summary
+    rows = score["slices"]["rows"]
+    assert [row["conditions"] for row in rows] == [as_json(slice_.conditions) for slice_ in report.slices]
+    for row, slice_ in zip(rows, report.slices, strict=True):
+        assert row["ratio"] == pytest.approx(slice_.ratio)
+        assert (tuple(row["worst"]), row["steps"]) == (slice_.worst, slice_.steps)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_a_biased_module_is_named_and_its_error_recovered() -> None:
     assert first.recovered.low > 0.3
     document = result.to_json()
     assert set(document["causes"][0]) == {
-        *("cause", "component", "probability", "episodes", "steps", "evidence", "recovered", "next")
+        *("cause", "title", "component", "probability", "episodes", "steps", "evidence", "recovered", "next")
     }
     listed = [cause["probability"] for cause in document["causes"]]
     assert listed == sorted(listed, reverse=True)

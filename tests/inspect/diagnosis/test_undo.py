@@ -22,7 +22,7 @@ from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood,
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
-from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, undo
+from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, brings_back, undo
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -171,6 +171,15 @@ def test_few_particles_become_as_many_as_in_the_record(own: int, expected: int |
     known = Deviation("particles//all", float(own), 300.0, 300.0, 300.0, 0.0, True, -10.0)
     changed = undo("healthy particles", run, {known.statistic: known})
     assert (None if changed is None else changed.particles) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("restore equations", True), ("shift image", True), ("drop image", False), ("restore haptics", False)],
+)
+def test_only_some_interventions_bring_back_what_was_healthy(name: str, expected: bool) -> None:
+    assert brings_back(name) is expected
+    assert brings_back("restore haptics", checkpoint("crossmodal-ekf"))
 
 
 def test_the_last_modality_is_not_dropped() -> None:

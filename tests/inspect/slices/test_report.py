@@ -81,6 +81,10 @@ def test_a_planted_slice_in_words(traces: list[Trace]) -> None:
     assert slice_.inside == pytest.approx(error[heavy_ones].mean())
     assert slice_.ratio == pytest.approx(error[heavy_ones].mean() / np.delete(error, heavy_ones).mean())
     assert slice_.low < slice_.ratio < slice_.high
+    episode, step = slice_.worst
+    assert measures.main_error(planted[episode])[step, -1] == max(
+        measures.main_error(planted[i])[measures.counted(planted[i]), -1].max() for i in heavy_ones
+    )
     sentence = report.sentence(slice_)
     assert sentence.startswith(f"Position error is {slice_.ratio:.2g} x larger (")
     assert sentence.endswith("where heavy load: 10 of 24 episodes, 42 % of steps.")

@@ -1,0 +1,56 @@
+/** What the Study tab shows for a task that no study contains: where there are results, and how to make some. */
+
+/** @import { Store } from '../core/state.js' */
+/** @import { Catalog, StudyInfo } from '../types/server.js' */
+
+import { create } from '../core/dom.js';
+import { emptyNote } from '../widgets/empty_note.js';
+import { firstRun } from '../widgets/pickers.js';
+
+const SINGLE = ['image', 'haptics']; // modalities with a filter of their own
+const ABOUT =
+  'A study trains several filters with several seeds and compares their errors, so that differences between filters are not those of one training.';
+
+/**
+ * Returns the elements of the note.
+ * @param {StudyInfo} study the selected one
+ * @param {Catalog} catalog
+ * @param {Store} store
+ */
+export function missingStudy(study, catalog, store) {
+  const { task: name } = store.state;
+  const selected = catalog.tasks.find((task) => task.name === name);
+  const buttons = catalog.tasks
+    .filter((task) => study.tasks.some((other) => other.name === task.name))
+    .map((task) => {
+      const textContent = `Show ${task.name}`;
+      const button = create('button', { type: 'button', className: 'text', textContent });
+      button.addEventListener('click', () => store.set(firstRun(task, store.state)));
+      return button;
+    });
+  const source = study.name === 'shipped' ? 'included study' : `study ${study.name}`;
+  return emptyNote({
+    title: `No study of ${name} yet`,
+    paragraphs: [
+      [ABOUT],
+      ...(buttons.length ? [[`The ${source} has results for `, ...buttons]] : []),
+    ],
+    purpose: `To make one, collect data of ${name}, train, and serve the results.`,
+    commands: studyCommands(name, selected?.modalities ?? []),
+  });
+}
+
+/**
+ * Commands that make a study of a task: the crossmodal filter beside those of one modality.
+ * @param {string} task
+ * @param {readonly string[]} modalities
+ */
+export function studyCommands(task, modalities) {
+  const single = modalities.filter((name) => SINGLE.includes(name));
+  const filters = ['crossmodal', ...single].map((name) => ` --filter ${name}-ekf`).join('');
+  return [
+    `beliefscope collect ${task} --episodes 300 -o ${task}.h5`,
+    `beliefscope study --task ${task} --data ${task}=${task}.h5${filters} -o study`,
+    'beliefscope serve --study study',
+  ];
+}

@@ -1,0 +1,165 @@
+/** Table of data slices in which a score is larger; each row opens the worst step of its slice. */
+
+/** @import { FailureScore, FailureSlice, SliceCondition } from '../types/server.js' */
+
+import { create, element } from '../core/dom.js';
+import { percent, sentence, significant, withUnit } from '../core/units.js';
+import { navigateRows } from '../widgets/row_navigation.js';
+import { markRow } from './event_table.js';
+import { scoreUnit } from './failure_scores.js';
+
+/** Units of the page for those of covariates. @type {Record<string, {unit: string, scale: number}>} */
+const UNITS = {
+  m: { unit: 'cm', scale: 100 },
+  'm/s': { unit: 'cm/s', scale: 100 },
+  rad: { unit: '°', scale: 180 / Math.PI },
+  'rad/s': { unit: '°/s', scale: 180 / Math.PI },
+};
+
+/** @typedef {{slice: FailureSlice, row: HTMLTableRowElement, button: HTMLButtonElement}} SliceRow */
+
+export class SliceTable {
+  #table;
+  #open;
+  /** @type {FailureScore | undefined} */
+  #score;
+  /** @type {SliceRow[]} */
+  #rows = [];
+
+  /**
+   * @param {HTMLTableElement} table
+   * @param {(step: {episode: number, step: number}, inputTime: number) => void} open
+   */
+  constructor(table, open) {
+    this.#table = table;
+    this.#open = open;
+    navigateRows(element('tbody', HTMLTableSectionElement, table));
+  }
+
+  /**
+   * @param {FailureScore | undefined} score
+   * @param {number} episodes number of searched episodes
+   */
+  show(score, episodes) {
+    if (score === this.#score) return;
+    this.#score = score;
+    const slices = score?.slices?.rows ?? [];
+    const headings = score && slices.length ? headingsOf(score) : [];
+    const head = headings.map(([textContent, title, className]) =>
+      create('th', { scope: 'col', textContent, title, className }),
+    );
+    element('thead', HTMLTableSectionElement, this.#table).replaceChildren(
+      create('tr', {}, ...head),
+    );
+    this.#rows = score ? slices.map((slice, i) => this.#row(slice, score, episodes, i)) : [];
+    element('tbody', HTMLTableSectionElement, this.#table).replaceChildren(
+      ...this.#rows.map(({ row }) => row),
+    );
+  }
+
+  /**
+   * Highlights the slices whose worst step is at the cursor.
+   * @param {number} episode
+   * @param {number} step
+   */
+  mark(episode, step) {
+    for (const { slice, row, button } of this.#rows)
+      markRow(row, button, slice.worst[0] === episode && slice.worst[1] === step);
+  }
+
+  /**
+   * @param {FailureSlice} slice
+   * @param {FailureScore} score
+   * @param {number} count of searched episodes
+   * @param {number} i place in the table
+   * @returns {SliceRow}
+   */
+  #row(slice, score, count, i) {
+    const { scale } = scoreUnit(score);
+    const { inside, outside, episodes, steps, share, worst } = slice;
+    const [episode, step] = worst;
+    const row = document.createElement('tr');
+    const button = create('button', {
+      type: 'button',
+      className: 'title',
+      textContent: sliceText(slice),
+      title: `Open the worst step: episode ${episode}, step ${step}`,
+      ariaLabel: `${sliceSentence(slice, score, count)} Worst: episode ${episode}, step ${step}`,
+      tabIndex: i ? -1 : 0,
+    });
+    button.addEventListener('click', ({ timeStamp }) => this.#open({ episode, step }, timeStamp));
+    row.insertCell().append(button);
+    const texts = [
+      significant(inside && scale * inside),
+      significant(outside && scale * outside),
+      ratioText(slice),
+      `${episodes.length} of ${count}`,
+      `${steps} (${percent(share)})`,
+    ];
+    for (const text of texts) row.append(create('td', { className: 'number', textContent: text }));
+    return { slice, row, button };
+  }
+}
+
+/**
+ * Title, explanation and class of each column.
+ * @param {FailureScore} score
+ */
+function headingsOf(score) {
+  const { unit } = scoreUnit(score);
+  return [
+    ['slice', 'Steps that meet these conditions', ''],
+    [withUnit('inside', unit), `Mean ${score.title} over the steps of the slice`, 'number'],
+    [withUnit('outside', unit), `Mean ${score.title} over all other steps`, 'number'],
+    ['ratio', 'Ratio of the means with its 95 % interval over episodes', 'number'],
+    ['episodes', 'Episodes with steps in the slice', 'number'],
+    ['steps', 'Number of steps, and share of all steps', 'number'],
+  ];
+}
+
+/**
+ * Describes a slice, its effect and its size: Position error is 1.5 × larger (1.3 to 1.7) where blackout: ...
+ * @param {FailureSlice} slice
+ * @param {FailureScore} score
+ * @param {number} count of searched episodes
+ */
+export function sliceSentence(slice, score, count) {
+  const { ratio, low, high, episodes, share } = slice;
+  const interval = low === null || high === null ? '' : ` (${factor(low)} to ${factor(high)})`;
+  const size = `${episodes.length} of ${count} episodes, ${percent(share)} of steps`;
+  const where = slice.conditions.map(conditionText).join(' and ');
+  return sentence(`${score.title} is ${factor(ratio)} × larger${interval} where ${where}: ${size}`);
+}
+
+/** @param {FailureSlice} slice */
+function sliceText({ conditions }) {
+  const text = conditions.map(conditionText).join(' and ');
+  return text[0].toUpperCase() + text.slice(1);
+}
+
+/** @param {FailureSlice} slice */
+function ratioText({ ratio, low, high }) {
+  const interval = low === null || high === null ? '' : ` (${factor(low)} to ${factor(high)})`;
+  return `${factor(ratio)} ×${interval}`;
+}
+
+/** @param {string} number without zeros at its end */
+const short = (number) => number.replace(/(\.\d*?)0+$/, '$1').replace(/\.$/, '');
+
+/** @param {number | null} value with two significant digits */
+const factor = (value) => (value === null ? '–' : String(Number(value.toPrecision(2))));
+
+/**
+ * Describes a condition in units of the page: 1 s < outage length ≤ 2 s, contact, or policy is push.
+ * @param {SliceCondition} condition
+ */
+export function conditionText({ covariate, unit: siUnit, low, high, category }) {
+  if (category === 'yes') return covariate;
+  if (category === 'no') return `no ${covariate}`;
+  if (category !== null) return `${covariate} is ${category}`;
+  const { unit, scale } = UNITS[siUnit] ?? { unit: siUnit, scale: 1 };
+  const end = (/** @type {number | null} */ value) =>
+    withUnit(short(significant(value === null ? null : scale * value)), unit);
+  if (low === null) return `${covariate} ≤ ${end(high)}`;
+  return high === null ? `${covariate} > ${end(low)}` : `${end(low)} < ${covariate} ≤ ${end(high)}`;
+}

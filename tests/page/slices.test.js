@@ -1,0 +1,46 @@
+/** Data slices in words. */
+
+import assert from 'node:assert/strict';
+import test from 'node:test';
+
+import { conditionText, sliceSentence } from '../../app/page/tabs/slice_table.js';
+
+const CONDITION = { covariate: 'true angle', unit: 'rad', low: null, high: null, category: null };
+
+test('conditions have the units of the page', () => {
+  const text = (change) => conditionText({ ...CONDITION, ...change });
+  assert.equal(text({ low: Math.PI / 8 }), 'true angle > 22.5 °');
+  assert.equal(text({ high: -0.5, covariate: 'true hinge x', unit: 'm' }), 'true hinge x ≤ −50 cm');
+  assert.equal(
+    text({ low: 1, high: 2, covariate: 'outage length', unit: 's' }),
+    '1 s < outage length ≤ 2 s',
+  );
+  assert.equal(text({ low: 3.9, covariate: 'time', unit: 's' }), 'time > 3.9 s');
+  assert.equal(text({ low: 0.6234, covariate: 'friction', unit: '' }), 'friction > 0.623');
+  assert.equal(text({ category: 'no', covariate: 'contact' }), 'no contact');
+  assert.equal(text({ category: 'yes', covariate: 'contact' }), 'contact');
+  assert.equal(text({ category: 'push', covariate: 'policy' }), 'policy is push');
+});
+
+test('a slice without an interval, and with one', () => {
+  const slice = {
+    conditions: [{ ...CONDITION, category: 'yes', covariate: 'blackout' }],
+    ratio: 1.5499,
+    low: null,
+    high: null,
+    inside: 0.02,
+    outside: 0.0129,
+    episodes: [3, 5],
+    worst: [3, 17],
+    steps: 20,
+    share: 0.204,
+    p_value: 0.01,
+  };
+  const score = { name: 'error', title: 'position error', unit: 'm', shown: 'cm', scale: 100 };
+  const end = 'where blackout: 2 of 9 episodes, 20 % of steps.';
+  assert.equal(sliceSentence(slice, score, 9), `Position error is 1.5 × larger ${end}`);
+  assert.equal(
+    sliceSentence({ ...slice, low: 1.34, high: 1.7 }, score, 9),
+    `Position error is 1.5 × larger (1.3 to 1.7) ${end}`,
+  );
+});
