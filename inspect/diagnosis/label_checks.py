@@ -34,8 +34,10 @@ def label_statistics(trace: Trace) -> dict[str, float]:
     offset = np.median(difference[keep], axis=0)  # (K, n)
     lags = np.array([_lag(labels, labels - difference[:, k], keep) for k in range(len(trace.modalities))])
     values = {f"lag/labels {name}/all": float(steps) for name, steps in zip(trace.modalities, lags, strict=True)}
-    values["lag/labels/all"] = float(_shared(lags[np.isfinite(lags), None])[0]) if np.isfinite(lags).any() else np.nan
-    for component, common in zip(task.components, _shared(offset), strict=True):
+    values["lag/labels/all"] = (
+        float(common_part(lags[np.isfinite(lags), None])[0]) if np.isfinite(lags).any() else np.nan
+    )
+    for component, common in zip(task.components, common_part(offset), strict=True):
         values[f"offset/labels {component.name}/all"] = float(common)
     return values
 
@@ -50,7 +52,7 @@ def _lag(labels: Array, measured: Array, keep: Mask) -> float:
     return lag(late, early, keep[BASELINE:])[0]
 
 
-def _shared(values: Array) -> Array:
-    """(n,): the smallest of values (K, n) in size, zero where their signs differ."""
+def common_part(values: Array) -> Array:
+    """(n,): what values (K, n) have in common, the smallest in size; zero where their signs differ."""
     smallest = np.abs(values).min(0)
     return np.where((values > 0).all(0), smallest, np.where((values < 0).all(0), -smallest, 0.0))

@@ -9,13 +9,21 @@ import numpy as np
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnosis.label_checks import label_statistics
+from beliefscope.inspect.diagnosis.label_checks import common_part, label_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
 
-SCATTER = {"module bias": "module scatter"}
+SCATTER = {"module bias": "module scatter", "contact distance": "contact distance scatter"}
 """Kind of statistic -> kind of its distance from the other episodes: whether a bias is the same in all of them."""
+
+
+COMMON = frozenset({"contact distance"})
+"""Kinds of statistics of which only the part common to all episodes counts: an object of another size moves all of them
+alike, an offset each in its own direction."""
+
+MIN_COMMON = 3
+"""Minimum number of episodes with a common part."""
 
 
 def episode_statistics(trace: Trace, checkpoint: Checkpoint, sensors: Mapping[str, float]) -> dict[str, float]:
@@ -33,7 +41,10 @@ def episode_statistics(trace: Trace, checkpoint: Checkpoint, sensors: Mapping[st
 def with_scatter(
     profile: HealthyProfile, rows: Sequence[Mapping[str, float]]
 ) -> tuple[HealthyProfile, list[dict[str, float]]]:
-    """The profile and the episodes' statistics with the distances of ``SCATTER`` from the mean of their own group."""
+    """The profile and the episodes' statistics with the distances of ``SCATTER`` from the mean of their own group.
+
+    Statistics of ``COMMON`` are replaced by the part common to the episodes; NaN for too few of them.
+    """
     columns, result = dict(profile.statistics), [dict(row) for row in rows]
     for name, healthy in profile.statistics.items():
         kind, _, rest = name.partition("/")
@@ -44,4 +55,9 @@ def with_scatter(
         columns[name] = np.abs(healthy - np.nanmean(healthy))
         for row, value in zip(result, np.abs(values - np.nanmean(values)).tolist(), strict=True):
             row[name] = value
+    for name in (name for name in profile.statistics if name.partition("/")[0] in COMMON):
+        known = np.array([row[name] for row in rows if np.isfinite(row.get(name, np.nan))])
+        common = float(common_part(known[:, None])[0]) if len(known) >= MIN_COMMON else np.nan
+        for row in result:
+            row[name] = common
     return replace(profile, statistics=columns), result

@@ -87,6 +87,7 @@ KINDS = {
     "object match": ("similarity of the object in the image to healthy images", True, 0.05),
     "contact distance": ("distance in m of the hand from the labelled object, beyond healthy contacts", False, 5e-4),
     "contact distance error": ("deviation in m of the hand from the labelled object in contact", False, 5e-4),
+    "contact distance scatter": ("variation between episodes in m of the hand from the labelled object", False, 5e-4),
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
@@ -127,7 +128,14 @@ PHASES = {
 
 RISING = frozenset(
     {"error", "angle error", "regret", "outside", "black", "frozen", "stuck", "saturation", "occlusion", "change"}
-    | {"opposition", "contact distance error", "module error", "module scatter", "dynamics error"}
+    | {
+        "opposition",
+        "contact distance error",
+        "contact distance scatter",
+        "module error",
+        "module scatter",
+        "dynamics error",
+    }
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 

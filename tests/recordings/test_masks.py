@@ -123,11 +123,11 @@ def test_a_live_run_holds_absent_readings(episode: Episode, tmp_path: Path) -> N
 def test_sensor_checks_ignore_absent_readings(episode: Episode) -> None:
     """Held readings are no frozen sensor and do not change its noise; without the mask they would be frozen."""
     statistics = sensor_statistics(episode, None)
-    assert statistics["frozen/camera/all"] == statistics["stuck/gps x/all"] == 0.0
-    assert statistics["noise/gps x/all"] == pytest.approx(NOISE, rel=0.25)
+    assert statistics["frozen/camera/all"] == statistics["stuck/gps/all"] == 0.0
+    assert statistics["noise/gps/all"] == pytest.approx(NOISE, rel=0.25)
     unmasked = sensor_statistics(replace(episode, task=replace(TASK, masks={})), None)
     assert unmasked["frozen/camera/all"] > 0.35
-    assert unmasked["stuck/gps x/all"] > 0.35
+    assert unmasked["stuck/gps/all"] > 0.35
 
 
 def test_faults_change_readings_only(episode: Episode) -> None:
@@ -137,9 +137,9 @@ def test_faults_change_readings_only(episode: Episode) -> None:
     np.testing.assert_array_equal(noisy.observations["gps"], hold(noisy.observations["gps"], present))
     np.testing.assert_array_equal(noisy.present("gps"), present)
     frozen = Faults.parse("sensor_frozen=gps:from=20:to=80").apply(episode)
-    share = sensor_statistics(frozen, None)["stuck/gps x/all"]
+    share = sensor_statistics(frozen, None)["stuck/gps/all"]
     assert share == pytest.approx(present[20:80].sum() / present.sum(), abs=2 / present.sum())
-    first, last = localise("stuck/gps x/all", frozen, None) or (0, 0)
+    first, last = localise("stuck/gps/all", frozen, None) or (0, 0)
     assert 20 <= first <= 24
     assert 76 <= last < 80
 

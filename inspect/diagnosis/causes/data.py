@@ -36,7 +36,8 @@ CAUSES = (
             Symptom(OBJECT, 0, optional=True),
             Symptom("module bias/*", 0, 0.3, "common"),
         ),
-        f"object match/image*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
+        f"object match/image*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}"
+        f"|{DYNAMICS}",
         "Register the frame of the motion capture with the robot's.",
     ),
     Cause(
@@ -50,7 +51,8 @@ CAUSES = (
                 0,
             ),
         ),
-        f"{OBJECT}|object match/image*|{CONTACT_DISTANCE}|sharpness/*|occlusion/*|shift/*|brightness/*|offset/*"
+        f"{OBJECT}|object match/image*|contact distance/*|contact distance error/*|sharpness/*|occlusion/*|shift/*"
+        "|brightness/*|offset/*"
         f"|{CONTACTS}|{LABELS}|{MODULES}",
         "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "
         "-o tuned.safetensors`.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ from beliefscope.inspect.diagnosis.scoring import (
     strength,
     support,
 )
+from beliefscope.inspect.diagnosis.statistics import with_scatter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 PAGE = Path(__file__).parents[3] / "docs" / "diagnose.md"
 
@@ -175,6 +178,30 @@ def test_the_distance_in_contact_separates_the_object_from_the_image_model() -> 
     same, larger = (deviation("contact distance/labels/contact", t) for t in (0.0, 10.0))
     assert explain(model, [*found, same]).score > explain(data, [*found, same]).score
     assert explain(data, [*found, larger]).score > explain(model, [*found, larger]).score
+
+
+def test_an_offset_of_the_labels_has_no_common_distance_in_contact() -> None:
+    """A larger object is farther away from every side, shifted labels by their own amount in each direction."""
+    data, labels = (next(c for c in CAUSES if c.name == name) for name in ("data.shift", "labels.offset"))
+    found = [deviation(f"module {kind}/image x/all", 10.0) for kind in ("bias", "error")]
+    found.append(deviation("contact distance error/labels/contact", 10.0))
+    common, scattered = (deviation(f"contact distance{kind}/labels/contact", 10.0) for kind in ("", " scatter"))
+    assert explain(data, [*found, common]).score > explain(labels, [*found, common]).score
+    assert explain(labels, [*found, scattered]).score > explain(data, [*found, scattered]).score
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [((3.0, 2.0, 4.0), 2.0), ((3.0, -2.0, 4.0), 0.0), ((3.0, 2.0), math.nan)]
+)
+def test_the_common_part_of_episodes(values: tuple[float, ...], expected: float) -> None:
+    name = "contact distance/labels/contact"
+    healthy = HealthyProfile("data", 20, None, {name: np.linspace(-1.0, 1.0, 20)})
+    columns, rows = with_scatter(healthy, [{name: value} for value in values])
+    assert [row[name] for row in rows] == pytest.approx([expected] * len(values), nan_ok=True)
+    scatter = [row["contact distance scatter/labels/contact"] for row in rows]
+    assert scatter == pytest.approx([abs(value - np.mean(values)) for value in values])
+    column = columns.statistics["contact distance scatter/labels/contact"]
+    np.testing.assert_allclose(column, np.abs(healthy.statistics[name]))
 
 
 def test_the_burden_counts_phases_once_and_the_filter_less() -> None:
