@@ -19,7 +19,7 @@ SCATTER = {"module bias": "module scatter", "contact distance": "contact distanc
 
 
 COMMON = frozenset({"contact distance"})
-"""Kinds of statistics of which only the part common to all episodes counts: an object of another size moves all of them
+"""Kinds of statistics that count by their part common to all episodes: an object of another size changes all of them
 alike, an offset each in its own direction."""
 
 MIN_COMMON = 3
