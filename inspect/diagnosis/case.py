@@ -27,7 +27,8 @@ class Case:
     """Episodes of a filter and their deviations from the healthy profile.
 
     Attributes:
-        rows: statistics by episode. sensors: those of sensors only.
+        rows: statistics by episode. sensors: those of sensors only. grouped: all, with those that depend on the other
+            episodes as well (``with_scatter``).
         deviations: with t-values relative to their critical values, largest first.
         p_value: probability of deviations of this size in a healthy filter.
     """
@@ -36,6 +37,7 @@ class Case:
     traces: Sequence[Trace]
     rows: Rows
     sensors: Rows
+    grouped: Rows
     profile: HealthyProfile
     deviations: Sequence[Deviation]
     p_value: float
@@ -73,17 +75,17 @@ def compared(
     setting: Setting, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
-    scattered, all_rows = with_scatter(profile, rows)
-    comparison = compare(scattered, all_rows)
+    scattered, grouped = with_scatter(profile, rows)
+    comparison = compare(scattered, grouped)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
-    return Case(setting, traces, all_rows, sensors, profile, deviations, comparison.p_value, alarm_rate)
+    return Case(setting, traces, rows, sensors, grouped, profile, deviations, comparison.p_value, alarm_rate)
 
 
 def focus(case: Case) -> Case:
     """The episodes with the largest alarm, if it does not concern the others; otherwise all of them."""
     alarm = case.alarms[0]
     hit = affected_episodes(case, case.alarms)
-    values = [row.get(alarm.statistic, np.nan) for row, chosen in zip(case.rows, hit, strict=True) if not chosen]
+    values = [row.get(alarm.statistic, np.nan) for row, chosen in zip(case.grouped, hit, strict=True) if not chosen]
     others = [value for value in values if np.isfinite(value)]
     if not others or not alarm.low <= np.mean(others) <= alarm.high:
         return case
@@ -111,7 +113,7 @@ def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
     if not alarms:
         return np.ones(len(case.rows), dtype=bool)
     name, healthy = alarms[0].statistic, alarms[0].healthy
-    distance = np.array([row.get(name, np.nan) - healthy for row in case.rows])
+    distance = np.array([row.get(name, np.nan) - healthy for row in case.grouped])
     distance *= np.sign(alarms[0].value - healthy)
     return np.asarray(distance >= 0.5 * np.nanmax(distance))
 

@@ -72,7 +72,7 @@ def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | No
 
 def _evidence(case: Case, deviation: Deviation) -> Evidence:
     """A deviation and the episode that shows it most."""
-    distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.rows]
+    distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.grouped]
     trace = case.traces[int(np.nanargmax(distance))]
     steps = localise(deviation.statistic, trace.episode, case.profile.reference)
     step = None if steps is None else steps[0]

@@ -20,9 +20,12 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import open_filter
+from beliefscope.inspect.diagnosis.case import compared, focus, observe
 from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis
+from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.traces.batch import trace_all
 
 
 @cache
@@ -67,6 +70,21 @@ def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
     if cause == "image.frozen":
         assert first.steps is not None
         assert 28 <= first.steps[0] <= 32
+
+
+def test_focused_episodes_are_compared_with_each_other() -> None:
+    """Statistics that depend on the other episodes are those of the chosen ones, not of all from before."""
+    episodes = dict(simulated(100, 6)) | {i: faulty("effector_offset=0.03")[i] for i in (1, 4)}
+    runs = list(trace_all(checkpoint(), episodes, episodes, 0, 300))
+    rows, sensors = zip(*(observe(run, checkpoint(), profile()) for run in runs), strict=True)
+    setting = Setting(checkpoint(), episodes, 300, frozenset(episodes))
+    case = compared(setting, runs, rows, sensors, profile(), 0.05)
+    part = focus(case)
+    chosen = [run.episode_index for run in part.traces]
+    assert chosen == [1, 4]
+    alone = compared(part.setting, part.traces, [rows[i] for i in chosen], part.sensors, profile(), 0.05)
+    assert part.grouped == alone.grouped
+    assert part.grouped != [case.grouped[i] for i in chosen]
 
 
 def test_the_number_of_processes_does_not_matter() -> None:
