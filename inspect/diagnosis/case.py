@@ -27,8 +27,8 @@ class Case:
     """Episodes of a filter and their deviations from the healthy profile.
 
     Attributes:
-        rows: statistics by episode. sensors: those of sensors only. grouped: all, with those that depend on the other
-            episodes as well (``with_scatter``).
+        rows: statistics by episode. sensors: those of sensors only. grouped: all of them, and statistics
+            relative to the other episodes (``with_scatter``).
         deviations: with t-values relative to their critical values, largest first.
         p_value: probability of deviations of this size in a healthy filter.
     """
