@@ -1,12 +1,14 @@
 """How fusion rules degrade under sensor faults that no training contained, as a Markdown table.
 
     python bench/fault_table.py push crossmodal-ekf unimodal-ekf feature-ekf image-ekf haptics-ekf
-    python bench/fault_table.py push-field DIR/a.safetensors DIR/b.safetensors --data DIR/outages.h5
+    python bench/fault_table.py push-field DIR/a.safetensors DIR/b.safetensors --data DIR/outages.h5 --seeds 3
 
 The first filter is compared with the others. Cells: position RMSE under the fault over that on clean data, both over
 whole episodes, with a 95 % interval over trajectories (inspect/statistics/intervals.py). The last rows test whether
 the first filter degrades less: ratio of its increase to that of the other filter, geometric mean over all faults, and
-the number of faults under which it degrades less, more, or neither (interval around 1).
+the number of faults under which it degrades less, more, or neither (interval around 1); and whether its error is
+smaller, over all faults. With --seeds N, squared errors are averaged over the checkpoints DIR/a.safetensors,
+DIR/a-seed1.safetensors and so on, as ``bench/field_study.py`` names them.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -64,10 +67,16 @@ def faults_for(episodes: Sequence[Episode]) -> list[str]:
     return [text.format(**sizes) for text in FAULTS]
 
 
-def squared_errors(filter_: Filter, episodes: Sequence[Episode], text: str) -> Array:
-    """(R,) sum of squared position errors of each trajectory."""
-    result = evaluate(filter_, episodes, faults=Faults.parse(text) if text else NO_FAULTS)
-    return result.squares[:, 1 + list(result.rmse).index(KEY)]
+def of_seed(name: str, seed: int) -> str:
+    """The checkpoint of another training seed."""
+    return name.replace(".safetensors", f"-seed{seed}.safetensors") if seed else name
+
+
+def squared_errors(filters: Sequence[Filter], episodes: Sequence[Episode], text: str) -> Array:
+    """(R,) sum of squared position errors of each trajectory, mean over the training seeds of a filter."""
+    faults = Faults.parse(text) if text else NO_FAULTS
+    results = [evaluate(filter_, episodes, faults=faults) for filter_ in filters]
+    return np.mean([result.squares[:, 1 + list(result.rmse).index(KEY)] for result in results], axis=0)
 
 
 def cells(logs: tuple[Array, Array, Array]) -> list[str]:
@@ -80,9 +89,13 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("task")
     parser.add_argument("filters", nargs="+", help="names or checkpoints; the first is compared with the others")
     parser.add_argument("--data", help="test episodes; default: the test episodes of the sample set")
+    parser.add_argument("--seeds", type=int, default=1, help="number of training seeds (1)")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    filters = [open_filter(options.task, name).filter for name in options.filters]
+    filters = [
+        [open_filter(options.task, of_seed(name, seed)).filter for seed in range(options.seeds)]
+        for name in options.filters
+    ]
     with open_dataset(options.data or sample_path(options.task)) as data:
         episodes = [data[s.index] for s in data.summaries if s.split == "test"]
     texts = faults_for(episodes)
@@ -92,7 +105,7 @@ def main(arguments: Sequence[str]) -> None:
         faulty.append(np.stack([squared_errors(f, episodes, text) for f in filters], axis=1))
         print(f"\r{len(faulty)} of {len(texts)} faults", end="", file=sys.stderr)
     print(file=sys.stderr)
-    print_table(options.filters, texts, clean, np.stack(faulty, axis=1))
+    print_table([Path(name).stem for name in options.filters], texts, clean, np.stack(faulty, axis=1))
 
 
 def print_table(names: Sequence[str], texts: Sequence[str], clean: Array, faulty: Array) -> None:
@@ -120,6 +133,8 @@ def print_table(names: Sequence[str], texts: Sequence[str], clean: Array, faulty
     less, more = (relative[2] < 0.0).sum(0), (relative[1] > 0.0).sum(0)
     counts = [f"{a}, {b}, {len(texts) - a - b}" for a, b in zip(less, more, strict=True)]
     print(f"| faults under which {names[0]} degrades less, more, neither | | {' | '.join(counts)} |")
+    error = jackknife(sums, lambda s: 0.5 * (np.log(s[..., 1:, :1]) - np.log(s[..., 1:, 1:])).mean(-2))
+    print(f"| error of {names[0]} / of this filter, all faults | | {' | '.join(cells(error))} |")
 
 
 if __name__ == "__main__":

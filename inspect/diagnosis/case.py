@@ -19,6 +19,9 @@ from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compar
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
 
+ALARM_RATE = 0.02
+"""Default probability that a healthy filter raises an alarm."""
+
 Rows = Sequence[Mapping[str, float]]
 
 

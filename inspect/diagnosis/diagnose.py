@@ -17,6 +17,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import (
+    ALARM_RATE,
     Case,
     affected_episodes,
     affected_steps,
@@ -59,7 +60,7 @@ def diagnose(
     *,
     seed: int = 0,
     particles: int = 300,
-    alarm_rate: float = 0.05,
+    alarm_rate: float = ALARM_RATE,
     base: Checkpoint | None = None,
     profile: HealthyProfile | None = None,
     engine: Engine = "local",
@@ -124,7 +125,7 @@ def diagnose_traces(
     *,
     seed: int = 0,
     particles: int = 300,
-    alarm_rate: float = 0.05,
+    alarm_rate: float = ALARM_RATE,
     base: Checkpoint | None = None,
     profile: HealthyProfile | None = None,
     progress: Callable[[float], None] | None = None,
@@ -134,7 +135,9 @@ def diagnose_traces(
     return _diagnosed(case, seed, base, "local", 1, progress or (lambda fraction: None))
 
 
-def preliminary(checkpoint: Checkpoint, trace: Trace, particles: int = 300, alarm_rate: float = 0.05) -> Diagnosis:
+def preliminary(
+    checkpoint: Checkpoint, trace: Trace, particles: int = 300, alarm_rate: float = ALARM_RATE
+) -> Diagnosis:
     """The diagnosis of one run before any cause is undone, within a fraction of a second; final if it is healthy.
 
     Raises BadInput without a healthy profile.

@@ -31,6 +31,9 @@ PERMUTATIONS = 1999
 TAIL = 0.99
 """Quantile of a statistic's t-values over healthy samples to which its critical value is proportional."""
 
+CRITICAL = 0.05
+"""Share of healthy samples with a deviation above its critical value, for which causes are calibrated."""
+
 SMALLEST_T = 2.0
 """Lower limit of this quantile."""
 
@@ -281,11 +284,12 @@ def _own_scale(distribution: Array, t: Array, single: bool) -> Array:
     return np.maximum(np.where(np.abs(t) >= largest, second, largest), SMALLEST_T)
 
 
-def with_critical_values(profile: HealthyProfile, comparison: Comparison, significance: float) -> tuple[Deviation, ...]:
+def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_rate: float) -> tuple[Deviation, ...]:
     """The deviations with t-values relative to critical ones, and alarms where the ratio is at least 1; largest first.
 
     Distributions of t-values differ between statistics; those of rare events have heavy tails. The critical value of a
-    statistic is proportional to its own high quantile, so that a share of healthy samples has an alarm.
+    statistic is proportional to its own high quantile, so that a share of healthy samples, ``CRITICAL``, exceeds any.
+    With a larger ``alarm_rate``, alarms begin at lower ratios.
     """
     names = [deviation.statistic for deviation in comparison.deviations]
     if not names:
@@ -297,11 +301,11 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     count = min(comparison.trajectories, profile.episodes // 2)
     t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor, rising)[0])
     own = _own_scale(t, t, count == 1)
-    limit = np.quantile((t / own).max(1), 1.0 - significance)
+    limit, alarm = np.quantile((t / own).max(1), [1.0 - CRITICAL, 1.0 - max(CRITICAL, alarm_rate)])
     critical = limit * (own if own.ndim == 1 else np.maximum(t.max(0), SMALLEST_T))
     error = math.sqrt(1.0 / comparison.trajectories + 1.0 / profile.episodes)
     result = [
-        replace(d, t=d.t / c, alarm=bool(abs(d.t) >= max(c, MIN_EFFECT / error)))
+        replace(d, t=d.t / c, alarm=bool(abs(d.t) >= max(c * alarm / limit, MIN_EFFECT / error)))
         for d, c in zip(comparison.deviations, critical, strict=True)
     ]
     return tuple(sorted(result, key=lambda deviation: -abs(deviation.t)))

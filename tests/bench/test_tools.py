@@ -24,6 +24,7 @@ class FakeCase:
     folder, particles, seed, runnable = Path("case"), 300, 7, True
 
 
+@pytest.mark.slow
 def test_commands_get_the_files_and_print_json() -> None:
     script = "import json, sys; print(json.dumps({'state': 'healthy', 'causes': [], 'arguments': sys.argv[1:]}))"
     case: Any = FakeCase()

@@ -22,7 +22,7 @@ def diagnose(
     runs: opt.Runs,
     episode: int | None = None,
     base: Path | None = None,
-    alarm_rate: float = 0.05,
+    alarm_rate: float = 0.02,
     profile_from: Path | None = None,
     repair: int | None = None,
     workers: int = 1,

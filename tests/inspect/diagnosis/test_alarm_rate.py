@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from inspect import signature
+
 import numpy as np
 import pytest
 
+from beliefscope.app.cli.commands.diagnose import diagnose as command
+from beliefscope.inspect.diagnosis.case import ALARM_RATE
+from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnostics.healthy_comparison import compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
@@ -54,3 +59,21 @@ def test_a_single_episode_does_not_hide_its_own_deviation() -> None:
         named = [d.statistic for d in with_critical_values(profile, comparison, RATE) if d.alarm]
         found += comparison.p_value <= RATE and named == [names[3]]
     assert found >= 19
+
+
+def test_a_smaller_alarm_rate_keeps_the_scale_of_deviations() -> None:
+    rng = np.random.default_rng(2)
+    healthy, tested = rows(60, rng), rows(6, rng)
+    tested[:, 3] += 2.5
+    tested[:, 5] += 1.7
+    profile = HealthyProfile("simulated", 60, None, dict(zip(NAMES, healthy.T, strict=True)))
+    comparison = compare(profile, [dict(zip(NAMES, row.tolist(), strict=True)) for row in tested])
+    strict, usual, lenient = (with_critical_values(profile, comparison, rate) for rate in (0.001, 0.05, 0.5))
+    assert strict == usual
+    assert [d.t for d in lenient] == [d.t for d in usual]
+    assert {d.statistic for d in usual if d.alarm} < {d.statistic for d in lenient if d.alarm}
+
+
+def test_the_command_has_the_default_alarm_rate_of_the_library() -> None:
+    assert signature(command).parameters["alarm_rate"].default == ALARM_RATE
+    assert signature(diagnose).parameters["alarm_rate"].default == ALARM_RATE
