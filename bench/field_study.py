@@ -3,8 +3,9 @@
     python bench/field_study.py DIR --seeds 3 -o docs/study/push-field
 
 DIR has train.h5 and no_outages.h5 of ``bench/field_tasks.py``, whose plan trains every filter; existing checkpoints and
-results (DIR/study) are not computed again. Outages of 2 s are injected into the test episodes without any. Errors are
-RMSE from step 0: squared errors are averaged over the seeds; brackets are 95 % intervals over trajectories.
+results (DIR/study) are not computed again. Outages of 2 s are injected into the test episodes, which have none. Where
+there is only outages.h5, as of real pushes, they are added to its own ones. Errors are RMSE from step 0: squared errors
+are averaged over the seeds; brackets are 95 % intervals over trajectories.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import torch
 from field_tasks import trained
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.evaluate import evaluate
@@ -28,7 +30,7 @@ from beliefscope.inspect.statistics.intervals import jackknife
 Array = NDArray[np.float64]
 
 OUTAGES = (0.0, 0.4, 0.8, 0.95)
-"""Shares of steps without an image."""
+"""Shares of steps whose image is removed."""
 
 RULES = ("crossmodal", "unimodal", "feature")
 INFORMATION = "information-ekf"
@@ -72,9 +74,10 @@ CLAIMS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 HEAD = """# Fusion rules on {task}
 
-RMSE from step 0 on {count} test episodes of 20 s, whose images are black in outages of 2 s for a share of the steps.
-Training seeds: {seeds}; brackets are 95 % intervals over trajectories. A claim holds if the interval of the ratio of
-errors is below 1, and does not if it is above 1. Summary: [field tasks](../field_tasks.md#fusion-rules-and-outages).
+RMSE from step 0 on {count} test episodes of {seconds:.0f} s, whose images are black in outages for a share of the
+steps. Training seeds: {seeds}; brackets are 95 % intervals over trajectories. A claim holds if the interval of the
+ratio of errors is below 1, and does not if it is above 1.
+Summary: [field tasks](../field_tasks.md#fusion-rules-and-outages).
 """
 
 
@@ -82,13 +85,24 @@ def label(name: str, seed: int) -> str:
     return f"{name}#{seed}" if seed else name
 
 
+def test_episodes(folder: Path) -> list[Episode]:
+    paths = (folder / "no_outages.h5", folder / "outages.h5")
+    with open_dataset(next(path for path in paths if path.exists())) as data:
+        return list(data)
+
+
+def black_shares(episodes: Sequence[Episode]) -> list[str]:
+    """Share of steps without an image at each of ``OUTAGES``, in percent."""
+    own = float(np.mean([episode.observations["image"].max(axis=(1, 2)) == 0 for episode in episodes]))
+    return [f"{100 * (own + (1 - own) * share):.0f} %" for share in OUTAGES]
+
+
 def results(folder: Path, name: str, seed: int) -> dict[str, Array]:
     """Error key -> (outages, trajectories) mean squared errors of a filter."""
     path = folder / "study" / f"{label(name, seed).replace(':', '-').replace('#', '-seed')}.json"
     if not path.exists():
         filter_, document = trained(folder, label(name, seed)), {}
-        with open_dataset(folder / "no_outages.h5") as data:
-            episodes = list(data)
+        episodes = test_episodes(folder)
         for share in OUTAGES:
             faults = Faults.parse(f"image_outage={share}:seconds=2") if share else NO_FAULTS
             metrics = evaluate(filter_, episodes, faults=faults)
@@ -116,9 +130,9 @@ def verdict(low: float, high: float) -> str:
     return "holds" if high < 1.0 else "**does not**" if low > 1.0 else "open"
 
 
-def tables(values: dict[str, dict[str, Array]], key: str) -> str:
+def tables(values: dict[str, dict[str, Array]], key: str, shares: Sequence[str]) -> str:
     """Errors of all filters, and the claims, by share of outages."""
-    head = " | ".join(f"{100 * share:.0f} %" for share in OUTAGES)
+    head = " | ".join(shares)
     lines = [f"| filter | {head} |", f"| --- |{' ---: |' * len(OUTAGES)}"]
     for name, by_key in values.items():
         cells = [f"{v:.2f} [{low:.2f}, {high:.2f}]" for v, low, high in map(rmse, by_key[key])]
@@ -132,7 +146,7 @@ def tables(values: dict[str, dict[str, Array]], key: str) -> str:
     return "\n".join(lines)
 
 
-def draw(values: dict[str, dict[str, Array]], key: str, path: Path) -> None:
+def draw(values: dict[str, dict[str, Array]], key: str, shares: Sequence[str], path: Path) -> None:
     """RMSE against the share of outages, one line per filter."""
     figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     colours = dict(zip((*RULES, "image", "haptics", "lstm", "transformer"), plt.get_cmap("tab10").colors, strict=False))
@@ -142,7 +156,12 @@ def draw(values: dict[str, dict[str, Array]], key: str, path: Path) -> None:
         if INFORMATION in name:
             style |= {"linewidth": 2.5}
         axes.plot(
-            100 * np.array(OUTAGES), [rmse(s)[0] for s in by_key[key]], marker="o", markersize=3, label=name, **style
+            [float(share.split()[0]) for share in shares],
+            [rmse(s)[0] for s in by_key[key]],
+            marker="o",
+            markersize=3,
+            label=name,
+            **style,
         )
     axes.set(xlabel="steps without an image (%)", ylabel=f"RMSE, {key.replace('_', ' in ')}", ylim=(0, None))
     axes.legend(fontsize=7, ncols=2, frameon=False, handlelength=3.5)
@@ -164,12 +183,13 @@ def main() -> None:
         values[name] = {key: np.mean([seed[key] for seed in seeds], axis=0) for key in seeds[0]}
     keys = [key for key in values[INFORMATION] if key in ("position_cm", "angle_deg")]
     figures = {key: options.output.with_name(f"{options.output.name}-{key.partition('_')[0]}.svg") for key in keys}
-    count = len(values[INFORMATION][keys[0]][0])
-    sections = [HEAD.format(task=options.output.name, count=count, seeds=options.seeds)]
+    episodes = test_episodes(options.folder)
+    seconds, shares = float(np.mean([episode.times[-1] for episode in episodes])), black_shares(episodes)
+    sections = [HEAD.format(task=options.output.name, count=len(episodes), seconds=seconds, seeds=options.seeds)]
     for key, path in figures.items():
         title = key.replace("_", ", ")
-        sections.append(f"## {title}\n\n![{title}]({path.name})\n\n{tables(values, key)}\n")
-        draw(values, key, path)
+        sections.append(f"## {title}\n\n![{title}]({path.name})\n\n{tables(values, key, shares)}\n")
+        draw(values, key, shares, path)
     options.output.with_suffix(".md").write_text("\n".join(sections))
     print("\n".join(sections))
 
