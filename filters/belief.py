@@ -95,6 +95,10 @@ class Evidence:
             present=None if self.present is None else function(self.present),
         )
 
+    def trajectory(self, i: int) -> Evidence:
+        """The evidence of trajectory i, N = 1."""
+        return self._map(lambda tensor: tensor[:, i : i + 1])
+
     def only(self, k: int) -> Evidence:
         """The same evidence with beta one-hot on measurement model k; unchanged without a weight model.
 

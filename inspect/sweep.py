@@ -29,7 +29,7 @@ from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
-FORMAT = 1
+FORMAT = 2
 """Version of the rows; rows of other versions are computed again."""
 
 EPISODES = 64
@@ -158,7 +158,8 @@ def describe_data(path: Path, checkpoint: Path) -> Row:
 def summary(trace: Trace) -> Iterator[Row]:
     """A row for each phase of a trace that has steps: errors in display units, consistency, weights, particles.
 
-    ``error`` is the root mean square of the position error, ``worst`` its maximum, at ``worst_step``, both in ``unit``;
+    ``error`` is the root mean square of the position error, ``worst`` its maximum, both in ``unit``, at ``worst_step``
+    and ``worst_time``, s since the first step, None without timestamps;
     each component has its own column, such as ``hinge_x_cm``. ``beta_image`` and ``weight_image`` are the mean raw and
     effective fusion weight.
     ``nll`` in nats, m and rad; ``nees`` over n, 1 if consistent; ``coverage95`` the share of steps with the truth in
@@ -201,6 +202,7 @@ def summary(trace: Trace) -> Iterator[Row]:
             **{key: rmse(key, mask) for key in components},
             "worst": float(np.sqrt(squared[main][at])),
             "worst_step": at,
+            "worst_time": None if episode.time is None else float(episode.time[at]),
             **{key: float(np.mean(values[mask])) for key, values in columns.items()},
         }
 

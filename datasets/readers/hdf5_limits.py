@@ -23,12 +23,13 @@ SLACK = 1 << 16
 
 def check_array(stored: h5py.Dataset, place: str) -> None:
     """Raise BadInput if the array is not numeric, not stored in this file, or larger than the file can hold."""
-    kind = stored.dtype.base if stored.dtype.subdtype else stored.dtype
-    if kind.kind not in "biuf" or stored.shape is None:
+    element, shape = stored.dtype, stored.shape  # h5py reads them from the file each time
+    kind = element.base if element.subdtype else element
+    if kind.kind not in "biuf" or shape is None:
         raise BadInput(f"{place} is {kind}, expected numbers.")
     if stored.is_virtual or stored.external:
         raise BadInput(f"{place} is stored in another file, expected numbers in this one.")
-    declared = math.prod(map(int, stored.shape)) * stored.dtype.itemsize
+    declared = math.prod(map(int, shape)) * element.itemsize
     size = stored.id.get_storage_size()
     if declared > min(MAX_BYTES, MAX_COMPRESSION * size + SLACK):
         raise BadInput(f"{place} declares {declared} bytes of numbers, but the file stores {size}.")

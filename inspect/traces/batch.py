@@ -13,6 +13,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
+from beliefscope.filters.belief import Gaussian, Recurrent, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
@@ -93,12 +94,13 @@ def _run_together(
     evidence, start = checkpoint.filter.encode(batch), first_belief(checkpoint.filter, batch)
     generator = Common().manual_seed(seed)  # ``trace`` gives each episode the numbers of a batch of one
     result = rollout(checkpoint.filter, evidence, start, generator, particles, keep=True, progress=progress)
+    joined = _join(result.steps)
     for i, (index, episode) in enumerate(zip(episodes, inputs, strict=True)):
         yield assemble_trace(
             checkpoint,
             episode,
-            _select(start, i),
-            step_arrays(checkpoint, _select(evidence, i, axis=1), [_select(step, i) for step in result.steps]),
+            Gaussian(start.mean[i : i + 1], start.covariance[i : i + 1]),
+            step_arrays(checkpoint, evidence.trajectory(i), [_select(joined, i)]),
             data_hash=episodes[index].digest(),
             episode_index=index,
             seed=seed,
@@ -111,11 +113,30 @@ def _part(progress: Progress | None, done: int, size: int, total: int) -> Progre
     return None if progress is None else lambda share: progress((done + share * size) / total)
 
 
-def _select(value: Any, i: int, axis: int = 0) -> Any:
-    """Trajectory i of all tensors of a dataclass, with N = 1."""
+def _join(steps: Sequence[StepTrace]) -> StepTrace:
+    """Step traces of N trajectories as one, with tensors (N, T, ...): cheaper than cutting each step into N."""
+    joined: dict[tuple[int, ...], Tensor] = {}  # a step trace has some tensors twice
+
+    def join(parts: Sequence[Any]) -> Any:
+        first = parts[0]
+        if isinstance(first, Tensor):
+            key = tuple(map(id, parts))
+            if key not in joined:
+                joined[key] = torch.stack(list(parts), dim=1)
+            return joined[key]
+        if first is None or isinstance(first, Recurrent):  # no trace contains the memory of a sequence model
+            return first
+        values = {f.name: join([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(first)}
+        return dataclasses.replace(first, **values)
+
+    result: StepTrace = join(steps)
+    return result
+
+
+def _select(value: Any, i: int) -> Any:
+    """Trajectory i of the tensors (N, T, ...) of joined steps: (T, ...)."""
     if isinstance(value, Tensor):
-        return value.narrow(axis, i, 1)
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value[i]
+    if value is None or isinstance(value, Recurrent):
         return value
-    parts = {f.name: _select(getattr(value, f.name), i, axis) for f in dataclasses.fields(value)}
-    return dataclasses.replace(value, **parts)
+    return dataclasses.replace(value, **{f.name: _select(getattr(value, f.name), i) for f in dataclasses.fields(value)})

@@ -195,7 +195,11 @@ def with_fewer_particles(arrays: dict[str, Tensor], count: int) -> dict[str, Ten
 
 
 def step_arrays(checkpoint: Checkpoint, evidence: Evidence, steps: Sequence[StepTrace]) -> dict[str, Tensor]:
-    """Arrays (T, ...) of a trace from T steps with N = 1."""
+    """Arrays (T, ...) of a trace.
+
+    Args:
+        evidence: of T steps, N = 1. steps: T steps with N = 1, or one whose tensors have T as their leading axis.
+    """
     filter_ = checkpoint.filter
     si = filter_.statistics
     arrays = ARRAYS_OF[checkpoint.kind](filter_, steps, evidence)
@@ -302,7 +306,7 @@ def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) 
 
 
 def _sequence_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
-    none = torch.zeros(len(steps), 0, filter_.n)
+    none = torch.zeros(len(evidence), 0, filter_.n)
     return {"modality_mean": none, "modality_covariance": none.unsqueeze(-1).expand(-1, -1, -1, filter_.n)}
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.sweep import Inputs, summary
+from beliefscope.inspect.trace import trace
 from beliefscope.recordings.sweep_table import RESULTS, Experiments, is_finished, run_sweep
 
 pytestmark = pytest.mark.slow
@@ -197,3 +199,13 @@ def test_sweeps_of_different_tasks_are_joined(sweep: Path, tmp_path: Path) -> No
     (door, push) = rows.to_pylist()
     assert (door["puck"], push["hinge"]) == (None, None)
     assert door["hinge"] > 0.0 < push["puck"]
+
+
+def test_rows_have_the_time_of_the_worst_step() -> None:
+    filter_ = load_checkpoint(shipped("door", "image-ekf"))
+    with open_dataset(sample_path("door")) as sample:
+        episode = sample[0]
+    times = np.linspace(0.0, 3.0, len(episode)) ** 2
+    timed = list(summary(trace(filter_, replace(episode, time=times))))
+    assert [row["worst_time"] for row in timed] == [times[row["worst_step"]] for row in timed]
+    assert {row["worst_time"] for row in summary(trace(filter_, episode))} == {None}
