@@ -3,6 +3,7 @@
 python bench/page.py                # all but the playback
 python bench/page.py --diagnosis    # only the diagnosis
 python bench/page.py --first        # only the first screen and the 3D scene
+python bench/page.py --keys         # only the keys
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.store import write_dataset
 
 KEYS = 200
+SINGLE_KEYS = 40
 VISITS = 5
 DIAGNOSED = (
     ("door", "crossmodal-ekf"),
@@ -113,6 +115,27 @@ RENDERINGS = """(seconds) => new Promise((done) => {
 """Counts the frames that the 3D scene renders, per second."""
 
 
+RENDERED = """() => {
+  window.renderedScenes = [];
+  const scene = document.querySelector('#scene iframe').contentWindow;
+  const { clear } = scene.WebGL2RenderingContext.prototype;
+  let [input, sent] = [null, 0];
+  addEventListener('keydown', ({ timeStamp }) => {
+    input = timeStamp;
+    sent = beliefscope.stats.scene.length;
+  }, true);
+  scene.WebGL2RenderingContext.prototype.clear = function (mask) {
+    if (input !== null && beliefscope.stats.scene.length > sent) {
+      const start = input;
+      input = null;
+      scene.setTimeout(() => renderedScenes.push(performance.now() - start));
+    }
+    return clear.call(this, mask);
+  };
+}"""
+"""Lists the times from a key to the end of the first rendering that starts after its scene was sent, ms."""
+
+
 def measure() -> list[Row]:
     try:
         import playwright.sync_api  # noqa: F401
@@ -179,7 +202,7 @@ def scene(page: Any, url: str) -> list[Row]:
 
 
 def keys(page: Any, url: str) -> list[Row]:
-    """Latency from a key to the drawn maps."""
+    """Latency from a key to the drawn maps and the 3D scene."""
     page.goto(url)
     usable(page)
     page.wait_for_timeout(3000)
@@ -190,13 +213,30 @@ def keys(page: Any, url: str) -> list[Row]:
     page.wait_for_timeout(500)
     times = np.array(page.evaluate("window.beliefscope.stats.scrub"))
     p50, p95 = np.percentile(times, [50, 95])
-    scenes = page.evaluate("window.beliefscope.stats.scene")
-    rows = [
+    return [
         (f"key to maps drawn, {len(times)} of {KEYS} keys, p50", f"{p50:.0f} ms", ""),
         (f"key to maps drawn, {len(times)} of {KEYS} keys, p95", f"{p95:.0f} ms", "<= 50 ms"),
+        *scene_keys(page),
     ]
-    if scenes:
-        rows.append((f"key to scene sent, {len(scenes)} keys, p95", f"{np.percentile(scenes, 95):.0f} ms", "<= 100 ms"))
+
+
+def scene_keys(page: Any) -> list[Row]:
+    """Latency from single keys to the 3D scene: until the server has sent it, and until the browser has rendered it."""
+    page.wait_for_timeout(2000)
+    page.evaluate(RENDERED)
+    page.evaluate("window.beliefscope.stats.scene.length = 0")
+    for _ in range(SINGLE_KEYS):
+        page.keyboard.press("ArrowRight")
+        page.wait_for_timeout(800)
+    rows = []
+    for case, list_, bar in (
+        ("sent", "beliefscope.stats.scene", "<= 100 ms"),
+        ("rendered", "renderedScenes", ""),
+    ):
+        times = np.array(page.evaluate(f"window.{list_}"))
+        for percentile, limit in ((50, ""), (95, bar)):
+            name = f"single key to scene {case}, {len(times)} of {SINGLE_KEYS} keys, p{percentile}"
+            rows.append((name, f"{np.percentile(times, percentile):.0f} ms" if len(times) else "no scene", limit))
     return rows
 
 
@@ -274,10 +314,14 @@ def main() -> None:
     parser.add_argument("--play", type=float, metavar="MINUTES", help="only measure the memory during playback")
     parser.add_argument("--first", action="store_true", help="only measure the first screen and the 3D scene")
     parser.add_argument("--diagnosis", action="store_true", help="only measure the diagnosis")
+    parser.add_argument("--keys", action="store_true", help="only measure the keys, on a shipped episode")
     args = parser.parse_args()
     if args.first:
         with browsing() as page, serving() as served:
             rows = [*first_screen(page, served.url), *scene(page, served.url)]
+    elif args.keys:
+        with browsing() as page, serving() as served:
+            rows = keys(page, served.url)
     elif args.diagnosis:
         with browsing() as page, serving() as served:
             rows = diagnosis(page, served.url)

@@ -105,10 +105,17 @@ def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference |
     text = f"{head}: {_description(first)}"
     beyond = [row for row in others if row.outcome != "met"]
     worst = max(beyond or others, key=lambda row: row.change, default=None)
+    advice = _advice(rows) if outcome == "inconclusive" else ""
     if worst is None:
-        return f"{text}."
+        return f"{text}.{advice}"
     label = "beyond the limit" if beyond else "largest change elsewhere"
-    return f"{text}; {label}: {_description(worst)}."
+    return f"{text}; {label}: {_description(worst)}.{advice}"
+
+
+def _advice(rows: Sequence[SliceChange]) -> str:
+    """Why a criterion is inconclusive, and what would decide it."""
+    names = " and ".join(row.slice for row in rows if row.outcome == "inconclusive")
+    return f" These held-out episodes are too few to decide {names}: more of them (--data) narrow the 95 % interval."
 
 
 def _description(row: SliceChange) -> str:

@@ -36,7 +36,7 @@ class ErrorSlice:
         inside, outside: mean score of its steps, and of all others; SI units.
         ratio, low, high: inside / outside with its 95 % interval over episodes; NaN below five episodes.
         episodes: indices in the data set of the episodes with steps in the slice.
-        worst: episode and step of its largest score.
+        worst: episode and step of its largest score, in an episode that is not the ``worst`` of a slice above, if any.
         steps, share: number of its steps, and their share of all.
         p_value: of the search, see ``inspect/slices/search.py``.
     """
@@ -214,7 +214,12 @@ def slices_of_survey(
         raise BadInput(f"no slices by {by}: the score is not finite at {np.sum(~np.isfinite(score))} steps")
     covariates = join_covariates(ordered)
     candidates = find_candidates(score, episode, covariates, alpha=alpha, seed=survey.seed, progress=progress)
-    slices = [_error_slice(candidate, score, episode, step) for candidate in candidates]
+    slices: list[ErrorSlice] = []
+    for candidate in candidates:
+        opened = [slice_.worst[0] for slice_ in slices]
+        slice_ = _error_slice(candidate, score, episode, step, opened)
+        if not slice_.low <= 1.0:
+            slices.append(slice_)
     return ErrorSlices(
         task=survey.task.name,
         filter=survey.filter,
@@ -230,14 +235,18 @@ def slices_of_survey(
         episodes=len(ordered),
         steps=len(score),
         covariates=tuple(covariate.name for covariate in covariates),
-        slices=tuple(slice_ for slice_ in slices if not slice_.low <= 1.0),
+        slices=tuple(slices),
     )
 
 
-def _error_slice(candidate: Candidate, score: Array, episode: Index, step: Index) -> ErrorSlice:
-    """Effect of a slice with its interval over episodes. episode, step: (S,) indices."""
+def _error_slice(candidate: Candidate, score: Array, episode: Index, step: Index, opened: Sequence[int]) -> ErrorSlice:
+    """Effect of a slice with its interval over episodes.
+
+    episode, step: (S,) indices. opened: episodes of the worst steps of the slices above.
+    """
     inside = candidate.steps
-    worst = int(np.where(inside, score, -np.inf).argmax())
+    unopened = inside & ~np.isin(episode, opened)
+    worst = int(np.where(unopened if unopened.any() else inside, score, -np.inf).argmax())
     indices, number = np.unique(episode, return_inverse=True)
     columns = np.stack([inside, ~inside, inside * score, ~inside * score], axis=1)
     sums = np.zeros((len(indices), 4))

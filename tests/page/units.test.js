@@ -52,6 +52,7 @@ test('percentages, sizes, angles and names', () => {
 
 test('numbers in texts of the server are set', () => {
   assert.equal(typeset('angle 1.67 -> 1.95 deg'), 'angle 1.67 → 1.95°');
+  assert.equal(typeset('angle error (deg)'), 'angle error (°)');
   assert.equal(typeset('-0.3 (-.5 to 2)'), '−0.3 (−.5 to 2)');
   for (const text of [
     'steps 3-5',

@@ -242,10 +242,10 @@ export class Page {
         stats.maps = { step, size };
         markUseful();
       },
-      drawn: (step, { inputTime }) => {
+      drawn: (step, inputTime) => {
         this.scene.drawn(this.#trace?.header.scene ?? []);
         stats.drawn = { step };
-        if (inputTime) addLatency(stats.scene, performance.now() - inputTime);
+        if (inputTime !== null) addLatency(stats.scene, performance.now() - inputTime);
       },
       error: (line) => this.#messages.show('cursor', line),
       connection: (problem) => {

@@ -69,7 +69,8 @@ export const typeset = (text) =>
   text
     .replace(/(?<![\w).:=-])-(?=\.?\d)/g, '−')
     .replaceAll(' -> ', ' → ')
-    .replace(/(?<=\d) deg\b/g, '°');
+    .replace(/(?<=\d) deg\b/g, '°')
+    .replace(/\(deg\b/g, '(°');
 
 /**
  * Formats a number with fixed digits and a true minus sign; a dash for a missing number.

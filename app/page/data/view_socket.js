@@ -18,12 +18,13 @@ import { openView } from './api.js';
  * @property {(factor: number) => boolean} pace sets the pause of the 3D scene, and returns whether it may render now
  * @property {(maps: Maps, inputTime: number | null) => void} maps
  * @property {(step: number, size: number | undefined) => void} noMaps the filter has no maps
- * @property {(step: number, cause: Cause) => void} drawn the 3D scene shows the step
+ * @property {(step: number, inputTime: number | null) => void} drawn the 3D scene shows the step; inputTime: of the last input, with the first scene of its step
  * @property {(line: string) => void} error
  * @property {(problem: string | null) => void} connection
  */
 
 const FINE_DELAY = 120; // ms after the last change of the cursor
+const SCRUB_GAP = 250; // ms; an input sooner after the previous one belongs to the same scrub
 const RESPONSE_TIMEOUT = 10_000; // ms
 /** Pause between renderings of a slow 3D scene, as a multiple of their duration. */
 const PACE = { scrubbing: Infinity, playing: 1, idle: 0 };
@@ -49,6 +50,8 @@ export class ViewSocket {
   #sent = new Map();
   /** @type {Cursor | null} */
   #last = null;
+  /** Time of the last input in ms, and whether the 3D scene has shown its step. */
+  #input = { time: -Infinity, drawn: true };
   /** Maps of the comparison run, which arrive first. @type {Maps | null} */
   #comparison = null;
   /** @type {number | undefined} */
@@ -70,13 +73,17 @@ export class ViewSocket {
   }
 
   /**
-   * Moves the cursor: requests coarse maps now, and fine maps and the scene when it stops.
+   * Moves the cursor: requests coarse maps now, and fine maps when it stops. A slow scene follows the first input of a
+   * scrub, such as a single key, and then waits until the cursor stops.
    * @param {Cursor} cursor
    * @param {number | null} [inputTime]
    */
   move(cursor, inputTime = null) {
     this.#last = cursor;
-    const scene = this.#handlers.pace(inputTime === null ? PACE.playing : PACE.scrubbing);
+    const scrubbing = inputTime !== null && inputTime - this.#input.time < SCRUB_GAP;
+    const pace = scrubbing ? PACE.scrubbing : inputTime === null ? PACE.playing : PACE.idle;
+    if (inputTime !== null) this.#input = { time: inputTime, drawn: false };
+    const scene = this.#handlers.pace(pace);
     this.#enqueue({ ...cursor, size: MAP_SIZE.coarse, scene }, inputTime);
     clearTimeout(this.#fineTimer);
     this.#fineTimer = setTimeout(
@@ -242,7 +249,9 @@ export class ViewSocket {
     }
     if (type === 'drawn') {
       if (cause.size === MAP_SIZE.fine && serial === this.#newest) this.#handlers.pace(PACE.idle);
-      this.#handlers.drawn(step, cause);
+      const first = step === this.#last?.step && !this.#input.drawn;
+      if (first) this.#input.drawn = true;
+      this.#handlers.drawn(step, first ? this.#input.time : null);
       for (const key of this.#sent.keys()) if (key <= serial) this.#sent.delete(key);
     }
     if (type === 'error') {

@@ -6,10 +6,12 @@ import { MARGIN } from './draw_map.js';
 
 const MIN_SIDE = 60; // px
 const MAX_COLUMNS = 4; // of one row, before two rows are tried
+const USEFUL_SIDE = 100; // px; more than four maps are not smaller: their area is scrolled instead
 export const CLOSE_UP = 4; // zoom while all maps of the run fit into it
 
 /**
- * Returns the largest square of a map that fits, and the number of maps in a row: all, or half of more than four.
+ * Returns the largest square of a map that fits, and the number of maps in a row: all, or half of more than four. More
+ * than four maps that would be too small get as many rows as their useful size needs, which exceed the height.
  * @param {number} count of maps
  * @param {number} width px of the area of all maps
  * @param {number} height px
@@ -23,6 +25,15 @@ export function mapLayout(count, width, height, head) {
     return { columns, side: Math.floor(Math.min((width - margins) / columns, vertical)) };
   });
   const largest = layouts.reduce((best, layout) => (layout.side > best.side ? layout : best));
+  if (count > MAX_COLUMNS && largest.side < USEFUL_SIDE) {
+    const slot = USEFUL_SIDE + MARGIN.gap + MARGIN.right;
+    const fitting = Math.floor((width - MARGIN.left + MARGIN.gap) / slot);
+    const columns = Math.min(Math.max(fitting, 1), count);
+    const margins = MARGIN.left + (columns - 1) * MARGIN.gap + columns * MARGIN.right;
+    const vertical = height - MARGIN.bottom - MARGIN.top - head; // one row in view
+    const side = Math.floor(Math.min((width - margins) / columns, vertical));
+    return { columns, side: Math.max(USEFUL_SIDE, side) };
+  }
   return { ...largest, side: Math.max(MIN_SIDE, largest.side) };
 }
 

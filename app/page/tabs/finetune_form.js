@@ -177,7 +177,7 @@ export class FinetuneForm {
       ...single.map(({ only }) => pair(only.join('+'), `only ${only.join(' + ')}`)),
     ]);
     fill(this.#select('slice'), [
-      ...this.#slices.map(({ name }) => pair(name, name)),
+      ...this.#slices.map(({ name }) => pair(name, displayName(name))),
       ['', 'clean data only'],
       [CUSTOM, 'custom'],
     ]);
@@ -301,7 +301,7 @@ export class FinetuneForm {
     const chosen = select.value;
     fill(
       select,
-      names.map((name) => pair(name, name)),
+      names.map((name) => pair(name, displayName(name))),
     );
     select.value = this.#hasOwnCriterion && names.includes(chosen) ? chosen : trained;
   }

@@ -11,7 +11,7 @@ import {
   lineStyle,
   scaled,
 } from '../core/palette.js';
-import { displayName, significant } from '../core/units.js';
+import { displayName, significant, typeset } from '../core/units.js';
 import { FONT, LABEL, tickLabels } from '../timeline/chart.js';
 
 /** @typedef {[low: number, high: number]} Range */
@@ -60,7 +60,7 @@ export function drawPlot(parent, plot) {
         {
           ...axisStyle(),
           ...LABEL,
-          label: plot.x_label,
+          label: typeset(plot.x_label),
           size: scaled(16),
           gap: 2,
           space: scaled(40),
@@ -72,7 +72,7 @@ export function drawPlot(parent, plot) {
         {
           ...axisStyle(),
           ...LABEL,
-          label: plot.y_label,
+          label: typeset(plot.y_label),
           size: scaled(40),
           gap: 3,
           space: scaled(24),
@@ -137,7 +137,7 @@ function paint(canvas, colours) {
 }
 
 /** @param {string} text */
-export const label = (text) => displayName(text).replaceAll('+', ' + ');
+export const label = (text) => typeset(displayName(text)).replaceAll('+', ' + ');
 
 /** @param {string} title */
 export const heading = (title) =>

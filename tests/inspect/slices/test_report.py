@@ -95,6 +95,22 @@ def test_a_planted_slice_in_words(traces: list[Trace]) -> None:
     assert len(report.tables()[0].rows) == len(report.slices)
 
 
+def test_each_slice_opens_an_episode_of_its_own(traces: list[Trace]) -> None:
+    """Two conditions enlarge the errors; both hold in the episodes with the largest ones."""
+    planted = []
+    for i, trace in enumerate(traces * 2):
+        heavy, wet = i % EPISODES < 5, i % 3 == 0
+        episode = replace(trace.episode, provenance={"heavy load": heavy, "wet floor": wet})
+        factor = (3.0 if heavy else 1.0) * (3.0 if wet else 1.0)
+        estimate = episode.states + factor * (trace.estimate_mean - episode.states)
+        planted.append(replace(trace, episode=episode, episode_index=i, estimate_mean=estimate))
+    slices = slices_of(planted).slices
+    assert len(slices) > 1
+    assert all(slice_.worst[0] in slice_.episodes for slice_ in slices)
+    opened = [slice_.worst[0] for slice_ in slices]
+    assert len(set(opened)) == len(opened)
+
+
 def test_invalid_scores(traces: list[Trace]) -> None:
     with pytest.raises(BadInput, match=r"score .*'speed'"):
         slices_of(traces, "speed")
