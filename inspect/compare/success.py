@@ -114,8 +114,9 @@ def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference |
 
 def _advice(rows: Sequence[SliceChange]) -> str:
     """Why a criterion is inconclusive, and what would decide it."""
-    names = " and ".join(row.slice for row in rows if row.outcome == "inconclusive")
-    return f" These held-out episodes are too few to decide {names}: more of them (--data) narrow the 95 % interval."
+    *names, last = (row.slice for row in rows if row.outcome == "inconclusive")
+    listed = f"{', '.join(names)} and {last}" if names else last
+    return f" These held-out episodes are too few to decide {listed}: more of them (--data) narrow the 95 % interval."
 
 
 def _description(row: SliceChange) -> str:
