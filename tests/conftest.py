@@ -53,6 +53,8 @@ def no_processes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
     if "not slow" not in request.config.getoption("-m"):
         return
 
+    import mujoco  # noqa: F401  (starts a process when it is imported first)
+
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("this test starts a process: mark it slow")
 

@@ -21,6 +21,7 @@ def result(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str], *optio
     return code, captured.out + captured.err
 
 
+@pytest.mark.slow
 def test_equal_numbers_pass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = """Of 12,345 episodes, errors are 1.23 and 2 cm.<!-- claim: PRINT => $.rmse.x * 100, $.rmse.y -->
 | a | 12,345 <!-- claim: PRINT => "episodes": .(\\d+), --> |
@@ -31,6 +32,7 @@ An error of 0.012 <!-- claim: PRINT => $.rmse.x --> to 0.02<!-- claim: PRINT => 
     assert output.count("python -c") == 1, "the same command must run once"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [
@@ -48,6 +50,7 @@ def test_wrong_numbers_fail(text: str, tmp_path: Path, capsys: pytest.CaptureFix
     assert result(tmp_path, text, capsys)[0] == 1
 
 
+@pytest.mark.slow
 def test_long_commands_run_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = "The error is 9 cm<!-- claim long: PRINT => $.rmse.y --> in 7 s<!-- measured: PRINT -->."
     assert result(tmp_path, text, capsys)[0] == 0

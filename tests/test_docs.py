@@ -86,7 +86,6 @@ def test_false_alarms_of_every_trained_filter_are_documented() -> None:
     assert max(map(float, rates.values())) <= 5.0, "no alarm in 95 % of the samples"
 
 
-@pytest.mark.slow  # MuJoCo starts a process when it is imported
 def test_python_reference_is_complete() -> None:
     text = (ROOT / "docs" / "python_reference.md").read_text()
     names = re.findall(r"^::: (\S+)\.(\w+)$", text, re.MULTILINE)
