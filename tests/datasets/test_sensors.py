@@ -102,6 +102,7 @@ def run() -> Trace:
     return trace(ExternalFilter(Adapter(Reader(), mean=4 * (0.0,), std=4 * (1.0,)), TASK, "reader"), make_episode())
 
 
+@pytest.mark.slow
 def test_data_set_and_definition(tmp_path: Path) -> None:
     path = tmp_path / "hand.h5"
     write_dataset(path, TASK, [make_episode(0), make_episode(1)])
