@@ -69,7 +69,8 @@ def faults_for(episodes: Sequence[Episode]) -> list[str]:
 
 def of_seed(name: str, seed: int) -> str:
     """The checkpoint of another training seed."""
-    return name.replace(".safetensors", f"-seed{seed}.safetensors") if seed else name
+    path = Path(name)
+    return str(path.with_stem(f"{path.stem}-seed{seed}")) if seed else name
 
 
 def squared_errors(filters: Sequence[Filter], episodes: Sequence[Episode], text: str) -> Array:

@@ -91,10 +91,10 @@ def test_episodes(folder: Path) -> list[Episode]:
         return list(data)
 
 
-def black_shares(episodes: Sequence[Episode]) -> list[str]:
+def black_shares(episodes: Sequence[Episode]) -> list[int]:
     """Share of steps without an image at each of ``OUTAGES``, in percent."""
     own = float(np.mean([episode.observations["image"].max(axis=(1, 2)) == 0 for episode in episodes]))
-    return [f"{100 * (own + (1 - own) * share):.0f} %" for share in OUTAGES]
+    return [round(100 * (own + (1 - own) * share)) for share in OUTAGES]
 
 
 def results(folder: Path, name: str, seed: int) -> dict[str, Array]:
@@ -130,9 +130,9 @@ def verdict(low: float, high: float) -> str:
     return "holds" if high < 1.0 else "**does not**" if low > 1.0 else "open"
 
 
-def tables(values: dict[str, dict[str, Array]], key: str, shares: Sequence[str]) -> str:
+def tables(values: dict[str, dict[str, Array]], key: str, shares: Sequence[int]) -> str:
     """Errors of all filters, and the claims, by share of outages."""
-    head = " | ".join(shares)
+    head = " | ".join(f"{share} %" for share in shares)
     lines = [f"| filter | {head} |", f"| --- |{' ---: |' * len(OUTAGES)}"]
     for name, by_key in values.items():
         cells = [f"{v:.2f} [{low:.2f}, {high:.2f}]" for v, low, high in map(rmse, by_key[key])]
@@ -146,7 +146,7 @@ def tables(values: dict[str, dict[str, Array]], key: str, shares: Sequence[str])
     return "\n".join(lines)
 
 
-def draw(values: dict[str, dict[str, Array]], key: str, shares: Sequence[str], path: Path) -> None:
+def draw(values: dict[str, dict[str, Array]], key: str, shares: Sequence[int], path: Path) -> None:
     """RMSE against the share of outages, one line per filter."""
     figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     colours = dict(zip((*RULES, "image", "haptics", "lstm", "transformer"), plt.get_cmap("tab10").colors, strict=False))
@@ -156,7 +156,7 @@ def draw(values: dict[str, dict[str, Array]], key: str, shares: Sequence[str], p
         if INFORMATION in name:
             style |= {"linewidth": 2.5}
         axes.plot(
-            [float(share.split()[0]) for share in shares],
+            shares,
             [rmse(s)[0] for s in by_key[key]],
             marker="o",
             markersize=3,
