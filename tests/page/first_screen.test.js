@@ -77,6 +77,26 @@ test('short outages and those in free motion are no finding', () => {
   assert.equal(outageFinding(run(14, 9), 0), null);
 });
 
+test('an injected fault that the diagnosis does not name comes before an outage', () => {
+  const frozen = {
+    ...run(14),
+    header: { faults: 'image_frozen=10' },
+    faultLabel: 'injected: image frozen',
+    faulty: series((t) => Number(t >= 10)),
+    error: () => series((t) => (t >= 10 ? 2 : 0.5)),
+  };
+  const result = finding(frozen, 0, HEALTHY);
+  assert.equal(result.headline, 'Injected: image frozen, from step 10.');
+  assert.equal(
+    result.evidence,
+    'Mean position error 0.50 cm before, 2.00 cm from then on. Diagnosis: Healthy: all is normal.',
+  );
+  assert.deepEqual([result.step, result.tone], [10, 'warn']);
+  assert.equal(finding(frozen, 0, FAULT).headline, 'Image frozen from step 31.');
+  const always = { ...frozen, faulty: series(() => 0) };
+  assert.match(finding(always, 0, HEALTHY).headline, /goes dark at step 8/);
+});
+
 test('a fault comes first, then the outage, then the largest error', () => {
   const fault = finding(run(14), 0, FAULT);
   assert.deepEqual(fault, {

@@ -1,4 +1,4 @@
-/** The finding of a run in words: an outage, the diagnosis, or its largest error. */
+/** The finding of a run in words: the diagnosis, an injected fault, an outage, or its largest error. */
 
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Diagnosis } from '../types/server.js' */
@@ -20,7 +20,8 @@ const BEFORE = 10; // steps that are compared with the outage
  */
 
 /**
- * Describes a run. A fault comes first, then an outage of the camera in contact, then the largest error.
+ * Describes a run. A diagnosed fault comes first, then an injected one, an outage of the camera in contact, and the
+ * largest error.
  * @param {Trace} trace
  * @param {number} component whose effective weights are described
  * @param {Diagnosis | null} diagnosis null without one
@@ -29,6 +30,11 @@ const BEFORE = 10; // steps that are compared with the outage
 export function finding(trace, component, diagnosis) {
   const fault = diagnosis && diagnosis.state !== 'healthy' ? faultFinding(diagnosis) : null;
   if (fault?.evidence) return fault;
+  const injected = trace.header.faults ? injectedFinding(trace) : null;
+  if (injected) {
+    const diagnosed = diagnosis ? `Diagnosis: ${sentence(diagnosis.headline)}` : '';
+    return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
+  }
   const outage = fault ? null : outageFinding(trace, component);
   if (outage) return { ...outage, tone: diagnosis ? 'good' : 'none' };
   const worst = worstFinding(trace, component);
@@ -51,6 +57,27 @@ function faultFinding({ state, masked, headline, causes }) {
     headline: sentence(headline),
     evidence: typeset(evidence.map(({ text }) => sentence(text)).join(' ')),
     step,
+  };
+}
+
+/**
+ * Describes the injected faults, and the errors before and from their first step; null if they have no first step.
+ * @param {Trace} trace
+ * @returns {Finding | null}
+ */
+function injectedFinding(trace) {
+  const first = trace.faulty.findIndex((value) => value > 0);
+  if (first < 0) return null;
+  const error = trace.error('fused', 'main');
+  const [before, during] = [error?.subarray(0, first), error?.subarray(first)].map((values) =>
+    withUnit(fixed(mean(values?.filter(Number.isFinite) ?? []), 2), trace.mainUnit),
+  );
+  const comparison = `Mean ${trace.task.main.name} error ${before} before, ${during} from then on.`;
+  return {
+    tone: 'warn',
+    headline: `${sentence(trace.faultLabel).slice(0, -1)}, from ${trace.stepLabel(first)}.`,
+    evidence: error && first > 0 ? comparison : '',
+    step: first,
   };
 }
 
