@@ -83,7 +83,7 @@ class Criterion:
         """The criterion in words."""
         name = BELIEF.get(self.measure, f"{measures(task)[self.measure]} error")
         return (
-            f"The {name} in slice \u201c{self.slice}\u201d falls by at least {_percent(self.by, ' ')}, and in no other "
+            f"The {name} in slice \u201c{self.slice.replace('_', ' ')}\u201d falls by at least {_percent(self.by, ' ')}, and in no other "
             f"slice rises by more than {_percent(self.others, ' ')}."
         )
 

@@ -114,7 +114,7 @@ def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference |
 
 def _advice(rows: Sequence[SliceChange]) -> str:
     """Why a criterion is inconclusive, and what would decide it."""
-    *names, last = (row.slice for row in rows if row.outcome == "inconclusive")
+    *names, last = (_title(row.slice) for row in rows if row.outcome == "inconclusive")
     listed = f"{', '.join(names)} and {last}" if names else last
     return f" These held-out episodes are too few to decide {listed}: more of them (--data) narrow the 95 % interval."
 
@@ -124,4 +124,9 @@ def _description(row: SliceChange) -> str:
     interval = ""
     if not math.isnan(row.low):
         interval = f", 95 % interval {round(100 * row.low):+d} to {round(100 * row.high):+d} %"
-    return f"{row.slice} {100 * row.change:+.1f} % ({values}{interval})"
+    return f"{_title(row.slice)} {100 * row.change:+.1f} % ({values}{interval})"
+
+
+def _title(slice_name: str) -> str:
+    """The name of a slice in a text: those of fault slices are identifiers, such as image_noise."""
+    return slice_name.replace("_", " ")

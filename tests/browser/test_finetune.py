@@ -71,3 +71,9 @@ def test_filter_is_finetuned_promoted_and_discarded(
         panel.get_by_role("button", name="Discard").click()
     page.until(f"{SELECTED} === 'crossmodal-ekf'")
     assert page.page.evaluate(FILTERS) == before
+
+    with page.page.expect_request(lambda request: request.method == "POST" and "finetune" in request.url) as request:
+        panel.get_by_role("button", name="Train longer").click()
+    assert request.value.post_data_json["steps"] == 6
+    panel.get_by_role("button", name="Pause").click()
+    page.until("() => document.querySelector('#finetune .verdict').textContent.startsWith('Paused.')")

@@ -61,6 +61,7 @@ export class Finetune {
     this.#runView = new FinetuneRun(html('article', host), catalog, store, {
       back: () => this.#closeRun(),
       pauseOrResume: () => this.#pauseOrResume(),
+      trainLonger: () => this.#trainLonger(),
       decide: (decision, link) => this.#decide(decision, link),
     });
     jobs.listen((list) => this.#followJobs(list));
@@ -124,6 +125,12 @@ export class Finetune {
     else this.#start(run, run.settings);
   }
 
+  /** Starts a run with twice the steps of this one. */
+  #trainLonger() {
+    const run = this.#run;
+    if (run) this.#start(run, { ...run.settings, steps: 2 * run.settings.steps });
+  }
+
   /**
    * Starts a run, or resumes the one with the same settings.
    * @param {Pick<Selection, 'task' | 'filter' | 'data'>} selection
@@ -138,7 +145,8 @@ export class Finetune {
       this.#jobs.refresh();
       this.load();
     } catch (error) {
-      this.#form.showError(messageOf(error));
+      if (this.#run) this.#runView.showVerdict(messageOf(error));
+      else this.#form.showError(messageOf(error));
     }
   }
 

@@ -361,7 +361,7 @@ export class FinetuneForm {
  * @param {FineTuneRunInfo} run
  */
 export const trainingData = ({ settings }) =>
-  settings.mix.map(({ slice }) => slice.name).join(' and ') || 'clean data';
+  settings.mix.map(({ slice }) => displayName(slice.name)).join(' and ') || 'clean data';
 
 /** @param {SliceInfo} slice */
 const definition = ({ name, faults, contact, only }) => ({ name, faults, contact, only });

@@ -5,6 +5,7 @@
 
 import { create, element, html } from '../core/dom.js';
 import {
+  displayName,
   fixed,
   mainName,
   mainText,
@@ -50,7 +51,7 @@ export class FinetuneRun {
    * @param {HTMLElement} host
    * @param {Catalog} catalog
    * @param {Store} store
-   * @param {{back: () => void, pauseOrResume: () => void, decide: (decision: Decision, link?: string) => void}} handlers
+   * @param {{back: () => void, pauseOrResume: () => void, trainLonger: () => void, decide: (decision: Decision, link?: string) => void}} handlers
    *   link: to be opened afterwards
    */
   constructor(host, catalog, store, handlers) {
@@ -114,7 +115,7 @@ export class FinetuneRun {
       const { before, after, unit, limit, outcome } = slice;
       const values = [before, after].map((value) => withUnit(significant(value), unit));
       const bound = `${i ? '≤ +' : '≤ −'}${percent(Math.abs(Number(limit)))}`;
-      const texts = [slice.slice, ...values, changeText(slice), bound, outcome];
+      const texts = [displayName(slice.slice), ...values, changeText(slice), bound, outcome];
       const cells = texts.map((textContent) => create('td', { textContent }));
       cells[5].dataset.outcome = outcome;
       return create('tr', {}, ...cells);
@@ -128,7 +129,7 @@ export class FinetuneRun {
   }
 
   /** @param {FineTuneDetails} run */
-  #drawDecision({ finetuned: name, saved_as: place, result }) {
+  #drawDecision({ finetuned: name, saved_as: place, result, settings }) {
     const { success } = result ?? {};
     const primary = success?.outcome === 'met' ? 'promote' : '';
     const host = html('.decide', this.#host);
@@ -153,8 +154,18 @@ export class FinetuneRun {
         place === 'saved' || Boolean(noChange),
       ),
       this.#decisionButton('discard', 'Discard', 'Remove it from the catalog', place === null),
+      ...(success && success.outcome !== 'met' ? [this.#longerButton(2 * settings.steps)] : []),
       create('span', { textContent: text }),
     );
+  }
+
+  /** @param {number} steps */
+  #longerButton(steps) {
+    const title = `Fine-tune the base checkpoint again, with ${steps} steps; this run is kept`;
+    const textContent = 'Train longer';
+    const button = create('button', { type: 'button', className: 'text', textContent, title });
+    button.addEventListener('click', this.#handlers.trainLonger);
+    return button;
   }
 
   /**
@@ -232,7 +243,7 @@ function progressFigures({ losses, validations, steps }, task, settings) {
   const slice = criterionSlice(settings);
   const x = validations.map(({ step }) => step);
   const errors = names.map((name) => ({
-    name,
+    name: displayName(name),
     layer: name === slice ? 'fused' : '',
     x,
     y: changes(validations, name, key),
@@ -241,7 +252,7 @@ function progressFigures({ losses, validations, steps }, task, settings) {
   /** @type {Plot['lines']} */
   const bounds = names.includes(slice)
     ? [
-        { name: `limit of ${slice}`, layer: 'fused', x: [0, steps], y: [-by, -by] },
+        { name: `limit of ${displayName(slice)}`, layer: 'fused', x: [0, steps], y: [-by, -by] },
         { name: 'limit of the others', layer: 'truth', x: [0, steps], y: [others, others] },
       ]
     : [];

@@ -4,7 +4,7 @@
 /** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Plot } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
-import { percent } from '../core/units.js';
+import { displayName, percent } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { jobSummary } from '../widgets/jobs.js';
 import { trainingData } from './finetune_form.js';
@@ -93,7 +93,7 @@ export class FinetuneRuns {
       settings.success ? criterionText(settings.success) : '–',
       success?.outcome ?? state,
       target ? changeText(target) : '',
-      worst ? `${worst.slice} ${changeText(worst)}` : '',
+      worst ? `${displayName(worst.slice)} ${changeText(worst)}` : '',
       place ? PLACES[place] : '',
     ];
     const cells = texts.map((textContent) => create('td', { textContent, title: textContent }));
@@ -121,7 +121,12 @@ function overlay(runs, names, base, key, quantity) {
     if (!slice || validations.length < 2) return [];
     const y = changes(validations, slice, key);
     return [
-      { name: `${names.get(run)}: ${slice}`, layer: '', x: validations.map((v) => v.step), y },
+      {
+        name: `${names.get(run)}: ${displayName(slice)}`,
+        layer: '',
+        x: validations.map((v) => v.step),
+        y,
+      },
     ];
   });
   if (lines.length < 2) return null;
@@ -158,7 +163,7 @@ export function limits(text) {
 export function criterionText(text) {
   const { by, others } = limits(text);
   const [slice] = text.split(':');
-  return `${slice} at least ${by} % better, others at most ${others} % worse`;
+  return `${displayName(slice)} at least ${by} % better, others at most ${others} % worse`;
 }
 
 /**
