@@ -6,6 +6,8 @@ import { create } from '../core/dom.js';
 import { cssVariable, swatch } from '../core/palette.js';
 import { displayName, fixed, percent } from '../core/units.js';
 
+const ROWS = 5; // for which there is room; more are scrolled
+
 /**
  * @typedef {object} Column
  * @property {string} title
@@ -55,6 +57,9 @@ export class StepTable {
       row.style.setProperty('--line', `var(${cssVariable(source)})`);
       return row;
     });
+    if (trace.sources.length > ROWS)
+      this.#table.tabIndex = 0; // so that the keyboard scrolls it
+    else this.#table.removeAttribute('tabindex');
     this.#table.replaceChildren(
       create('thead', {}, create('tr', {}, create('td'), ...heads)),
       create('tbody', {}, ...rows),

@@ -17,6 +17,10 @@ import { FONT, LABEL, tickLabels } from '../timeline/chart.js';
 /** @typedef {[low: number, high: number]} Range */
 /** @typedef {{property: string, stroke: string, dash: number[], width: number}} LineStyle */
 
+/** Distances of the ticks of whole numbers, such as steps. */
+const WHOLE_STEPS = Array.from({ length: 8 }, (_, power) =>
+  [1, 2, 5].map((n) => n * 10 ** power),
+).flat();
 const PLOT_HEIGHT = scaled(190); // px
 /** Dashes of the second line of a layer, the third, ... */
 const DASHES = [
@@ -64,9 +68,7 @@ export function drawPlot(parent, plot) {
           size: scaled(16),
           gap: 2,
           space: scaled(40),
-          ...(plot.kind === 'bars' && xs.every(Number.isInteger)
-            ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] }
-            : {}),
+          ...(xs.every(Number.isInteger) ? { incrs: WHOLE_STEPS } : {}),
           ...(plot.names?.length ? namedTicks(plot.names) : {}),
         },
         {
