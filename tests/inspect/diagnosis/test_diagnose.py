@@ -87,6 +87,7 @@ def test_focused_episodes_are_compared_with_each_other() -> None:
     assert part.grouped != [case.grouped[i] for i in chosen]
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_does_not_matter() -> None:
     """Two blocks of episodes and up to three interventions, in one process and in two."""
     episodes = {i: Faults.parse("image_shift=3").apply(e) for i, e in simulated(0, 20).items()}
@@ -152,6 +153,7 @@ def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
     assert no_diagnosis(replace(filter_, healthy_profile=enough)) is None
 
 
+@pytest.mark.slow
 def test_external_filters_are_compared_with_a_measured_profile() -> None:
     external = open_filter("door", "examples/04_own_filter.py:build")
     with open_dataset(sample_path("door")) as data:

@@ -128,6 +128,7 @@ def test_profiles_of_format_1_have_no_reference() -> None:
     assert set(again.statistics) == set(NAMES)
 
 
+@pytest.mark.slow
 def test_a_measured_profile_is_that_of_new_episodes() -> None:
     """Statistics of images are measured with references that the episode is not part of."""
     checkpoint = load_checkpoint(PRETRAINED / "push-image-ekf.safetensors")
