@@ -82,8 +82,9 @@ class Criterion:
     def sentence(self, task: Task) -> str:
         """The criterion in words."""
         name = BELIEF.get(self.measure, f"{measures(task)[self.measure]} error")
+        slice_ = self.slice.replace("_", " ")
         return (
-            f"The {name} in slice \u201c{self.slice.replace('_', ' ')}\u201d falls by at least {_percent(self.by, ' ')}, and in no other "
+            f"The {name} in slice \u201c{slice_}\u201d falls by at least {_percent(self.by, ' ')}, and in no other "
             f"slice rises by more than {_percent(self.others, ' ')}."
         )
 
