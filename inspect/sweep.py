@@ -167,7 +167,7 @@ def summary(trace: Trace) -> Iterator[Row]:
     """
     error = measures.errors(trace)[:, -1]
     squared = {key: values.numpy() for key, values in squares(trace.task, torch.from_numpy(error)).items()}
-    *components, main = squared
+    main, components = trace.task.main_error.key, [component.key for component in trace.task.components]
     columns = {"nees": measures.nees(trace)[:, -1]} | _probabilities(trace, error.shape[-1])
     if trace.effective_sample_size is not None and trace.particle_count:
         columns["ess"] = trace.effective_sample_size / trace.particle_count

@@ -222,7 +222,7 @@ class TraceStore:
         checkpoint = catalog.filter(selection.filter)
         live = selection.data.startswith(LIVE_PREFIX)
         episode = self.live.episode(selection.data) if live else catalog.episode(selection.data, selection.episode)
-        selection.faults.check(checkpoint.task)
+        selection.faults.check(checkpoint.task, len(episode))
         if selection.edit is not None:
             selection.edit.faults.check(checkpoint.task)
         if selection.only:

@@ -72,10 +72,15 @@ class Faults:
     def __add__(self, other: Faults) -> Faults:
         return Faults(self.sequence + other.sequence)
 
-    def check(self, task: Task) -> None:
-        """Raise BadInput for a fault of a sensor that the task does not have."""
+    def check(self, task: Task, steps: int | None = None) -> None:
+        """Raise BadInput for a fault of a sensor that the task does not have, or that starts after the last step.
+
+        steps: number of steps of the longest episode; None if unknown.
+        """
         for fault in self.sequence:
             fault.keys(task)
+            if steps is not None and fault.from_ >= steps:
+                raise BadInput(f"fault {fault} starts after the last step, {steps - 1}")
 
     def apply(self, episode: Episode, seed: int = 0) -> Episode:
         """Return a faulty copy. Random numbers depend only on the seed, the episode's digest and each fault's position.

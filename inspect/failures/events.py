@@ -205,7 +205,8 @@ class Failures(Diagnostic):
         columns += tuple(f"{layer_label(layer)} {self.error_shown[0]}".rstrip() for layer in self.layers)
         columns += tuple(f"{display_name(name)} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
-        columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1] if len(self.layers) > 2)
+        if any(event.effective_weights is not None for event in events):
+            columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1])
         return Table("Worst events", columns, tuple(map(self._row, events)))
 
     def _row(self, event: Event) -> tuple[Value, ...]:

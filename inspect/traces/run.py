@@ -62,6 +62,7 @@ def trace(
     Raises:
         BadInput: the episode or the faults do not fit the checkpoint's task, or a setting is out of range.
     """
+    faults.check(checkpoint.task, len(episode))
     if isinstance(checkpoint, ExternalFilter):
         return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
     if particles_kept < 1:

@@ -107,7 +107,7 @@ def trace(
 
     Raises BadInput for an unknown filter, episode or fault, and if the data are of another task.
     """
-    checkpoint = load_filter(filter_)
+    checkpoint = _filter(filter_, data)
     episodes = _episodes(data, checkpoint)
     index = episodes.held_out()[0] if episode is None else episode
     injected = _faults(faults, checkpoint)
@@ -165,7 +165,7 @@ def diagnose(
 
     Raises BadInput for a filter without a healthy record.
     """
-    checkpoint = load_filter(filter_)
+    checkpoint = _filter(filter_, data)
     source, injected = _episodes(data, checkpoint), _faults(faults, checkpoint)
     indices = source.held_out() if episodes is None else episodes
     profile = None
@@ -194,7 +194,7 @@ def evaluate(
         episodes: indices; default: the held-out ones.
         start_offset: distance of the first belief from the true state, such as ``3cm,20deg``.
     """
-    checkpoint = load_filter(filter_)
+    checkpoint = _filter(filter_, data)
     source = _episodes(data, checkpoint)
     return evaluate_filter(
         checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
@@ -226,7 +226,7 @@ def find_failures(
 
     Raises BadInput for a score that the filter or task does not have.
     """
-    checkpoint = load_filter(filter_)
+    checkpoint = _filter(filter_, data)
     source = _episodes(data, checkpoint)
     injected = _faults(faults, checkpoint)
     return rank_failures(checkpoint, source, episodes, by=by, faults=injected, seed=seed, particles=particles)
@@ -287,7 +287,7 @@ def compare(
 
     Raises BadInput for filters that cannot be compared.
     """
-    first, second = load_filter(before), load_filter(after)
+    first, second = _filter(before, data), _filter(after, data)
     own = parse_slices(slices, (), first.task)
     source = _episodes(data, first)
     return compare_checkpoints(first, second, source, episodes, slices=own, particles=particles, seed=seed)
@@ -371,6 +371,12 @@ def _shipped(text: str) -> Path:
     if not name:
         raise BadInput(f"filter {text!r} is neither TASK/NAME, such as door/crossmodal-pf, nor a .safetensors file")
     return shipped(task, name)
+
+
+def _filter(filter_: object, data: Data) -> Checkpoint:
+    """The filter. The data define the task of a filter object of your own."""
+    own = not isinstance(filter_, Checkpoint | str | Path)
+    return load_filter(filter_, data.task if own and isinstance(data, Dataset) else "")
 
 
 def _episodes(data: Data, checkpoint: Checkpoint) -> Dataset:

@@ -93,8 +93,15 @@ test('an injected fault that the diagnosis does not name comes before an outage'
   );
   assert.deepEqual([result.step, result.tone], [10, 'warn']);
   assert.equal(finding(frozen, 0, FAULT).headline, 'Image frozen from step 31.');
-  const always = { ...frozen, faulty: series(() => 0) };
-  assert.match(finding(always, 0, HEALTHY).headline, /goes dark at step 8/);
+  const part = { ...frozen, faulty: series((t) => Number(t >= 10 && t < 15)) };
+  assert.match(finding(part, 0, HEALTHY).headline, /from step 10 to step 14\.$/);
+  assert.match(finding(part, 0, HEALTHY).evidence, /2\.00 cm in these steps\./);
+  const always = finding({ ...frozen, faulty: series(() => 0) }, 0, HEALTHY);
+  assert.equal(always.headline, 'Injected: image frozen, in all steps.');
+  assert.match(
+    always.evidence,
+    /^Largest error at step 10\..* Diagnosis: Healthy: all is normal\.$/,
+  );
 });
 
 test('a fault comes first, then the outage, then the largest error', () => {

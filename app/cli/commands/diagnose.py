@@ -53,7 +53,8 @@ def diagnose(
     other = None if base is None else open_filter(checkpoint.task, str(base))
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
-        episodes = {index: faults.apply(data[index], runs.seed) for index in indices}
+        clean = runs.clean_episodes(data, indices, faults)
+        episodes = {index: faults.apply(clean_episode, runs.seed) for index, clean_episode in clean.items()}
         failed = None if repair is None else data[repair]
     profile = _profile(checkpoint, profile_from)
     with console.progress("Diagnosing") as advance:

@@ -55,7 +55,7 @@ def train(
     from beliefscope.recordings.rerun_log.training_curves import log_losses
 
     opt.check_folder(log, "--log")
-    target = load_task(task)
+    target = load_task(opt.definition_of(task, data))
     settings = architecture(target, filter, networks)
     probabilities = parse_blackouts(blackouts)
     check_name("preset", preset, PLANS)

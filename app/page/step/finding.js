@@ -30,7 +30,7 @@ const BEFORE = 10; // steps that are compared with the outage
 export function finding(trace, component, diagnosis) {
   const fault = diagnosis && diagnosis.state !== 'healthy' ? faultFinding(diagnosis) : null;
   if (fault?.evidence) return fault;
-  const injected = trace.header.faults ? injectedFinding(trace) : null;
+  const injected = trace.header.faults ? injectedFinding(trace, component) : null;
   if (injected) {
     const diagnosed = diagnosis ? `Diagnosis: ${sentence(diagnosis.headline)}` : '';
     return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
@@ -61,21 +61,28 @@ function faultFinding({ state, masked, headline, causes }) {
 }
 
 /**
- * Describes the injected faults, and the errors before and from their first step; null if they have no first step.
+ * Describes the injected faults, and the errors before and with them, or the largest one if they are in all steps.
  * @param {Trace} trace
- * @returns {Finding | null}
+ * @param {number} component whose effective weights are described
+ * @returns {Finding}
  */
-function injectedFinding(trace) {
-  const first = trace.faulty.findIndex((value) => value > 0);
-  if (first < 0) return null;
+function injectedFinding(trace, component) {
+  const label = sentence(trace.faultLabel).slice(0, -1);
+  const [first, last] = [trace.faulty.indexOf(1), trace.faulty.lastIndexOf(1)];
+  if (first < 0) {
+    const { headline, evidence, step } = worstFinding(trace, component);
+    const text = `${headline} ${evidence}`.trim();
+    return { tone: 'warn', headline: `${label}, in all steps.`, evidence: text, step };
+  }
   const error = trace.error('fused', 'main');
-  const [before, during] = [error?.subarray(0, first), error?.subarray(first)].map((values) =>
-    withUnit(fixed(mean(values?.filter(Number.isFinite) ?? []), 2), trace.mainUnit),
+  const [before, during] = [error?.subarray(0, first), error?.subarray(first, last + 1)].map(
+    (values) => withUnit(fixed(mean(values?.filter(Number.isFinite) ?? []), 2), trace.mainUnit),
   );
-  const comparison = `Mean ${trace.task.main.name} error ${before} before, ${during} from then on.`;
+  const end = last + 1 < trace.steps ? ` to ${trace.stepLabel(last)}` : '';
+  const comparison = `Mean ${trace.task.main.name} error ${before} before, ${during} ${end ? 'in these steps' : 'from then on'}.`;
   return {
     tone: 'warn',
-    headline: `${sentence(trace.faultLabel).slice(0, -1)}, from ${trace.stepLabel(first)}.`,
+    headline: `${label}, from ${trace.stepLabel(first)}${end}.`,
     evidence: error && first > 0 ? comparison : '',
     step: first,
   };

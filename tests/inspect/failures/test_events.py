@@ -341,6 +341,13 @@ def test_figures_and_tables(survey: Survey) -> None:
     assert len(axes.lines) == len(failures.plots()[0].lines) >= 2
 
 
+def test_the_table_of_a_filter_without_weights_has_none(traces: list[Trace]) -> None:
+    runs = [replace(run, weights=None, effective_weights=None) for run in traces]
+    table = failures_of(Survey.from_traces(runs), "error").tables()[-1]
+    assert not [name for name in table.columns if "weight" in name]
+    assert {len(row) for row in table.rows} == {len(table.columns)}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
