@@ -7,14 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
+from beliefscope.datasets import episode_parts, store
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_parts import EpisodeParts
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.readers import episode_file
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import run
@@ -27,8 +32,10 @@ from beliefscope.inspect.trace import (
     header_of,
     load_trace,
     save_trace,
+    save_trace_parts,
     trace,
     trace_from_arrays,
+    trace_parts,
 )
 from beliefscope.inspect.traces import run as run_module
 from beliefscope.inspect.traces.replay import Replay
@@ -179,7 +186,7 @@ def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.
     with open_dataset(sample_path(task)) as dataset:
         episode = dataset[dataset.held_out()[0]]
     whole = trace(checkpoint, episode)
-    monkeypatch.setattr(run_module, "STEPS_ENCODED", 37)
+    monkeypatch.setattr(run_module, "STEPS_PER_PART", 37)
     in_blocks = trace(checkpoint, episode)
     for key, values in arrays_of(whole).items():
         # Products of matrices with fewer rows round differently.
@@ -214,3 +221,54 @@ def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, mo
     assert standalone(checkpoint, sample, "image").particle_count == 2000
     with pytest.raises(BadInput, match="particles kept must be at least 1"):
         trace(checkpoint, episode, particles_kept=0)
+
+
+@pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door/crossmodal-pf", "push-field/information-ekf"])
+def test_trace_in_parts_has_the_same_bytes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The evidence of the last filter depends on several steps."""
+    task, filter_name = name.split("/")
+    with open_dataset(sample_path(task)) as dataset:
+        episode = dataset[dataset.held_out()[0]]
+    for module in (store, episode_file, episode_parts, run_module):
+        monkeypatch.setattr(module, "STEPS_PER_PART", 30)
+    path = tmp_path / "long.h5"
+    write_dataset(path, episode.task, [episode])
+    checkpoint = load_checkpoint(shipped(task, filter_name))
+    settings = {"seed": 3, "particles": 40, "particles_kept": 11}
+    save_trace(trace(checkpoint, episode, 0, **settings), tmp_path / "whole.trace")
+    progress: list[float] = []
+    with open_dataset(path, episode.task) as dataset:
+        parts = dataset.in_parts(0)
+        assert isinstance(parts, EpisodeParts)
+        written = list(trace_parts(checkpoint, parts, 0, progress=progress.append, **settings))
+    assert len(written) >= 4
+    assert max(map(len, written)) <= 30
+    first = save_trace_parts(written, len(episode), tmp_path / "parts.trace")
+    assert first.data_hash == episode.digest()
+    assert (progress[-1], len(progress)) == (1.0, len(episode))
+    assert (tmp_path / "parts.trace").read_bytes() == (tmp_path / "whole.trace").read_bytes()
+
+
+def test_trace_file_is_that_of_safetensors(traced: Trace, tmp_path: Path) -> None:
+    save_trace(traced, tmp_path / "run.trace")
+    arrays = {key: np.ascontiguousarray(array) for key, array in arrays_of(traced).items()}
+    arrays |= {"episode/time": np.arange(len(traced), dtype=np.float64)}
+    timed = replace(traced, episode=replace(traced.episode, time=arrays["episode/time"]))
+    save_trace(timed, tmp_path / "timed.trace")
+    metadata = {"beliefscope-trace": json.dumps(header_of(timed), sort_keys=True)}
+    assert (tmp_path / "timed.trace").read_bytes() == safetensors.numpy.save(arrays, metadata)
+
+
+def test_modified_parts_are_refused(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (store, episode_file, episode_parts):
+        monkeypatch.setattr(module, "STEPS_PER_PART", 30)
+    path = tmp_path / "long.h5"
+    write_dataset(path, episode.task, [episode])
+    with h5py.File(path, "r+") as file:
+        file["trajectory0/states"][40] += np.float32(0.1)
+    checkpoint = load_checkpoint(shipped("door", "haptics-ekf"))
+    with open_dataset(path) as dataset:
+        parts = dataset.in_parts(0)
+        assert isinstance(parts, EpisodeParts)
+        with pytest.raises(BadInput, match=r"trajectory0 in .* do not match its digest"):
+            next(trace_parts(checkpoint, parts))
