@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.replay import body_poses, replay_model
@@ -53,7 +54,8 @@ class Bodies:
             return
         positions, rotations = body_poses(self._model, qpos)
         for body, name in self._solids:
-            transforms = rr.Transform3D.columns(translation=positions[:, body], mat3x3=rotations[:, body])
+            quaternions = Rotation.from_matrix(rotations[:, body]).as_quat()  # x, y, z, w, as in Rerun
+            transforms = rr.Transform3D.columns(translation=positions[:, body], quaternion=quaternions)
             yield f"world/bodies/{name}", transforms
 
 
