@@ -132,7 +132,7 @@ SCHEMA: tuple[Entity, ...] = (
         "(3,), (4,)",
         "m",
         "bodies",
-        "position and quaternion of each body of robot and object; its shape is a static `Mesh3D`",
+        "position and quaternion of each body of robot and object, static if fixed; its shape is a static `Mesh3D`",
     ),
     Entity(
         "world/object/{state}",
@@ -220,7 +220,7 @@ SCHEMA: tuple[Entity, ...] = (
         "(S, S)",
         "u8",
         "maps",
-        "PNG: 255 x quantity / its maximum",
+        "PNG of 16 bits: 255 x quantity / its maximum",
     ),
     Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log of the quantity at the maximum"),
     Entity("maps/{layer}/truth", "Boxes2D", "(1, 2)", "cells", "maps", "true position on the map"),

@@ -49,7 +49,7 @@ memory until the file is complete. Each chunk of an entity has 2 kB of metadata.
 PARTICLES_PER_CHUNK, STEPS_WITH_PARTICLES = 300_000, 100
 """Number of particles over all steps of a chunk (20 MB), and minimum number of its steps."""
 
-MAPS_PER_CHUNK = 64
+MAPS_PER_CHUNK = 100
 LAYOUT_STEPS = 1000
 
 
@@ -190,8 +190,8 @@ def send_header(stream: rr.RecordingStream, trace: Trace, bodies: Bodies, steps:
     """
     _send_properties(stream, trace, steps)
     _send_static(stream, trace, trace.task, steps)
-    for entity, mesh in bodies.meshes():
-        stream.log(entity, mesh, static=True)
+    for entity, archetype in bodies.static():
+        stream.log(entity, archetype, static=True)
 
 
 def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> None:

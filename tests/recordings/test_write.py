@@ -187,7 +187,9 @@ def test_precision_of_maps(new_trace: Callable[..., Trace], new_map: MapMaker, t
                 assert batch.column(STEP).to_pylist() == [12]
                 values[name] = batch.column(name)
     png = values["EncodedDepthImage:blob"].flatten().flatten().to_numpy().tobytes()
-    shares = np.asarray(Image.open(BytesIO(png)))[::-1] / 255.0
+    image = Image.open(BytesIO(png))
+    assert image.mode == "I;16", "the viewer draws images of 8 bits black"
+    shares = np.asarray(image)[::-1] / 255.0
     log_peak = values["Scalars:scalars"].flatten().to_numpy()[0]
     likelihood = np.exp(map_.log_likelihood[1].astype(float))
     assert np.abs(shares * np.exp(log_peak) - likelihood).max() <= likelihood.max() / 510 * 1.0001

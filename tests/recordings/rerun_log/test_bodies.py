@@ -60,6 +60,17 @@ def test_poses_equal_the_replay(run: Trace, tmp_path: Path) -> None:
     assert "Mesh3D:vertex_positions" in recorded
 
 
+def test_bodies_that_cannot_move_have_one_pose(run: Trace, tmp_path: Path) -> None:
+    write_recording(run, tmp_path / "run.rrd")
+    replayed = replay(DOOR, run.episode)
+    assert replayed is not None
+    recorded = columns(tmp_path / "run.rrd", "world/bodies/link0")
+    body = replayed.model.body("link0").id
+    assert recorded["Transform3D:translation"].shape == (3,)
+    np.testing.assert_allclose(recorded["Transform3D:translation"], replayed.positions[0, body], atol=1e-6)
+    assert (replayed.positions[:, body] == replayed.positions[0, body]).all()
+
+
 def test_puck_is_a_cylinder(tmp_path: Path) -> None:
     write_recording(traced("push", "image-ekf"), tmp_path / "run.rrd")
     recorded = columns(tmp_path / "run.rrd", "world/object/truth")
