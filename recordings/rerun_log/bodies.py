@@ -33,7 +33,7 @@ class Bodies:
                 self._solids[body] = [mesh_of(shape) for shape in group]
 
     def static(self) -> Iterator[tuple[str, Any]]:
-        """Path and mesh of each body, and the poses of those that cannot move."""
+        """Path and mesh of each body, and the poses of fixed ones."""
         for (body, name), parts in self._solids.items():
             offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
             yield (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from beliefscope.datasets.readers import episode_file
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.evaluate import run
+from beliefscope.filters.evaluate import run as run_batch
 from beliefscope.inspect.diagnostics import particle_health
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import (
@@ -61,7 +62,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
 def test_tracing_does_not_change_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
     filter_ = checkpoint.filter
     batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
-    error, covariance = run(filter_, batch, only=None, particles=100, seed=7)
+    error, covariance = run_batch(filter_, batch, only=None, particles=100, seed=7)
     si = torch.from_numpy(traced.estimate_mean)
     assert torch.equal(si - batch.states[:, 0], error[:, 0])
     assert torch.equal(torch.from_numpy(traced.estimate_covariance), covariance[:, 0])
@@ -272,3 +273,33 @@ def test_modified_parts_are_refused(episode: Episode, tmp_path: Path, monkeypatc
         assert isinstance(parts, EpisodeParts)
         with pytest.raises(BadInput, match=r"trajectory0 in .* do not match its digest"):
             next(trace_parts(checkpoint, parts))
+
+
+def test_file_with_large_chunks_is_read_at_once(
+    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As earlier versions wrote them: each part would decompress all steps."""
+    write_dataset(tmp_path / "long.h5", episode.task, [episode])
+    monkeypatch.setattr(episode_file, "STEPS_PER_PART", 30)
+    with open_dataset(tmp_path / "long.h5") as dataset:
+        assert isinstance(dataset.in_parts(0), Episode)
+
+
+def test_command_reads_long_episodes_in_parts(
+    run: Callable[..., tuple[int, str, str]], episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = "trace door --filter crossmodal-pf --particles 20 --data long.h5 --episode 0 --json - -o"
+    with monkeypatch.context() as patch:
+        for module in (store, episode_file, episode_parts, run_module):
+            patch.setattr(module, "STEPS_PER_PART", 30)
+        write_dataset(tmp_path / "long.h5", episode.task, [episode])
+        parts = run(f"{line} parts.trace")
+    monkeypatch.setattr(run_module, "STEPS_PER_PART", 30)  # the same blocks of evidence, and so the same bits
+    whole = run(f"{line} whole.trace --faults image_shift=0")
+    assert (parts[0], whole[0]) == (0, 0), parts[2] + whole[2]
+    assert json.loads(parts[1])["steps"] == len(episode)
+    run_of_parts, run_of_whole = load_trace(tmp_path / "parts.trace"), load_trace(tmp_path / "whole.trace")
+    assert run_of_parts.data_hash == run_of_whole.data_hash == episode.digest()
+    for name, values in arrays_of(run_of_whole).items():
+        np.testing.assert_array_equal(arrays_of(run_of_parts)[name], values, err_msg=name)
