@@ -11,6 +11,7 @@ Rows of the large table are those of a real sweep, repeated for further checkpoi
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import re
 import resource
@@ -27,12 +28,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
 
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.sweep import Inputs
-from beliefscope.inspect.trace import save_trace, trace
 from beliefscope.recordings.sweep_table import CHECKPOINTS, RESULTS, TABLES, Experiments, run_sweep
 
 DOCS = Path(__file__).parents[1] / "docs" / "sweep.md"
@@ -157,32 +156,46 @@ def kill_sweep(folder: Path, kills: int, count: int = 50, episodes: int = 200) -
     sys.exit(not same)
 
 
-MEMORY = (("crossmodal-ekf", 10_000, 300), ("crossmodal-ekf", 40_000, 300), ("crossmodal-pf", 20, 1_000_000))
+MEMORY = (
+    ("crossmodal-ekf", 100, 300),
+    ("crossmodal-ekf", 10_000, 300),
+    ("crossmodal-ekf", 100_000, 300),
+    ("crossmodal-ekf", 1_000_000, 300),
+    ("crossmodal-pf", 20, 1_000_000),
+    ("crossmodal-pf", 100, 1_000_000),
+)
 """Filter, steps and particles of each measured trace."""
 
 
-def print_memory(name: str, steps: int, particles: int) -> None:
-    """Peak memory of this process after it traced and saved a run. Its episode repeats one of the sample data set."""
+def write_long_episode(path: Path, steps: int) -> None:
+    """A data set of one episode, which repeats one of the sample data set."""
     with open_dataset(sample_path("door")) as sample:
         episode = sample[0]
     index = np.arange(steps) % len(episode)
     arrays: dict[str, Any] = {key: getattr(episode, key)[index] for key in ("states", "controls", "contact", "qpos")}
     observations = {key: values[index] for key, values in episode.observations.items()}
-    long = replace(episode, **arrays, observations=observations, covariates={})
-    torch.set_num_threads(1)
-    before = peak_memory()
-    run = trace(load_checkpoint(shipped("door", name)), long, particles=particles)
+    write_dataset(path, episode.task, [replace(episode, **arrays, observations=observations, covariates={})])
+
+
+def print_memory(name: str, steps: int, particles: int) -> None:
+    """Peak memory of the command that traces and saves a run, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        save_trace(run, Path(folder) / "run.trace")
-        size = (Path(folder) / "run.trace").stat().st_size / 1e6
-    print(
-        f"{name}, {steps} steps, {particles} particles: {before:.0f} MB before, then {peak_memory():.0f}; {size:.0f} MB"
-    )
-
-
-def peak_memory() -> float:
-    """MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        data, output = Path(folder) / "long.h5", Path(folder) / "run.trace"
+        # In another process: a process inherits the peak memory of the one that starts it.
+        writing = get_context("spawn").Process(target=write_long_episode, args=(data, steps))
+        writing.start()
+        writing.join()
+        words = [sys.executable, "-m", "beliefscope", "trace", "door", "--filter", name, "--data", str(data)]
+        words += ["--episode", "0", "--particles", str(particles), "-o", str(output)]
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        if code := os.waitstatus_to_exitcode(status):
+            raise RuntimeError(f"the command ended with code {code}: {' '.join(words)}")
+        print(
+            f"{name}, {steps} steps, {particles} particles: peak {usage.ru_maxrss / 1e3:.0f} MB, "
+            f"{usage.ru_utime + usage.ru_stime:.0f} CPU-s, file {output.stat().st_size / 1e6:.0f} MB",
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -199,9 +212,7 @@ def main() -> None:
             kill_sweep(folder, arguments.kills)
         elif arguments.memory:
             for run in MEMORY:
-                process = get_context("spawn").Process(target=print_memory, args=run)
-                process.start()
-                process.join()
+                print_memory(*run)
         else:
             survey(folder)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_parts import EpisodeParts
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 
@@ -62,6 +63,10 @@ class Dataset(ABC):
         if not 0 <= index < len(self):
             raise BadInput(f"Episode {index} is not in {self.path}, which has episodes 0 to {len(self) - 1}.")
         return self._episode(index)
+
+    def in_parts(self, index: int) -> Episode | EpisodeParts:
+        """An episode that is read in parts, if it is long and the file allows it. Raises BadInput as ``[index]``."""
+        return self[index]
 
     def held_out(self) -> list[int]:
         """Indices of the test episodes, else of the validation episodes, else of all episodes."""

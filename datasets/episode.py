@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -117,18 +117,40 @@ class Episode:
     def __len__(self) -> int:
         return len(self.states)
 
+    def part(self, first: int, last: int) -> Episode:
+        """Steps ``first`` to ``last - 1``, as views of the same arrays; times still count from the first step."""
+        arrays: dict[str, Any] = {n: getattr(self, n)[first:last] for n in ("states", "controls", "contact", "qpos")}
+        for name in ("observations", "covariates"):
+            arrays[name] = {key: array[first:last] for key, array in getattr(self, name).items()}
+        return replace(self, **arrays, time=None if self.time is None else self.time[first:last])
+
     def digest(self) -> str:
         """SHA-256 over the names, shapes, types and bytes of the arrays, independent of the file format."""
-        arrays = {"states": self.states, "controls": self.controls, "contact": self.contact, "qpos": self.qpos}
+        return digest_of(self, len(self), lambda name: [self.arrays[name]])
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All arrays by name; ``observations/image`` is that of an observation."""
+        arrays: dict[str, NDArray[Any]] = {n: getattr(self, n) for n in ("states", "controls", "contact", "qpos")}
         arrays |= {f"observations/{key}": value for key, value in self.observations.items()}
         arrays |= {f"covariates/{key}": value for key, value in self.covariates.items()}
-        arrays |= {} if self.time is None else {"time": self.time}
-        digest = hashlib.sha256(f"{self.task.name} {self.dt} {self.seed} {self.split}".encode())
-        for name in sorted(arrays):
-            array = np.ascontiguousarray(arrays[name])
-            digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
-            digest.update(array.tobytes())
-        return digest.hexdigest()
+        return arrays if self.time is None else arrays | {"time": self.time}
+
+
+def digest_of(like: Episode, steps: int, blocks: Callable[[str], Iterable[NDArray[Any]]]) -> str:
+    """Digest of an episode whose arrays are read in blocks of consecutive steps.
+
+    Args:
+        like: some steps of the episode.
+        steps: of the whole episode.
+        blocks: name of an array -> its blocks.
+    """
+    digest = hashlib.sha256(f"{like.task.name} {like.dt} {like.seed} {like.split}".encode())
+    for name, array in sorted(like.arrays.items()):
+        digest.update(f"{name} {(steps, *array.shape[1:])} {array.dtype.str}".encode())
+        for block in blocks(name):
+            digest.update(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
 
 
 def step_text(step: int, time: float | None) -> str:

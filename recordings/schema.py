@@ -129,10 +129,10 @@ SCHEMA: tuple[Entity, ...] = (
     Entity(
         "world/bodies/{body}",
         "Transform3D",
-        "(3,), (3, 3)",
+        "(3,), (4,)",
         "m",
         "bodies",
-        "pose of each body of robot and object; its shape is a static `Mesh3D`",
+        "position and quaternion of each body of robot and object, static if fixed; its shape is a static `Mesh3D`",
     ),
     Entity(
         "world/object/{state}",
@@ -216,11 +216,11 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("maps/title", "TextDocument", "static", "text", "maps", "likelihood or posterior, and the fusion rule"),
     Entity(
         "maps/{layer}",
-        "DepthImage or LineStrips2D",
+        "EncodedDepthImage or LineStrips2D",
         "(S, S)",
         "u8",
         "maps",
-        "255 x quantity / its maximum",
+        "PNG of 16 bits: 255 x quantity / its maximum",
     ),
     Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log of the quantity at the maximum"),
     Entity("maps/{layer}/truth", "Boxes2D", "(1, 2)", "cells", "maps", "true position on the map"),

@@ -161,6 +161,7 @@ OVERVIEW = {
     "worst": "max(r.worst)",
     "worst_episode": "arg_max(r.episode, r.worst)",
     "worst_step": "arg_max(r.worst_step, r.worst)",
+    "worst_time": "arg_max_null(r.worst_time, r.worst)",
     "checkpoint": "r.checkpoint",
     "data": "r.data",
     "provenance": "any_value(c.provenance)",
@@ -205,7 +206,10 @@ class Experiments:
         for table in TABLES:
             files = [str(folder / f"{table}.parquet") for folder in self.folders]
             try:
-                self._database.read_parquet(files, union_by_name=True).create_view(table)
+                rows = self._database.read_parquet(files, union_by_name=True)
+                if table == RESULTS and "worst_time" not in rows.columns:  # of earlier versions
+                    rows = rows.project("*, NULL::DOUBLE AS worst_time")
+                rows.create_view(table)
             except duckdb.Error as error:
                 raise BadInput(f"damaged results of a sweep: {error}") from None
         paths = [str(folder) for folder in self.folders]
@@ -244,7 +248,7 @@ class Experiments:
     def episodes(self, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> pa.Table:
         """The results of one checkpoint by episode and seed, largest error first."""
         return self.query(
-            f"SELECT episode, seed, policy, steps, error, unit, worst, worst_step, nees FROM {RESULTS} "
+            f"SELECT episode, seed, policy, steps, error, unit, worst, worst_step, worst_time, nees FROM {RESULTS} "
             "WHERE checkpoint = ? AND data = ? AND faults = ? AND phase = ? ORDER BY error DESC, episode, seed",
             [checkpoint, data, faults, phase],
         )

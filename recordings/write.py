@@ -34,7 +34,7 @@ from beliefscope.datasets.task_json import task_to_json
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_from_arrays
-from beliefscope.inspect.traces.live_file import STATIC
+from beliefscope.inspect.traces.data import STATIC
 from beliefscope.recordings.rerun_log import entities
 from beliefscope.recordings.rerun_log.blueprint import blueprint
 from beliefscope.recordings.rerun_log.bodies import Bodies
@@ -42,11 +42,14 @@ from beliefscope.recordings.rerun_log.diagnostics import log_diagnostic
 from beliefscope.recordings.rerun_log.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
-STEPS_PER_CHUNK, CHUNKS = 100, 100
+STEPS_PER_CHUNK, CHUNKS = 1000, 100
 """Minimum number of steps per chunk, and maximum number of chunks: Rerun keeps an index of about 0.4 MB per chunk in
-memory until the file is complete."""
+memory until the file is complete. Each chunk of an entity has 2 kB of metadata."""
 
-MAPS_PER_CHUNK = 16
+PARTICLES_PER_CHUNK, STEPS_WITH_PARTICLES = 300_000, 100
+"""Number of particles over all steps of a chunk (20 MB), and minimum number of its steps."""
+
+MAPS_PER_CHUNK = 100
 LAYOUT_STEPS = 1000
 
 
@@ -83,7 +86,7 @@ def write_recording(
     layout = blueprint(sample, task, first[0] if first else None, diagnostics)
     bodies = Bodies(sample, task)
     with new_recording(Path(path), sample, bodies, len(trace), layout) as stream:
-        for start, last in chunks(len(trace)):
+        for start, last in chunks(len(trace), steps_per_chunk(trace)):
             send_steps(stream, trace, task, bodies, slice(start, last))
             report(0.5 * last / len(trace))
         for name, diagnostic in diagnostics.items():
@@ -141,9 +144,15 @@ def closing_layout(layout: rrb.Blueprint) -> Iterator[None]:
             stream.disconnect()
 
 
-def chunks(steps: int) -> Iterator[tuple[int, int]]:
+def steps_per_chunk(like: Trace) -> int:
+    """Minimum number of steps per chunk of a run. like: some of its steps."""
+    particles = 1 if like.particles is None else max(1, like.particles.shape[1])
+    return min(STEPS_PER_CHUNK, max(STEPS_WITH_PARTICLES, PARTICLES_PER_CHUNK // particles))
+
+
+def chunks(steps: int, minimum: int = STEPS_PER_CHUNK) -> Iterator[tuple[int, int]]:
     """(first, last + 1) steps of each chunk."""
-    size = max(STEPS_PER_CHUNK, math.ceil(steps / CHUNKS))
+    size = max(minimum, math.ceil(steps / CHUNKS))
     for first in range(0, steps, size):
         yield first, min(first + size, steps)
 
@@ -181,8 +190,8 @@ def send_header(stream: rr.RecordingStream, trace: Trace, bodies: Bodies, steps:
     """
     _send_properties(stream, trace, steps)
     _send_static(stream, trace, trace.task, steps)
-    for entity, mesh in bodies.meshes():
-        stream.log(entity, mesh, static=True)
+    for entity, archetype in bodies.static():
+        stream.log(entity, archetype, static=True)
 
 
 def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.store import open_dataset
@@ -68,8 +70,8 @@ def test_from_collect_to_record(run: Run, folder: Path) -> None:
     assert out.startswith("one.rrd (")
     assert len(out.splitlines()) == 1
     (chunk,) = RrdReader(folder / "one.rrd").stream().filter(content="/maps/image").drop(is_static=True)
-    maps = chunk.to_record_batch().column("DepthImage:buffer")
-    assert [len(row) for (row,) in maps.to_pylist()] == [11 * 11, 11 * 11]
+    maps = chunk.to_record_batch().column("EncodedDepthImage:blob")
+    assert [Image.open(BytesIO(bytes(row))).size for (row,) in maps.to_pylist()] == [(11, 11), (11, 11)]
 
 
 @pytest.mark.long  # six seconds

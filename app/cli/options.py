@@ -268,11 +268,14 @@ class Run(Runs):
 
     episode: int | None = None
 
+    def index(self, episodes: Dataset) -> int:
+        """Index of the selected episode, or of the first held-out one."""
+        return episodes.held_out()[0] if self.episode is None else self.episode
+
     def read_episode(self, task: Task) -> tuple[Episode, int]:
-        """The selected episode, or the first held-out one; and its index."""
+        """The selected episode, and its index."""
         with self.episodes(task) as episodes:
-            index = episodes.held_out()[0] if self.episode is None else self.episode
-            return episodes[index], index
+            return episodes[self.index(episodes)], self.index(episodes)
 
     def trace(self, align: bool = False, **settings: int) -> tuple[Checkpoint, Trace]:
         """The filter, and its run over the selected episode: see ``over``."""
@@ -344,12 +347,13 @@ def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Data
 
 
 def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:
-    """Description of a file created from a trace. extra: additional values of the JSON document."""
+    """Description of a file created from a trace. extra: values of the JSON document, besides those of the trace."""
     from beliefscope.inspect.traces.provenance import describe
 
-    run = f"{trace.filter} over {len(trace)} steps of {trace.task.name} episode {trace.episode_index}"
+    document = describe(trace) | extra
+    run = f"{trace.filter} over {document['steps']} steps of {trace.task.name} episode {trace.episode_index}"
     text = run + (f" with {trace.faults}" if trace.faults else "")
-    return console.Result(describe(trace) | extra, text, path)
+    return console.Result(document, text, path)
 
 
 def checkpoint_result(

@@ -5,15 +5,27 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from errno import EDQUOT, ENOSPC
 from pathlib import Path
+from typing import BinaryIO
 
 from beliefscope.datasets.errors import BadInput
 
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Replace a file atomically. Raises BadInput if it cannot be written, e.g. for a missing folder or a full disk."""
+    with replacing(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Yields a temporary file that replaces ``path`` when the block ends, unless with an error.
+
+    Raises BadInput as ``write_atomically``.
+    """
     path = Path(path)
     try:
         if not path.parent.is_dir():
@@ -21,7 +33,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         handle, temporary = tempfile.mkstemp(".part", f".{path.name[:100]}.", path.parent)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(data)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             os.chmod(temporary, 0o644)

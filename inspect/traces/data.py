@@ -156,6 +156,10 @@ ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type) and "Mapp
 """Names of the array fields of a trace."""
 
 
+STATIC = ("start_mean", "start_covariance")
+"""Arrays of a trace without a step axis."""
+
+
 def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
     """All arrays of a trace by name; those of its episode start with ``episode/``, its own scalars with ``extra/``."""
     episode = trace.episode

@@ -3,27 +3,45 @@
 from __future__ import annotations
 
 import json
+import math
+import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.io.atomic_write import replacing
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import task_to_json
-from beliefscope.inspect.traces.data import ARRAYS, Trace, arrays_of
+from beliefscope.inspect.traces.data import ARRAYS, STATIC, Trace, arrays_of
 from beliefscope.inspect.traces.validate import validate_trace
 
 FORMAT = 1
+
+_TYPES = {
+    "|b1": "BOOL",
+    "|u1": "U8",
+    "|i1": "I8",
+    "<i2": "I16",
+    "<u2": "U16",
+    "<f2": "F16",
+    "<i4": "I32",
+    "<u4": "U32",
+    "<f4": "F32",
+    "<f8": "F64",
+    "<i8": "I64",
+    "<u8": "U64",
+}
+"""NumPy's types and their names in safetensors, in the order by which safetensors sorts."""
 
 _RENAMED_ARRAYS = {"acting": "effective_weights"}
 _RENAMED_KINDS = {"foreign": "external"}
@@ -31,10 +49,58 @@ _RENAMED_KINDS = {"foreign": "external"}
 
 def save_trace(trace: Trace, path: Path) -> None:
     """Write a trace atomically. Raises BadInput if the folder does not exist."""
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays_of(trace).items()}
-    write_atomically(
-        path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header_of(trace), sort_keys=True)})
-    )
+    save_trace_parts([trace], len(trace), path)
+
+
+def save_trace_parts(parts: Iterable[Trace], steps: int, path: Path) -> Trace:
+    """Write consecutive parts of a trace as ``save_trace`` writes the whole, with one part in memory at a time.
+
+    Args:
+        steps: number of all steps.
+
+    Returns:
+        The first part.
+
+    Raises:
+        BadInput: the folder does not exist.
+    """
+    remaining = iter(parts)
+    first = next(remaining)
+    arrays = arrays_of(first)
+    shapes = {
+        name: (*([] if name in STATIC else [steps]), *a.shape[name not in STATIC :]) for name, a in arrays.items()
+    }
+    header, offsets = _layout({name: (array.dtype, shapes[name]) for name, array in arrays.items()}, header_of(first))
+    written = 0
+    with replacing(path) as file:
+        file.write(header)
+        for part in chain([first], remaining):
+            for name, array in arrays_of(part).items():
+                if name not in STATIC or not written:
+                    file.seek(offsets[name] + written * (array.nbytes // max(1, len(array))))
+                    file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+            written += len(part)
+        assert written == steps, (written, steps)
+    return first
+
+
+def _layout(
+    arrays: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]], header: Mapping[str, Any]
+) -> tuple[bytes, dict[str, int]]:
+    """Beginning of a safetensors file, and the offset of each array in it. arrays: type and shape.
+
+    Arrays are sorted as by the package safetensors, which cannot write in parts.
+    """
+    entries: dict[str, Any] = {"__metadata__": {"beliefscope-trace": json.dumps(header, sort_keys=True)}}
+    end, offsets = 0, {}
+    for name in sorted(arrays, key=lambda name: (-list(_TYPES).index(arrays[name][0].str), name)):
+        dtype, shape = arrays[name]
+        offsets[name], end = end, end + dtype.itemsize * math.prod(shape)
+        entries[name] = {"dtype": _TYPES[dtype.str], "shape": shape, "data_offsets": [offsets[name], end]}
+    text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    start = 8 + len(text)
+    return struct.pack("<Q", len(text)) + text, {name: start + offset for name, offset in offsets.items()}
 
 
 def header_of(trace: Trace) -> dict[str, Any]:

@@ -33,14 +33,11 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.traces.data import Trace, arrays_of
+from beliefscope.inspect.traces.data import STATIC, Trace, arrays_of
 from beliefscope.inspect.traces.file import header_of, trace_from_arrays
 
 FORMAT = 1
 SUFFIX = ".live"
-STATIC = ("start_mean", "start_covariance")
-"""Arrays of a trace without a step axis."""
-
 LARGEST_HEADER = 1 << 24
 LARGEST_STEP = 1 << 26
 LARGEST_BLOCK = 1 << 27

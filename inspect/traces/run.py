@@ -1,4 +1,4 @@
-"""Run a filter over an episode and assemble the trace."""
+"""Run a filter over an episode and assemble the trace, as a whole or in parts."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_parts import STEPS_PER_PART, EpisodeParts
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.filters.batch import Steps
+from beliefscope.filters.batch import Batch, Steps, check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, reweighted
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
@@ -29,9 +30,6 @@ from beliefscope.inspect.traces.external import trace_external
 
 PARTICLES_KEPT = 10_000
 """Particles of each step that a trace stores by default."""
-
-STEPS_ENCODED = 4096
-"""Steps of one episode that are encoded at once; limits memory."""
 
 PARTICLES_AT_ONCE = 1 << 21
 """Particles whose arrays are computed at once if not all are kept; limits memory."""
@@ -65,13 +63,42 @@ def trace(
     faults.check(checkpoint.task, len(episode))
     if isinstance(checkpoint, ExternalFilter):
         return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
-    if particles_kept < 1:
-        raise BadInput(f"particles kept must be at least 1, not {particles_kept}")
     run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
     arrays = run_arrays(
-        checkpoint, run.blocks(), len(episode), run.start, run.generator(), particles, particles_kept, progress
+        checkpoint,
+        encoded(run.filter, run.episode),
+        len(episode),
+        run.start,
+        run.generator(),
+        particles,
+        particles_kept,
+        progress,
     )
     return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
+
+
+@torch.no_grad()
+def trace_parts(
+    checkpoint: Checkpoint,
+    episode: EpisodeParts,
+    episode_index: int = 0,
+    seed: int = 0,
+    particles: int = 300,
+    progress: Callable[[float], None] | None = None,
+    particles_kept: int = PARTICLES_KEPT,
+) -> Iterator[Trace]:
+    """Yields consecutive parts of the trace of a built-in filter, with the same bits as ``trace``.
+
+    Memory does not grow with the steps. Arguments and errors as for ``trace``.
+    """
+    run = start_run(checkpoint, episode.part(0, 1), episode_index, seed, particles, NO_FAULTS)
+    provenance, done = {**run.provenance, "data_hash": episode.digest()}, 0
+    blocks = encoded(checkpoint.filter, episode)
+    for arrays in run_parts(
+        checkpoint, blocks, len(episode), run.start, run.generator(), particles, particles_kept, progress
+    ):
+        first, done = done, done + len(arrays["estimate_mean"])
+        yield assemble_trace(checkpoint, episode.part(first, done), run.start, arrays, **provenance)
 
 
 @dataclass(frozen=True)
@@ -81,14 +108,12 @@ class FilterRun:
     Attributes:
         episode: filter input, after fault injection.
         filter: of the run.
-        steps: the episode's steps.
         start: belief before step 0, N = 1.
         provenance: trace fields that identify the run.
     """
 
     episode: Episode
     filter: Filter
-    steps: Steps
     start: Gaussian
     provenance: Mapping[str, Any]
 
@@ -96,16 +121,7 @@ class FilterRun:
     def evidence(self) -> Evidence:
         """Evidence of all steps."""
         with torch.no_grad():
-            return self.filter.encode(self.steps.episode(0))
-
-    def blocks(self) -> Iterator[Evidence]:
-        """Evidence of consecutive steps, a limited number at once."""
-        total = len(self.episode)
-        for first in range(0, total, STEPS_ENCODED):
-            lead = min(first, self.filter.history)
-            size = min(STEPS_ENCODED, total - first)
-            batch = self.steps.windows(torch.tensor([first - lead]), lead + size)
-            yield self.filter.encode(batch)[lead:]
+            return self.filter.encode(_batch(self.filter, self.episode))
 
     def generator(self) -> torch.Generator:
         """A new generator of the run's random numbers."""
@@ -123,10 +139,23 @@ def start_run(
     filter_ = checkpoint.filter
     provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
     episode = faults.apply(episode, seed)
-    steps = Steps.from_episodes(filter_.task, [episode])
-    start = first_belief(filter_, steps.windows(steps.first, 1))
+    check_shapes(filter_.task, episode, f"episode {episode_index}")
+    start = first_belief(filter_, _batch(filter_, episode.part(0, 1)))
     settings = {"particles": particles, "torch": torch.__version__}
-    return FilterRun(episode, filter_, steps, start, provenance | {"settings": settings})
+    return FilterRun(episode, filter_, start, provenance | {"settings": settings})
+
+
+def encoded(filter_: Filter, episode: Episode | EpisodeParts) -> Iterator[Evidence]:
+    """Evidence of consecutive steps, a limited number at once."""
+    for first in range(0, len(episode), STEPS_PER_PART):
+        lead = min(first, filter_.history)
+        part = episode.part(first - lead, min(first + STEPS_PER_PART, len(episode)))
+        yield filter_.encode(_batch(filter_, part))[lead:]
+
+
+def _batch(filter_: Filter, episode: Episode) -> Batch:
+    """All steps of an episode, N = 1."""
+    return Steps.from_episodes(filter_.task, [episode]).episode(0)
 
 
 def run_arrays(
@@ -145,10 +174,34 @@ def run_arrays(
         total: T.
         progress: called with the completed fraction, 0..1.
     """
-    filter_ = checkpoint.filter
-    belief = filter_.start(start, particles, generator)
     arrays: dict[str, Tensor] = {}
     done = 0
+    for part in run_parts(checkpoint, blocks, total, start, generator, particles, particles_kept, progress):
+        first, done = done, done + len(part["estimate_mean"])
+        if done - first == total:
+            return part
+        for name, values in part.items():
+            if name not in arrays:  # once: small arrays that stay between large ones would fragment the memory
+                arrays[name] = values.new_empty(total, *values.shape[1:])
+            arrays[name][first:done] = values
+    return arrays
+
+
+def run_parts(
+    checkpoint: Checkpoint,
+    blocks: Iterable[Evidence],
+    total: int,
+    start: Gaussian,
+    generator: torch.Generator,
+    particles: int,
+    particles_kept: int,
+    progress: Callable[[float], None] | None,
+) -> Iterator[dict[str, Tensor]]:
+    """Yields the arrays of consecutive steps. Arguments as for ``run_arrays``."""
+    if particles_kept < 1:
+        raise BadInput(f"particles kept must be at least 1, not {particles_kept}")
+    filter_ = checkpoint.filter
+    belief, done = filter_.start(start, particles, generator), 0
     for block in blocks:
         at_once = len(block)
         if isinstance(belief, Particles) and particles > particles_kept:
@@ -162,14 +215,7 @@ def run_arrays(
                 done += 1
                 if progress is not None:
                     progress(done / total)
-            part = with_fewer_particles(step_arrays(checkpoint, evidence, steps), particles_kept)
-            if len(steps) == total:
-                return part
-            for name, values in part.items():
-                if name not in arrays:  # once: small arrays that stay between large ones would fragment the memory
-                    arrays[name] = values.new_empty(total, *values.shape[1:])
-                arrays[name][done - len(steps) : done] = values
-    return arrays
+            yield with_fewer_particles(step_arrays(checkpoint, evidence, steps), particles_kept)
 
 
 BY_PARTICLE = {"particles": -2, "prior_log_weights": -1, "log_weights": -1, "log_likelihood": -1}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.replay import body_poses, replay_model
@@ -31,9 +32,9 @@ class Bodies:
             for body, group in groupby(by_body, key=lambda shape: (shape.body, shape.name)):
                 self._solids[body] = [mesh_of(shape) for shape in group]
 
-    def meshes(self) -> Iterator[tuple[str, rr.Mesh3D]]:
-        """Path and mesh of each body."""
-        for (_, name), parts in self._solids.items():
+    def static(self) -> Iterator[tuple[str, Any]]:
+        """Path and mesh of each body, and the poses of fixed ones."""
+        for (body, name), parts in self._solids.items():
             offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
             yield (
                 f"world/bodies/{name}",
@@ -46,15 +47,25 @@ class Bodies:
                     ),
                 ),
             )
+            if not self._moves(body):
+                positions, rotations = body_poses(self._model, np.zeros((1, self._model.nq)))
+                pose = rr.Transform3D(translation=positions[0, body], mat3x3=rotations[0, body])
+                yield f"world/bodies/{name}", pose
 
     def columns(self, qpos: np.ndarray) -> Iterator[tuple[str, Any]]:
-        """Poses of the bodies at joint positions (T, nq)."""
+        """Poses of the moving bodies at joint positions (T, nq)."""
         if self._model is None:
             return
         positions, rotations = body_poses(self._model, qpos)
         for body, name in self._solids:
-            transforms = rr.Transform3D.columns(translation=positions[:, body], mat3x3=rotations[:, body])
-            yield f"world/bodies/{name}", transforms
+            if self._moves(body):
+                quaternions = Rotation.from_matrix(rotations[:, body]).as_quat()  # x, y, z, w, as in Rerun
+                transforms = rr.Transform3D.columns(translation=positions[:, body], quaternion=quaternions)
+                yield f"world/bodies/{name}", transforms
+
+    def _moves(self, body: int) -> bool:
+        assert self._model is not None
+        return bool(self._model.body_weldid[body] != 0)
 
 
 def _rgba(part: Mesh) -> np.ndarray:

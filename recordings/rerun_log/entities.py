@@ -25,6 +25,7 @@ PARTICLE_GRID, SHADES = 2.0**-13, 32
 """m and number of colours to which displayed particles are rounded: invisible, and halves the file size. The exact
 particles are under ``trace/``."""
 
+GRAY = 150.0  # of a particle without weight
 ROBOT_COLOUR = "#B0B0B0"
 MODALITY = "update of the fused filter's prior with this modality only, not a standalone filter; fusion weight"
 KINDS = {
@@ -191,9 +192,10 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
             quaternions = np.roll(outline.wxyz, -1, axis=-1)
             yield f"world/object/{name}", archetype.columns(centers=outline.position, quaternions=quaternions)
     if plane and trace.particles is not None and trace.log_weights is not None:
-        points = _lift(np.round(trace.particles[steps][:, :, plane] / PARTICLE_GRID) * PARTICLE_GRID)
-        rows, count = points.shape[:2]
-        shades = _shades(trace.log_weights[steps], _hex("fused", trace))
+        order, shades = _shades(trace.log_weights[steps], _hex("fused", trace))
+        points = np.take_along_axis(trace.particles[steps][:, :, plane], order[..., None], axis=1)
+        points = _lift(np.round(points / PARTICLE_GRID) * PARTICLE_GRID)
+        rows, count = shades.shape
         particles = rr.Points3D.columns(positions=points.reshape(-1, 3), colors=shades.ravel())
         yield "world/plane/particles", particles.partition([count] * rows)
 
@@ -240,13 +242,17 @@ def _lift(points: Array) -> Array:
     return np.concatenate([points, np.zeros_like(points[..., :1])], axis=-1).astype(np.float32)
 
 
-def _shades(log_weights: Array, hue: str) -> NDArray[np.uint32]:
-    """(T, M) RGBA from gray (zero weight) to the colour (largest weight of the step)."""
-    share = np.sqrt(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)))[..., None]
-    share = np.rint(share * SHADES) / SHADES
-    gray, full = np.full(3, 150.0), np.array([int(hue[i : i + 2], 16) for i in (1, 3, 5)], float)
-    red, green, blue = np.moveaxis(np.rint(gray + share * (full - gray)).astype(np.uint32), -1, 0)
-    return red << 24 | green << 16 | blue << 8 | np.uint32(255)
+def _shades(log_weights: Array, hue: str) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """Order (T, M) of ascending weight, and RGBA (T, M) in this order.
+
+    Colours go from gray (zero weight) to the colour (largest weight of the step).
+    """
+    order = np.argsort(log_weights, axis=1)
+    ordered = np.take_along_axis(log_weights, order, axis=1)
+    share = np.rint(SHADES * np.sqrt(np.exp(ordered - ordered[:, -1:]))).astype(np.intp)
+    full = np.array([int(hue[i : i + 2], 16) for i in (1, 3, 5)], float)
+    red, green, blue = np.rint(np.linspace(np.full(3, GRAY), full, SHADES + 1)).astype(np.uint32).T
+    return order, (red << 24 | green << 16 | blue << 8 | np.uint32(255))[share]
 
 
 def _hex(source: str, trace: Trace) -> str:

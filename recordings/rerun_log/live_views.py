@@ -15,12 +15,12 @@ from beliefscope.recordings.rerun_log.blueprint import blueprint
 from beliefscope.recordings.rerun_log.bodies import Bodies
 from beliefscope.recordings.schema import APPLICATION
 from beliefscope.recordings.write import (
-    STEPS_PER_CHUNK,
     chunks,
     closing_layout,
     new_recording,
     send_header,
     send_steps,
+    steps_per_chunk,
     thinning,
 )
 
@@ -59,14 +59,14 @@ class LiveViews:
         stream = rr.RecordingStream(APPLICATION)
         reader = LiveFileReader(self._live)
         try:
-            written, ended, written_at = 0, False, 0.0
+            written, ended, written_at, at_once = 0, False, 0.0, 1
             while not (ended and written == reader.steps):
                 ended = self._ended.wait(0.0 if reader.steps > written + MIN_STEPS else POLL_INTERVAL)
                 waiting = reader.poll() - written
                 self.behind = max(self.behind, waiting)
                 if written == 0 and waiting:
                     first = reader.part(0, 1)
-                    task = first.task
+                    task, at_once = first.task, steps_per_chunk(first)
                     layout, bodies = blueprint(first, task, growing=True), Bodies(first, task)
                     with closing_layout(layout):
                         # Without footer: the index of all chunks would fill the memory of a long run.
@@ -75,7 +75,7 @@ class LiveViews:
                 if ended and not self._write_rest:
                     return
                 if waiting >= MIN_STEPS or (waiting and (ended or time.monotonic() > written_at + MAX_DELAY)):
-                    last = min(reader.steps, written + STEPS_PER_CHUNK)
+                    last = min(reader.steps, written + at_once)
                     send_part(stream, reader, bodies, written, last)
                     stream.flush()
                     written, written_at = last, time.monotonic()
@@ -99,7 +99,7 @@ def write_live_recording(live: Path, path: Path) -> Path:
         task = sample.task
         bodies = Bodies(sample, task)
         with new_recording(path, sample, bodies, reader.steps, blueprint(sample, task)) as stream:
-            for first, last in chunks(reader.steps):
+            for first, last in chunks(reader.steps, steps_per_chunk(sample)):
                 send_part(stream, reader, bodies, first, last)
                 stream.flush()  # or all of it would wait in memory for the disk
     finally:

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
+from beliefscope.datasets import episode_parts, store
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_parts import EpisodeParts
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.readers import episode_file
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.evaluate import run
+from beliefscope.filters.evaluate import run as run_batch
 from beliefscope.inspect.diagnostics import particle_health
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import (
@@ -27,8 +33,10 @@ from beliefscope.inspect.trace import (
     header_of,
     load_trace,
     save_trace,
+    save_trace_parts,
     trace,
     trace_from_arrays,
+    trace_parts,
 )
 from beliefscope.inspect.traces import run as run_module
 from beliefscope.inspect.traces.replay import Replay
@@ -54,7 +62,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
 def test_tracing_does_not_change_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
     filter_ = checkpoint.filter
     batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
-    error, covariance = run(filter_, batch, only=None, particles=100, seed=7)
+    error, covariance = run_batch(filter_, batch, only=None, particles=100, seed=7)
     si = torch.from_numpy(traced.estimate_mean)
     assert torch.equal(si - batch.states[:, 0], error[:, 0])
     assert torch.equal(torch.from_numpy(traced.estimate_covariance), covariance[:, 0])
@@ -179,7 +187,7 @@ def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.
     with open_dataset(sample_path(task)) as dataset:
         episode = dataset[dataset.held_out()[0]]
     whole = trace(checkpoint, episode)
-    monkeypatch.setattr(run_module, "STEPS_ENCODED", 37)
+    monkeypatch.setattr(run_module, "STEPS_PER_PART", 37)
     in_blocks = trace(checkpoint, episode)
     for key, values in arrays_of(whole).items():
         # Products of matrices with fewer rows round differently.
@@ -214,3 +222,84 @@ def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, mo
     assert standalone(checkpoint, sample, "image").particle_count == 2000
     with pytest.raises(BadInput, match="particles kept must be at least 1"):
         trace(checkpoint, episode, particles_kept=0)
+
+
+@pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door/crossmodal-pf", "push-field/information-ekf"])
+def test_trace_in_parts_has_the_same_bytes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The evidence of the last filter depends on several steps."""
+    task, filter_name = name.split("/")
+    with open_dataset(sample_path(task)) as dataset:
+        episode = dataset[dataset.held_out()[0]]
+    for module in (store, episode_file, episode_parts, run_module):
+        monkeypatch.setattr(module, "STEPS_PER_PART", 30)
+    path = tmp_path / "long.h5"
+    write_dataset(path, episode.task, [episode])
+    checkpoint = load_checkpoint(shipped(task, filter_name))
+    settings = {"seed": 3, "particles": 40, "particles_kept": 11}
+    save_trace(trace(checkpoint, episode, 0, **settings), tmp_path / "whole.trace")
+    progress: list[float] = []
+    with open_dataset(path, episode.task) as dataset:
+        parts = dataset.in_parts(0)
+        assert isinstance(parts, EpisodeParts)
+        written = list(trace_parts(checkpoint, parts, 0, progress=progress.append, **settings))
+    assert len(written) >= 4
+    assert max(map(len, written)) <= 30
+    first = save_trace_parts(written, len(episode), tmp_path / "parts.trace")
+    assert first.data_hash == episode.digest()
+    assert (progress[-1], len(progress)) == (1.0, len(episode))
+    assert (tmp_path / "parts.trace").read_bytes() == (tmp_path / "whole.trace").read_bytes()
+
+
+def test_trace_file_is_that_of_safetensors(traced: Trace, tmp_path: Path) -> None:
+    save_trace(traced, tmp_path / "run.trace")
+    arrays = {key: np.ascontiguousarray(array) for key, array in arrays_of(traced).items()}
+    arrays |= {"episode/time": np.arange(len(traced), dtype=np.float64)}
+    timed = replace(traced, episode=replace(traced.episode, time=arrays["episode/time"]))
+    save_trace(timed, tmp_path / "timed.trace")
+    metadata = {"beliefscope-trace": json.dumps(header_of(timed), sort_keys=True)}
+    assert (tmp_path / "timed.trace").read_bytes() == safetensors.numpy.save(arrays, metadata)
+
+
+def test_modified_parts_are_refused(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (store, episode_file, episode_parts):
+        monkeypatch.setattr(module, "STEPS_PER_PART", 30)
+    path = tmp_path / "long.h5"
+    write_dataset(path, episode.task, [episode])
+    with h5py.File(path, "r+") as file:
+        file["trajectory0/states"][40] += np.float32(0.1)
+    checkpoint = load_checkpoint(shipped("door", "haptics-ekf"))
+    with open_dataset(path) as dataset:
+        parts = dataset.in_parts(0)
+        assert isinstance(parts, EpisodeParts)
+        with pytest.raises(BadInput, match=r"trajectory0 in .* do not match its digest"):
+            next(trace_parts(checkpoint, parts))
+
+
+def test_file_with_large_chunks_is_read_at_once(
+    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As earlier versions wrote them: each part would decompress all steps."""
+    write_dataset(tmp_path / "long.h5", episode.task, [episode])
+    monkeypatch.setattr(episode_file, "STEPS_PER_PART", 30)
+    with open_dataset(tmp_path / "long.h5") as dataset:
+        assert isinstance(dataset.in_parts(0), Episode)
+
+
+def test_command_reads_long_episodes_in_parts(
+    run: Callable[..., tuple[int, str, str]], episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = "trace door --filter crossmodal-pf --particles 20 --data long.h5 --episode 0 --json - -o"
+    with monkeypatch.context() as patch:
+        for module in (store, episode_file, episode_parts, run_module):
+            patch.setattr(module, "STEPS_PER_PART", 30)
+        write_dataset(tmp_path / "long.h5", episode.task, [episode])
+        parts = run(f"{line} parts.trace")
+    monkeypatch.setattr(run_module, "STEPS_PER_PART", 30)  # the same blocks of evidence, and so the same bits
+    whole = run(f"{line} whole.trace --faults image_shift=0")
+    assert (parts[0], whole[0]) == (0, 0), parts[2] + whole[2]
+    assert json.loads(parts[1])["steps"] == len(episode)
+    run_of_parts, run_of_whole = load_trace(tmp_path / "parts.trace"), load_trace(tmp_path / "whole.trace")
+    assert run_of_parts.data_hash == run_of_whole.data_hash == episode.digest()
+    for name, values in arrays_of(run_of_whole).items():
+        np.testing.assert_array_equal(arrays_of(run_of_parts)[name], values, err_msg=name)

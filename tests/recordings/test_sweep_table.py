@@ -209,3 +209,25 @@ def test_rows_have_the_time_of_the_worst_step() -> None:
     timed = list(summary(trace(filter_, replace(episode, time=times))))
     assert [row["worst_time"] for row in timed] == [times[row["worst_step"]] for row in timed]
     assert {row["worst_time"] for row in summary(trace(filter_, episode))} == {None}
+
+
+def test_results_have_the_time_of_the_worst_step(sweep: Path, tmp_path: Path) -> None:
+    """Of an episode with timestamps, and not of one without, nor in the results of earlier versions."""
+    with open_dataset(sample_path("door")) as sample:
+        episode = sample[0]
+        times = np.linspace(0.0, 3.0, len(episode)) ** 2
+        episodes = [replace(episode, time=times), sample[1]]
+        write_dataset(tmp_path / "timed.h5", sample.task, episodes)
+    folder = tmp_path / "timed"
+    run_sweep(Inputs((shipped("door", "image-ekf"),), (tmp_path / "timed.h5",), all_episodes=True).cells(), folder)
+    experiments = Experiments([folder])
+    (row,) = experiments.overview().to_pylist()
+    by_episode = experiments.episodes(row["checkpoint"], row["data"]).to_pylist()
+    expected = {r["episode"]: times[r["worst_step"]] if r["episode"] == 0 else None for r in by_episode}
+    assert {r["episode"]: r["worst_time"] for r in by_episode} == expected
+    assert row["worst_time"] == expected[row["worst_episode"]]
+
+    results = pq.read_table(folder / "results.parquet")
+    pq.write_table(results.drop_columns(["worst_time"]), folder / "results.parquet")
+    (earlier,) = Experiments([folder]).overview().to_pylist()
+    assert earlier == row | {"worst_time": None}

@@ -8,18 +8,29 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.rerun_log.entities import PARTICLE_GRID
 from beliefscope.recordings.schema import HEADER, PROPERTIES, SCHEMA, STEP, TIME, Entity
-from beliefscope.recordings.write import CHUNKS, STEPS_PER_CHUNK, chunks, write_recording
+from beliefscope.recordings.write import (
+    CHUNKS,
+    STEPS_PER_CHUNK,
+    STEPS_WITH_PARTICLES,
+    chunks,
+    steps_per_chunk,
+    write_recording,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -88,10 +99,35 @@ def test_chunks_cover_all_steps_once(steps: int) -> None:
     assert all(last - first >= STEPS_PER_CHUNK for first, last in parts[:-1])
 
 
+def test_chunks_of_many_particles_have_fewer_steps(new_trace: Callable[..., Trace]) -> None:
+    assert steps_per_chunk(new_trace("ekf", steps=2)) == STEPS_PER_CHUNK
+    assert steps_per_chunk(new_trace("pf", steps=2, particles=300)) == STEPS_PER_CHUNK
+    assert steps_per_chunk(new_trace("pf", steps=2, particles=1000)) == 300
+    assert steps_per_chunk(new_trace("pf", steps=2, particles=10_000)) == STEPS_WITH_PARTICLES
+
+
+def test_displayed_particles_are_sorted_by_weight(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
+    """Each particle has the colour of its weight; the heaviest is drawn last, above all others."""
+    trace = new_trace("pf", steps=4, particles=50)
+    assert trace.particles is not None
+    assert trace.log_weights is not None
+    write_recording(trace, tmp_path / "run.rrd")
+    stream = RrdReader(tmp_path / "run.rrd").stream().filter(content="/world/plane/particles").drop(is_static=True)
+    (batch,) = (chunk.to_record_batch() for chunk in stream)
+    points = batch.column("Points3D:positions").flatten().flatten().to_numpy().reshape(4, 50, 3)[..., :2]
+    colours = batch.column("Points3D:colors").flatten().to_numpy().reshape(4, 50)
+    order = np.argsort(trace.log_weights, axis=1)
+    expected = np.take_along_axis(trace.particles[..., list(trace.task.floor or ())], order[..., None], 1)
+    np.testing.assert_allclose(points, expected, atol=PARTICLE_GRID)
+    full = int(colour("fused", trace.modalities)[1:], 16) << 8 | 255
+    assert (colours[:, -1] == full).all()
+    assert len(np.unique(colours)) > 4
+
+
 def test_round_trip_of_several_chunks_and_special_numbers(
     new_trace: Callable[..., Trace], assert_same: Compare, tmp_path: Path
 ) -> None:
-    trace = new_trace("pf", steps=213, particles=7)
+    trace = new_trace("pf", steps=STEPS_PER_CHUNK + 213, particles=7)
     assert trace.log_likelihood is not None
     trace.log_likelihood[5, 0, :3] = np.nan, -np.inf, np.float32(1e-45)
     write_recording(trace, tmp_path / "run.rrd")
@@ -146,11 +182,14 @@ def test_precision_of_maps(new_trace: Callable[..., Trace], new_map: MapMaker, t
     values = {}
     for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/maps/haptics/**"):
         batch = chunk.to_record_batch()
-        for name in ("DepthImage:buffer", "Scalars:scalars"):
+        for name in ("EncodedDepthImage:blob", "Scalars:scalars"):
             if name in batch.schema.names:
                 assert batch.column(STEP).to_pylist() == [12]
                 values[name] = batch.column(name)
-    shares = values["DepthImage:buffer"].flatten().flatten().to_numpy().reshape(41, 41)[::-1] / 255.0
+    png = values["EncodedDepthImage:blob"].flatten().flatten().to_numpy().tobytes()
+    image = Image.open(BytesIO(png))
+    assert image.mode == "I;16", "the viewer draws images of 8 bits black"
+    shares = np.asarray(image)[::-1] / 255.0
     log_peak = values["Scalars:scalars"].flatten().to_numpy()[0]
     likelihood = np.exp(map_.log_likelihood[1].astype(float))
     assert np.abs(shares * np.exp(log_peak) - likelihood).max() <= likelihood.max() / 510 * 1.0001

@@ -24,7 +24,8 @@ class ExperimentRow(Reply):
     """Results of a checkpoint over a data set in one phase.
 
     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
-    ``unit``, at ``worst_episode`` and ``worst_step``. provenance: JSON of the file beside the checkpoint.
+    ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
+    timestamps. provenance: JSON of the file beside the checkpoint.
     """
 
     name: str
@@ -40,6 +41,7 @@ class ExperimentRow(Reply):
     worst: Number
     worst_episode: int | None
     worst_step: int | None
+    worst_time: Number
     checkpoint: str
     data: str
     provenance: str
@@ -55,7 +57,7 @@ class Experiments(Reply):
 
 
 class EpisodeResult(Reply):
-    """Results of an episode in one phase; error and worst in ``unit``."""
+    """Results of an episode in one phase; error and worst in ``unit``, worst_time as in ``ExperimentRow``."""
 
     episode: int
     seed: int
@@ -65,6 +67,7 @@ class EpisodeResult(Reply):
     unit: str
     worst: Number
     worst_step: int
+    worst_time: Number
     nees: Number
 
 

@@ -10,15 +10,30 @@ def trace(run: opt.Run, output: Path, align: bool = False, particles_kept: int =
     A trace contains, for every step, the beliefs before and after the observation, each modality's own update, fusion
     weights as output by the network and effective weights, particles and their ancestors. Estimates are bit-identical
     to those of a run without tracing. Memory does not grow with particles times steps: of more than --particles-kept
-    particles, that many are stored in each step. Read it in Python with beliefscope.inspect.trace.load_trace.
+    particles, that many are stored in each step. Episodes of more than 4096 steps are read and written in parts, unless
+    with --faults, --align or an external filter. Read it in Python with beliefscope.inspect.trace.load_trace.
 
     \b
     Examples:
       beliefscope trace door --filter crossmodal-pf --episode 9 -o run.trace
       beliefscope trace door --filter crossmodal-pf --faults force_bias:x=5:from=20 -o biased.trace
     """
-    from beliefscope.inspect.trace import save_trace
+    from beliefscope.datasets.episode import Episode
+    from beliefscope.datasets.episode_parts import STEPS_PER_PART
+    from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.inspect.trace import save_trace, save_trace_parts, trace_parts
 
-    _, trace = run.trace(align, particles_kept=particles_kept)
-    save_trace(trace, output)
-    return opt.trace_result(trace, output)
+    checkpoint, faults = run.open()
+    with run.episodes(checkpoint.task) as data:
+        index = run.index(data)
+        needs_whole = align or faults or isinstance(checkpoint, ExternalFilter)
+        episode = data[index] if needs_whole else data.in_parts(index)
+        if isinstance(episode, Episode):
+            trace = run.over(checkpoint, episode, index, faults, align, particles_kept=particles_kept)
+            save_trace(trace, output)
+        else:
+            run.check(checkpoint, [episode.part(0, STEPS_PER_PART)], align)
+            with console.progress("Filtering") as advance:
+                parts = trace_parts(checkpoint, episode, index, run.seed, run.particles, advance, particles_kept)
+                trace = save_trace_parts(parts, len(episode), output)
+    return opt.trace_result(trace, output, steps=len(episode))

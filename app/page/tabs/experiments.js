@@ -5,7 +5,7 @@
 
 import { create, element, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
-import { displayName, fixed, sentence, significant } from '../core/units.js';
+import { displayName, fixed, sentence, significant, stepLabel } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelState } from '../widgets/panel_state.js';
@@ -309,8 +309,11 @@ export class Experiments {
    * @param {ExperimentRow} row
    * @param {EpisodeResult} result
    */
-  #episodeItem(row, { episode, error, unit, worst, worst_step: step, nees, policy }) {
-    const link = create('a', { textContent: `Episode ${episode}, step ${step}` });
+  #episodeItem(
+    row,
+    { episode, error, unit, worst, worst_step: step, worst_time: time, nees, policy },
+  ) {
+    const link = create('a', { textContent: `Episode ${episode}, ${stepLabel(step, time)}` });
     const patch = (/** @type {string} */ filter) => ({
       ...this.#runOf(row, filter),
       episode,

@@ -345,7 +345,7 @@ export interface components {
         };
         /**
          * EpisodeResult
-         * @description Results of an episode in one phase; error and worst in ``unit``.
+         * @description Results of an episode in one phase; error and worst in ``unit``, worst_time as in ``ExperimentRow``.
          */
         EpisodeResult: {
             /** Episode */
@@ -364,6 +364,8 @@ export interface components {
             worst: number | null;
             /** Worst Step */
             worst_step: number;
+            /** Worst Time */
+            worst_time: number | null;
             /** Nees */
             nees: number | null;
         };
@@ -418,7 +420,8 @@ export interface components {
          * @description Results of a checkpoint over a data set in one phase.
          *
          *     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
-         *     ``unit``, at ``worst_episode`` and ``worst_step``. provenance: JSON of the file beside the checkpoint.
+         *     ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
+         *     timestamps. provenance: JSON of the file beside the checkpoint.
          */
         ExperimentRow: {
             /** Name */
@@ -447,6 +450,8 @@ export interface components {
             worst_episode: number | null;
             /** Worst Step */
             worst_step: number | null;
+            /** Worst Time */
+            worst_time: number | null;
             /** Checkpoint */
             checkpoint: string;
             /** Data */

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.replay import replay
@@ -53,10 +54,21 @@ def test_poses_equal_the_replay(run: Trace, tmp_path: Path) -> None:
     body = replayed.model.body("hand").id
     recorded = columns(tmp_path / "run.rrd", "world/bodies/hand")
     positions = recorded["Transform3D:translation"].reshape(-1, 3)
-    rotations = recorded["Transform3D:mat3x3"].reshape(-1, 3, 3).transpose(0, 2, 1)  # Rerun stores columns
+    rotations = Rotation.from_quat(recorded["Transform3D:quaternion"].reshape(-1, 4)).as_matrix()
     np.testing.assert_allclose(positions, replayed.positions[:, body], atol=1e-6)
     np.testing.assert_allclose(rotations, replayed.rotations[:, body], atol=1e-6)
     assert "Mesh3D:vertex_positions" in recorded
+
+
+def test_bodies_that_cannot_move_have_one_pose(run: Trace, tmp_path: Path) -> None:
+    write_recording(run, tmp_path / "run.rrd")
+    replayed = replay(DOOR, run.episode)
+    assert replayed is not None
+    recorded = columns(tmp_path / "run.rrd", "world/bodies/link0")
+    body = replayed.model.body("link0").id
+    assert recorded["Transform3D:translation"].shape == (3,)
+    np.testing.assert_allclose(recorded["Transform3D:translation"], replayed.positions[0, body], atol=1e-6)
+    assert (replayed.positions[:, body] == replayed.positions[0, body]).all()
 
 
 def test_puck_is_a_cylinder(tmp_path: Path) -> None:
