@@ -22,6 +22,9 @@ from beliefscope.inspect.trace import Trace
 ALARM_RATE = 0.02
 """Default probability that a healthy filter raises an alarm."""
 
+HEALTHY_RANGE = (1.0, 99.0)
+"""Percentiles of the healthy values of a statistic between which an episode counts as unaffected."""
+
 Rows = Sequence[Mapping[str, float]]
 
 
@@ -112,13 +115,25 @@ def symptoms_of(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation
 
 
 def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
-    """(E,) mask of episodes whose value of the first alarm deviates by at least half as much as the most deviating."""
-    if not alarms:
-        return np.ones(len(case.rows), dtype=bool)
-    name, healthy = alarms[0].statistic, alarms[0].healthy
-    distance = np.array([row.get(name, np.nan) - healthy for row in case.grouped])
-    distance *= np.sign(alarms[0].value - healthy)
-    return np.asarray(distance >= 0.5 * np.nanmax(distance))
+    """(E,) mask of episodes that alarms concern.
+
+    All of them, unless there are two groups: some whose value of the first alarm is outside of the range of healthy
+    episodes, by at least half as much as that of the most deviating one, and others that are inside of it, also in all
+    other alarms that are at least half as large.
+    """
+    everything = np.ones(len(case.rows), dtype=bool)
+    inside = everything.copy()
+    for alarm in alarms:
+        healthy = case.profile.statistics.get(alarm.statistic)
+        if healthy is not None and np.isfinite(healthy).any() and abs(alarm.t) >= 0.5 * abs(alarms[0].t):
+            low, high = np.nanpercentile(healthy, HEALTHY_RANGE)
+            inside &= ~np.array([not low <= row.get(alarm.statistic, low) <= high for row in case.grouped])
+    if not alarms or not inside.any():
+        return everything
+    values = np.array([row.get(alarms[0].statistic, np.nan) for row in case.grouped])
+    distance = (values - alarms[0].healthy) * np.sign(alarms[0].value - alarms[0].healthy)
+    hit = ~inside & (distance >= 0.5 * np.nanmax(distance))
+    return hit if hit.any() and (hit | inside).all() else everything
 
 
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
