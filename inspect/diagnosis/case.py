@@ -22,8 +22,8 @@ from beliefscope.inspect.trace import Trace
 ALARM_RATE = 0.02
 """Default probability that a healthy filter raises an alarm."""
 
-HEALTHY_RANGE = (1.0, 99.0)
-"""Percentiles of the healthy values of a statistic between which an episode counts as unaffected."""
+SHARED = 0.25
+"""Mean deviation of episodes, relative to that of others, from which a fault affects them as well."""
 
 Rows = Sequence[Mapping[str, float]]
 
@@ -117,23 +117,20 @@ def symptoms_of(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation
 def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
     """(E,) mask of episodes that alarms concern.
 
-    All of them, unless there are two groups: some whose value of the first alarm is outside of the range of healthy
-    episodes, by at least half as much as that of the most deviating one, and others that are inside of it, also in all
-    other alarms that are at least half as large.
+    Those that deviate by at least half as much as the most deviating one, in the first alarm or another one at least
+    half as large; all of them, if the first alarm is not known in all or the others also have ``SHARED`` of it.
     """
     everything = np.ones(len(case.rows), dtype=bool)
-    inside = everything.copy()
-    for alarm in alarms:
-        healthy = case.profile.statistics.get(alarm.statistic)
-        if healthy is not None and np.isfinite(healthy).any() and abs(alarm.t) >= 0.5 * abs(alarms[0].t):
-            low, high = np.nanpercentile(healthy, HEALTHY_RANGE)
-            inside &= ~np.array([not low <= row.get(alarm.statistic, low) <= high for row in case.grouped])
-    if not alarms or not inside.any():
+    if not alarms:
         return everything
-    values = np.array([row.get(alarms[0].statistic, np.nan) for row in case.grouped])
-    distance = (values - alarms[0].healthy) * np.sign(alarms[0].value - alarms[0].healthy)
-    hit = ~inside & (distance >= 0.5 * np.nanmax(distance))
-    return hit if hit.any() and (hit | inside).all() else everything
+    large = [alarm for alarm in alarms if abs(alarm.t) >= 0.5 * abs(alarms[0].t)]
+    values = np.array([[row.get(alarm.statistic, np.nan) for row in case.grouped] for alarm in large])
+    healthy, value = (np.array([[getattr(alarm, name)] for alarm in large]) for name in ("healthy", "value"))
+    distance = (values - healthy) * np.sign(value - healthy)
+    hit = (distance >= 0.5 * np.nanmax(distance, axis=1, keepdims=True)).any(0)
+    if not np.isfinite(values[0]).all() or hit.all():
+        return everything
+    return everything if np.abs(distance[0, ~hit]).mean() > SHARED * np.abs(distance[0, hit]).mean() else hit
 
 
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
