@@ -117,20 +117,23 @@ def symptoms_of(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation
 def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
     """(E,) mask of episodes that alarms concern.
 
-    Those that deviate by at least half as much as the most deviating one, in the first alarm or another one at least
-    half as large; all of them, if the first alarm is not known in all or the others also have ``SHARED`` of it.
+    Episodes that deviate in the first alarm by at least half as much as the most deviating one. All of them, if it is
+    unknown in some, or if the others deviate as well: one is outside of the range of healthy episodes, or their mean
+    deviation is more than ``SHARED`` of that of the affected ones.
     """
     everything = np.ones(len(case.rows), dtype=bool)
     if not alarms:
         return everything
-    large = [alarm for alarm in alarms if abs(alarm.t) >= 0.5 * abs(alarms[0].t)]
-    values = np.array([[row.get(alarm.statistic, np.nan) for row in case.grouped] for alarm in large])
-    healthy, value = (np.array([[getattr(alarm, name)] for alarm in large]) for name in ("healthy", "value"))
-    distance = (values - healthy) * np.sign(value - healthy)
-    hit = (distance >= 0.5 * np.nanmax(distance, axis=1, keepdims=True)).any(0)
-    if not np.isfinite(values[0]).all() or hit.all():
+    name, sign = alarms[0].statistic, np.sign(alarms[0].value - alarms[0].healthy)
+    values = np.array([row.get(name, np.nan) for row in case.grouped])
+    distance = (values - alarms[0].healthy) * sign
+    hit = distance >= 0.5 * np.nanmax(distance)
+    if hit.all() or not np.isfinite(values).all():
         return everything
-    return everything if np.abs(distance[0, ~hit]).mean() > SHARED * np.abs(distance[0, hit]).mean() else hit
+    record = case.profile.statistics.get(name, values)
+    outside = (values[~hit] < np.nanmin(record)) | (values[~hit] > np.nanmax(record))
+    shared = np.abs(distance[~hit]).mean() > SHARED * np.abs(distance[hit]).mean()
+    return everything if shared or outside.any() else hit
 
 
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:

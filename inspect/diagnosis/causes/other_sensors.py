@@ -57,8 +57,8 @@ CAUSES = (
         "contact.delay",
         "Contact flag delayed",
         (Symptom("lag/contact/*"),),
-        f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|{IN_PHASES}|{LAGS}|{CONTACT_DISTANCE}"
-        f"|{HAPTICS}|{DYNAMICS}",
+        f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*"
+        f"|direction/*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Synchronise the contact sensor with the force sensor.",
         "restore contact|drop haptics",
     ),
