@@ -101,7 +101,7 @@ class Faults:
                 if key in present:
                     present[key] = fault.apply_presence(present[key], episode.dt, np.random.default_rng(rng))
                     observations[key] = hold(observations[key], present[key])
-        controls = _controls(episode, observations)
+        controls = derived_controls(episode, observations)
         for position, fault in enumerate(self.sequence):
             if isinstance(fault, ControlFault):
                 controls = fault.apply(controls, episode.dt, np.random.default_rng([seed, digest, position]))
@@ -257,8 +257,8 @@ def _parse_value(text: str) -> float | int | str:
     return text
 
 
-def _controls(episode: Episode, observations: Mapping[str, Readings]) -> FloatArray:
-    """Controls recomputed from the faulty readings, if the episode's controls derive from its readings."""
+def derived_controls(episode: Episode, observations: Mapping[str, Readings]) -> FloatArray:
+    """Controls recomputed from other readings, if the episode's controls derive from its readings."""
     keys = ("effector_position", "contact")
     if not all(key in episode.observations for key in keys):
         return episode.controls

@@ -22,6 +22,9 @@ from beliefscope.inspect.trace import Trace
 ALARM_RATE = 0.02
 """Default probability that a healthy filter raises an alarm."""
 
+SHARED = 0.25
+"""Mean deviation of episodes, relative to that of others, from which a fault affects them as well."""
+
 Rows = Sequence[Mapping[str, float]]
 
 
@@ -112,13 +115,25 @@ def symptoms_of(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation
 
 
 def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
-    """(E,) mask of episodes whose value of the first alarm deviates by at least half as much as the most deviating."""
+    """(E,) mask of episodes that alarms concern.
+
+    Episodes that deviate in the first alarm by at least half as much as the most deviating one. All of them, if it is
+    unknown in some, or if the others deviate as well: one is outside of the range of healthy episodes, or their mean
+    deviation is more than ``SHARED`` of that of the affected ones.
+    """
+    everything = np.ones(len(case.rows), dtype=bool)
     if not alarms:
-        return np.ones(len(case.rows), dtype=bool)
-    name, healthy = alarms[0].statistic, alarms[0].healthy
-    distance = np.array([row.get(name, np.nan) - healthy for row in case.grouped])
-    distance *= np.sign(alarms[0].value - healthy)
-    return np.asarray(distance >= 0.5 * np.nanmax(distance))
+        return everything
+    name, sign = alarms[0].statistic, np.sign(alarms[0].value - alarms[0].healthy)
+    values = np.array([row.get(name, np.nan) for row in case.grouped])
+    distance = (values - alarms[0].healthy) * sign
+    hit = distance >= 0.5 * np.nanmax(distance)
+    if hit.all() or not np.isfinite(values).all():
+        return everything
+    record = case.profile.statistics.get(name, values)
+    outside = (values[~hit] < np.nanmin(record)) | (values[~hit] > np.nanmax(record))
+    shared = np.abs(distance[~hit]).mean() > SHARED * np.abs(distance[hit]).mean()
+    return everything if shared or outside.any() else hit
 
 
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:

@@ -53,7 +53,8 @@ class Cause:
         symptoms: deviations that the cause always produces.
         consequences: patterns of statistics that it may change as well.
         lowers: patterns of statistics that it may decrease, but not increase.
-        undo: name of the intervention that undoes it (``inspect/diagnosis/interventions.py``); empty if there is none.
+        undo: names of interventions that undo it (``inspect/diagnosis/undo.py``), joined by ``|``: the first one
+            that is possible does; empty if there is none.
         next: next action; may have the placeholders ``{task}`` and ``{filter}``.
         prior: added to the score; negative for a cause that would explain almost everything.
     """

@@ -31,11 +31,11 @@ from beliefscope.inspect.diagnosis.case import (
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.interventions import ratios, recovery, replay_without
+from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.undo import brings_back
-from beliefscope.inspect.diagnosis.visibility import VISIBLE, Effect
+from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile, profile_document
 from beliefscope.inspect.trace import Trace
@@ -91,9 +91,7 @@ def diagnose(
     for _, results in run_blocks(run, blocks, engine, workers, lambda share: report(0.6 * share)):
         observed |= {result[0].episode_index: result for result in results}
     traces, rows, sensors = zip(*(observed[index] for index in episodes), strict=True)
-    setting = Setting(
-        checkpoint, {trace.episode_index: trace.episode for trace in traces}, particles, frozenset(episodes)
-    )
+    setting = _setting(checkpoint, traces, particles, profile)
     case = compared(setting, traces, rows, sensors, profile, alarm_rate)
     return _diagnosed(case, seed, base, engine, workers, lambda share: report(0.6 + 0.4 * share))
 
@@ -149,11 +147,15 @@ def preliminary(
 def _examined(
     checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
-    episodes = {trace.episode_index: trace.episode for trace in traces}
     rows, sensors = zip(*(observe(trace, checkpoint, profile) for trace in traces), strict=True)
-    return compared(
-        Setting(checkpoint, episodes, particles, frozenset(episodes)), traces, rows, sensors, profile, alarm_rate
-    )
+    setting = _setting(checkpoint, traces, particles, profile)
+    return compared(setting, traces, rows, sensors, profile, alarm_rate)
+
+
+def _setting(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> Setting:
+    """The inputs of traces."""
+    episodes = {trace.episode_index: trace.episode for trace in traces}
+    return Setting(checkpoint, episodes, particles, frozenset(episodes), healthy=profile)
 
 
 def _diagnosed(
@@ -170,7 +172,7 @@ def _diagnosed(
         return healthy(case)
     affected = focus(case)
     explanations = explain_all(affected)
-    effects = confirm(affected, explanations, seed, base, engine, workers, progress)
+    effects = confirm(case, affected, explanations, seed, base, engine, workers, progress)
     progress(1.0)
     return conclude(case, affected, explanations, effects)
 
@@ -200,6 +202,7 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
 
 def confirm(
     case: Case,
+    affected: Case,
     explanations: dict[str, Explanation],
     seed: int,
     base: Checkpoint | None,
@@ -207,11 +210,15 @@ def confirm(
     workers: int,
     progress: Callable[[float], None],
 ) -> dict[str, Effect]:
-    """Undo the most probable causes; adds the share of all deviations that disappears to their support."""
+    """Undo the most probable causes; adds the share of all deviations that disappears to their support.
+
+    Args:
+        affected: the episodes of the case that the largest alarm concerns.
+    """
     likely = sorted(((p, name) for name, p in probabilities(explanations).items() if p >= WORTH_UNDOING), reverse=True)
     names = [name for _, name in likely[:UNDONE]]
     effects: dict[str, Effect] = {}
-    run = partial(_undone, case, seed, base)
+    run = partial(_undone, case, affected, seed, base)
     for number, (name, effect) in enumerate(run_all(run, names, engine, workers), 1):
         if effect is not None:
             effects[name] = effect
@@ -221,7 +228,7 @@ def confirm(
     return effects
 
 
-def _undone(case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect | None:
+def _undone(everything: Case, case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect | None:
     """Effect of undoing a cause; None if it cannot be undone."""
     cause = next(cause for cause in CAUSES if cause.name == name)
     alarms = symptoms_of(cause, case.alarms)
@@ -232,7 +239,9 @@ def _undone(case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect
     replay = replay_without(cause, setting, case.by_statistic, seed, base)
     if replay is None:
         return None
-    after = examine_again(case, setting, replay)
+    action, traces = replay
+    after = examine_again(case, setting, traces)
     restored = max(0.0, 1.0 - burden(after.deviations) / burden(case.deviations))
-    changes = ratios(VISIBLE, case.rows, after.rows)
-    return Effect(recovery(case.traces, replay), restored, changes, brings_back(cause.undo, base))
+    others = [trace for trace in everything.traces if trace.episode_index not in case.setting.episodes]
+    ratios = effect_ratios(everything.traces, [*traces, *others])
+    return Effect(recovery(case.traces, traces), restored, ratios, brings_back(action, base))

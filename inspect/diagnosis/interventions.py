@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,17 +21,18 @@ from beliefscope.inspect.traces.batch import trace_all
 
 def replay_without(
     cause: Cause, setting: Setting, deviations: Deviations, seed: int, base: Checkpoint | None = None
-) -> list[Trace] | None:
-    """Traces of the episodes without a cause, in their order; None if it cannot be undone."""
-    if not cause.undo:
-        return None
-    try:
-        changed = undo(cause.undo, setting, deviations, base)
-    except BadInput:  # modules of an external filter cannot be changed
-        return None
-    if changed is None:
-        return None
-    return list(trace_all(changed.checkpoint, changed.episodes, changed.episodes, seed, changed.particles))
+) -> tuple[str, list[Trace]] | None:
+    """The first intervention that can undo a cause, and traces of the episodes without it, in their order; or None."""
+    for name in filter(None, cause.undo.split("|")):
+        try:
+            changed = undo(name, setting, deviations, base)
+        except BadInput:  # modules of an external filter cannot be changed
+            return None
+        if changed is not None:
+            return name, list(
+                trace_all(changed.checkpoint, changed.episodes, changed.episodes, seed, changed.particles)
+            )
+    return None
 
 
 def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
@@ -43,16 +44,6 @@ def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
         return Recovery(np.nan, np.nan, np.nan, nll)
     share, low, high = jackknife(sums, _removed)
     return Recovery(float(share), float(low), float(high), nll)
-
-
-def ratios(
-    statistics: Iterable[str], before: Sequence[Mapping[str, float]], after: Sequence[Mapping[str, float]]
-) -> dict[str, float]:
-    """Statistic -> its mean over the episodes before relative to after the undo; absent where it is unknown."""
-    means = {
-        name: [np.mean([row.get(name, np.nan) for row in rows]) for rows in (before, after)] for name in statistics
-    }
-    return {name: float(a / b) for name, (a, b) in means.items() if np.isfinite(a / b)}
 
 
 def negative_log_likelihood(trace: Trace) -> float:

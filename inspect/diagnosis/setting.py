@@ -10,6 +10,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class Setting:
     Attributes:
         affected: episodes to which changes of sensors apply.
         steps: first affected step and first step after it; None for all.
+        healthy: profile that the run is compared with; None if no undo needs its reference.
     """
 
     checkpoint: Checkpoint
@@ -26,6 +28,7 @@ class Setting:
     particles: int
     affected: frozenset[int]
     steps: tuple[int, int] | None = None
+    healthy: HealthyProfile | None = None
 
 
 Deviations = Mapping[str, Deviation]

@@ -1,20 +1,35 @@
-"""Undoing a cause in sensors or controls: readings shifted, scaled or advanced by the size of the deviation."""
+"""Undoing a cause in sensors, controls or labels: values shifted, scaled or advanced by the size of the deviation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from itertools import permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.faults.injection import derived_controls
 from beliefscope.inspect.diagnosis.setting import Deviations, Setting, Undo
-from beliefscope.inspect.diagnosis.vector_checks import CHANGE
+from beliefscope.inspect.diagnosis.vector_checks import CHANGE, FORCE, TORQUE, in_contact, lever
+from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
+from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
+from beliefscope.inspect.statistics.signals import MIN_STEPS
+
+CLEARLY = 2.0
+"""Ratio of the force in contact to its 90 % quantile without contact."""
+
+NUDGE = 1e-3
+"""m: step of the difference quotient of the camera's map."""
 
 
 def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], float], NDArray[Any]]) -> Setting | None:
-    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes dt."""
+    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes dt.
+
+    Controls that derive from the readings are recomputed, as when faults are injected.
+    """
     episodes = dict(setting.episodes)
     for index in setting.affected:
         episode = episodes[index]
@@ -29,21 +44,36 @@ def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], f
         if readings.dtype == np.uint8:
             changed = np.rint(changed).clip(0, 255)
         observations = {**episode.observations, key: changed.astype(readings.dtype)}
-        episodes[index] = replace(episode, observations=observations)
+        episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
+    return replace(setting, episodes=episodes)
+
+
+def _with_labels(setting: Setting, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Setting:
+    """Changed true states (T, n) in the affected episodes."""
+    episodes = {
+        index: replace(episode, states=change(episode.states).astype(np.float32))
+        if index in setting.affected
+        else episode
+        for index, episode in setting.episodes.items()
+    }
     return replace(setting, episodes=episodes)
 
 
 def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
-    """A delayed image, the delayed haptics, or controls, advanced by their delay."""
-    lag = deviations.get("lag/control/all" if key == "control" else "lag/image/all")
+    """A delayed image, the delayed haptics, controls or labels, advanced by their delay."""
+    lag = deviations.get(f"lag/{key if key in ('control', 'labels') else 'image'}/all")
     steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
+
+    def ahead(values: NDArray[Any]) -> NDArray[Any]:
+        return values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
+
+    if key == "labels":
+        return _with_labels(setting, ahead) if steps else None
     keys = setting.checkpoint.task.modalities.get(key, (key,))
     result: Setting | None = setting
     for name in keys:
         if result is not None:
-            result = _with_readings(
-                result, name, lambda values, dt: values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
-            )
+            result = _with_readings(result, name, lambda values, dt: ahead(values))
     return result if steps else None
 
 
@@ -77,12 +107,12 @@ def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
     return None if not ratio else _with_readings(setting, "image", lambda images, dt: images / ratio)
 
 
-def tare_force(setting: Setting, deviations: Deviations) -> Setting | None:
-    """Force without its excess level in free motion."""
-    bias = [_excess(deviations, f"level/force {axis}/free motion") for axis in "xyz"]
+def tare(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
+    """Force or torque without its excess level in free motion."""
+    bias = [_excess(deviations, f"level/{key} {axis}/free motion") for axis in "xyz"]
     if None in bias:
         return None
-    return _with_readings(setting, "force", lambda force, dt: force - np.array(bias)[: force.shape[1]])
+    return _with_readings(setting, key, lambda readings, dt: readings - np.array(bias)[: readings.shape[1]])
 
 
 def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -104,6 +134,80 @@ def scale_force(setting: Setting, deviations: Deviations) -> Setting | None:
 def negate_force(setting: Setting, deviations: Deviations) -> Setting | None:
     """Force with the opposite sign."""
     return _with_readings(setting, "force", lambda force, dt: -force)
+
+
+def permute_force(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Force with the order of axes that best agrees with the torque in contact; None if that is the order it has."""
+    orders = list(permutations(range(3)))
+    left = np.zeros(len(orders))
+    for index in setting.affected:
+        observations, at = setting.episodes[index].observations, in_contact(setting.episodes[index])
+        if {FORCE, TORQUE} <= observations.keys() and at.sum() >= MIN_STEPS:
+            force, torque = (observations[key].astype(np.float64)[at] for key in (FORCE, TORQUE))
+            left += [lever(force[:, order], torque)[1] for order in orders]
+    order = orders[int(left.argmin())]
+    return None if order == (0, 1, 2) else _with_readings(setting, FORCE, lambda force, dt: force[:, order])
+
+
+def restore_contact(setting: Setting, deviations: Deviations) -> Setting | None:
+    """A contact flag computed from the force: set where it exceeds its healthy size without the flag (``CLEARLY``)."""
+    names = [f"unflagged force/{CONTACT}/all", *(f"level/{FORCE} {axis}/free motion" for axis in "xyz")]
+    if setting.healthy is None or not all(name in setting.healthy.statistics for name in names):
+        return None
+    unflagged, *zero = (float(np.nanmean(setting.healthy.statistics[name])) for name in names)
+    episodes = dict(setting.episodes)
+    for index in setting.affected:
+        episode = episodes[index]
+        size = np.linalg.norm(episode.observations[FORCE].astype(np.float64) - zero, axis=1)
+        contact = (size > CLEARLY * unflagged).astype(episode.observations[CONTACT].dtype)[:, None]
+        observations = {**episode.observations, CONTACT: contact}
+        episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
+    return replace(setting, episodes=episodes)
+
+
+def shift_hand(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Hand positions without their offset: from commanded positions or, if these derive from the measured ones, from
+    the offset of the hand in the image, which determines x and y."""
+    offset = [_excess(deviations, f"offset/control {axis}/all") for axis in "xyz"]
+    pixels = [_excess(deviations, f"hand offset/image {axis}/all") for axis in "xy"]
+    derived = any(
+        not np.array_equal(derived_controls(e, {**e.observations, HAND: e.observations[HAND] + 1.0}), e.controls)
+        for e in setting.episodes.values()
+        if HAND in e.observations
+    )
+    if not derived and None not in offset:
+        shift = -np.array(offset, dtype=np.float64)
+    elif None not in pixels and (camera := _hand_camera(setting)) is not None:
+        centre = camera.scale[0]
+        nudged = camera.pixels(centre + NUDGE * np.eye(len(centre))[:2]) - camera.pixels(centre[None])
+        shift = np.zeros(len(centre))
+        shift[:2] = -np.linalg.lstsq(nudged.T / NUDGE, np.array(pixels, dtype=np.float64), rcond=None)[0]
+    else:
+        return None
+    return _with_readings(setting, HAND, lambda position, dt: position - shift[: position.shape[1]])
+
+
+def _hand_camera(setting: Setting) -> LandmarkFilter | None:
+    """Where the hand is seen in healthy images."""
+    reference = None if setting.healthy is None else setting.healthy.reference
+    return None if reference is None else reference.hand
+
+
+def shift_labels(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Labels without an offset: the excess bias of all measurement models, weighted by their precision."""
+    task = setting.checkpoint.task
+    shift = np.zeros(len(task.components))
+    for i, component in enumerate(task.components):
+        known = [
+            d
+            for name, d in deviations.items()
+            if name.startswith("module bias/") and name.endswith(f" {component.name}/all")
+        ]
+        if not known:
+            return None
+        weights = [max(d.high - d.low, 1e-6) ** -2 for d in known]
+        shift[i] = np.average([d.value - d.healthy for d in known], weights=weights)
+    return _with_labels(setting, lambda states: states + shift)
 
 
 def scale_control(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -131,7 +235,12 @@ def _ratio(deviations: Deviations, name: str) -> float | None:
 READINGS: Mapping[str, Undo] = {
     "realign image": realign_image,
     "expose image": expose_image,
-    "tare force": tare_force,
+    "tare force": partial(tare, FORCE),
+    "tare torque": partial(tare, TORQUE),
+    "permute force": permute_force,
+    "restore contact": restore_contact,
+    "shift hand": shift_hand,
+    "shift labels": shift_labels,
     "detrend force": detrend_force,
     "scale force": scale_force,
     "negate force": negate_force,

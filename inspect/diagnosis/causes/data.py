@@ -27,6 +27,7 @@ CAUSES = (
         ),
         f"{OBJECT}|object match/image*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*",
         "Synchronise the clock of the motion capture with the sensors.",
+        "advance labels",
     ),
     Cause(
         "labels.offset",
@@ -39,6 +40,7 @@ CAUSES = (
         f"object match/image*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}"
         f"|{DYNAMICS}",
         "Register the frame of the motion capture with the robot's.",
+        "shift labels",
     ),
     Cause(
         "data.shift",

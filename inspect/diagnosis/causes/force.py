@@ -52,7 +52,7 @@ CAUSES = (
         (Symptom("axes/force/*", -1),),
         f"lever/force*|direction/force/*|level/force*|drift/force*|noise/force*|stuck/force*|{CONTACT}|{HAPTICS}",
         "Correct the frame of the force sensor.",
-        "drop haptics",
+        "permute force|drop haptics",
     ),
     Cause(
         "force.noise",
@@ -84,7 +84,7 @@ CAUSES = (
         (Symptom("level/torque*", 0),),
         f"drift/torque*|saturation/torque*|{HAPTICS}",
         "Tare the torque sensor in free motion.",
-        "drop haptics",
+        "tare torque|drop haptics",
     ),
     Cause(
         "torque.noise",

@@ -19,7 +19,7 @@ CAUSES = (
         (Symptom(HAND, 0, otherwise=(Symptom("offset/control*", 0),)),),
         f"{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Calibrate the robot's kinematics against the camera.",
-        "drop haptics",
+        "shift hand|drop haptics",
     ),
     Cause(
         "effector.noise",
@@ -39,7 +39,7 @@ CAUSES = (
         ),
         f"opposition/contact/extreme|{IN_PHASES}|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the contact sensor or its threshold.",
-        "drop haptics",
+        "restore contact|drop haptics",
         lowers="toggles/contact/*",
     ),
     Cause(
@@ -51,7 +51,7 @@ CAUSES = (
         ),
         f"share/contact/*|unflagged force/contact/*|{IN_PHASES}|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the sign and the threshold of the contact sensor.",
-        "drop haptics",
+        "restore contact|drop haptics",
     ),
     Cause(
         "contact.delay",
@@ -60,7 +60,7 @@ CAUSES = (
         f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*"
         f"|direction/*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Synchronise the contact sensor with the force sensor.",
-        "drop haptics",
+        "restore contact|drop haptics",
     ),
     Cause(
         "haptics.dropout",

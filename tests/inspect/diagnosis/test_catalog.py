@@ -61,7 +61,7 @@ def row(cause: Cause) -> str:
         return " or ".join([own, *map(text, s.otherwise)]) + (", if known" if s.optional else "")
 
     symptoms = "; ".join(map(text, cause.symptoms))
-    return f"| `{cause.name}` | {cause.title} | {symptoms} | {cause.undo or 'none'} |"
+    return f"| `{cause.name}` | {cause.title} | {symptoms} | {cause.undo.replace('|', ', or ') or 'none'} |"
 
 
 def test_the_catalog_has_every_required_cause_once() -> None:

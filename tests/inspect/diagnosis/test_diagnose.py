@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,7 +21,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import open_filter
-from beliefscope.inspect.diagnosis.case import compared, focus, observe
+from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, focus, observe
 from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
@@ -85,6 +86,25 @@ def test_focused_episodes_are_compared_with_each_other() -> None:
     alone = compared(part.setting, part.traces, [rows[i] for i in chosen], part.sensors, profile(), 0.05)
     assert part.grouped == alone.grouped
     assert part.grouped != [case.grouped[i] for i in chosen]
+
+
+def test_episodes_are_affected_unless_they_are_healthy() -> None:
+    """A weak fault of all episodes is not taken for one of those that happen to show it most."""
+    weak = deviations_in(lambda healthy, spread: [healthy + 1.5 * spread] * 3 + [healthy + 0.6 * spread] * 3)
+    some = deviations_in(lambda healthy, spread: [healthy + 9.0 * spread] * 3 + [healthy] * 3)
+    every = deviations_in(lambda healthy, spread: [healthy + 9.0 * spread] * 3 + [healthy + 4.0 * spread] * 3)
+    assert affected_episodes(weak, weak.deviations).tolist() == [True] * 6
+    assert affected_episodes(some, some.deviations).tolist() == [True] * 3 + [False] * 3
+    assert affected_episodes(every, every.deviations).tolist() == [True] * 6
+
+
+def deviations_in(values: Callable[[float, float], list[float]]) -> Case:
+    """A case whose force along x has levels by episode, from those of healthy episodes and their standard deviation."""
+    healthy = np.array([0.1 * (i % 11) for i in range(44)])
+    name = "level/force x/free motion"
+    rows = [{name: value} for value in values(float(healthy.mean()), float(healthy.std()))]
+    setting = Setting(checkpoint(), {}, 300, frozenset())
+    return compared(setting, [], rows, rows, HealthyProfile("test", 44, None, {name: healthy}), 0.05)
 
 
 @pytest.mark.slow

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.cause import Recovery
-from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
+from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.statistics.measures import counted
+from beliefscope.inspect.traces.batch import trace_all
 
 
 def error(value: float, alarm: bool = False) -> dict[str, Deviation]:
@@ -41,3 +47,23 @@ def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool
 def test_calibration_may_change_in_both_directions(nees: float, visible: bool) -> None:
     changed = Effect(Recovery(0.0, 0.0, 0.0, 0.0), 0.0, {"nees/fused/all": nees}, True)
     assert is_visible({}, changed) is visible
+
+
+def test_ratios_are_those_of_all_steps_of_all_episodes() -> None:
+    """Errors by unit and the NEES, pooled: not means of episodes, which short or easy ones would dominate."""
+    filter_ = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    with open_dataset(sample_path("door")) as data:
+        episodes = {index: data[index] for index in data.held_out()[:3]}
+    faulty = {index: Faults.parse("blackout=0.9").apply(episode) for index, episode in episodes.items()}
+    before, after = (list(trace_all(filter_, group, group, 0, 30)) for group in (faulty, episodes))
+    ratios = effect_ratios(before, after)
+    squares = [
+        np.concatenate([np.square(t.estimate_mean[counted(t)] - t.episode.states[counted(t)]) for t in group])
+        for group in (before, after)
+    ]
+    position, angle = (
+        [float(np.sqrt(group[:, part].sum(1).mean())) for group in squares] for part in (slice(0, 2), slice(2, 3))
+    )
+    assert ratios["error//all"] == pytest.approx(position[0] / position[1], rel=1e-5)
+    assert ratios["angle error//all"] == pytest.approx(angle[0] / angle[1], rel=1e-5)
+    assert set(ratios) == {"error//all", "angle error//all", "nees/fused/all"}
