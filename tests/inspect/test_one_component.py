@@ -15,8 +15,10 @@ from beliefscope.app.protocol.trace_format import columns, header, scene_layers
 from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Component, Task
 from beliefscope.datasets.task_json import task_from_json, task_to_json
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
@@ -29,6 +31,7 @@ from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of, s
 from beliefscope.inspect.figures.paper import maps_figure, steps_by_contact
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.sweep import summary
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.replay import Edit
 from beliefscope.recordings.export import export_trace
@@ -217,6 +220,20 @@ def test_start_offsets_have_the_unit_of_the_component() -> None:
     assert StartOffset.parse("5 cm", task("km", ("cm", 1e5), 1e-3)).lengths["km"] == pytest.approx(5e-5)
     with pytest.raises(BadInput, match="not in a unit of task 'tank': K"):
         StartOffset.parse("3cm", task())
+
+
+def test_rows_of_sweeps_have_the_error_of_the_main_component() -> None:
+    """The main error is that of the first of two components: its key is also that of the component."""
+    door = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    with open_dataset(sample_path("door")) as data:
+        run = trace(door, data[9], 9)
+    task_ = replace(run.task, map_components=("hinge_x",))
+    named = replace(run, episode=replace(run.episode, task=task_))
+    row = next(iter(summary(named)))
+    error = 100.0 * measures.errors(named)[measures.phases(named)[row["phase"]], -1, 0]
+    assert row["error"] == row["hinge_x_cm"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-6)
+    assert row["worst"] == pytest.approx(np.abs(error).max(), rel=1e-6)
+    assert row["angle_deg"] > 0.0
 
 
 def test_failures_are_in_the_unit_of_the_component(runs: list[Trace]) -> None:
