@@ -260,6 +260,7 @@ def test_trace_file_is_that_of_safetensors(traced: Trace, tmp_path: Path) -> Non
     assert (tmp_path / "timed.trace").read_bytes() == safetensors.numpy.save(arrays, metadata)
 
 
+@pytest.mark.slow
 def test_modified_parts_are_refused(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (store, episode_file, episode_parts):
         monkeypatch.setattr(module, "STEPS_PER_PART", 30)
