@@ -163,6 +163,7 @@ MEMORY = (
     ("crossmodal-ekf", 1_000_000, 300),
     ("crossmodal-pf", 20, 1_000_000),
     ("crossmodal-pf", 100, 1_000_000),
+    ("crossmodal-pf", 800, 1_000_000),
 )
 """Filter, steps and particles of each measured trace."""
 

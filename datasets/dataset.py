@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -72,6 +72,10 @@ class Dataset(ABC):
         """Indices of the test episodes, else of the validation episodes, else of all episodes."""
         by_split = {split: [s.index for s in self.summaries if s.split == split] for split in ("test", "val")}
         return by_split["test"] or by_split["val"] or list(range(len(self)))
+
+    def most_steps(self, indices: Iterable[int]) -> int:
+        """Number of steps of the longest of these episodes; 0 without any."""
+        return max((self.summaries[index].steps for index in indices if 0 <= index < len(self)), default=0)
 
     def close(self) -> None:  # noqa: B027 (closing is optional)
         """Close open files. Episodes already read stay valid."""

@@ -144,6 +144,7 @@ def evaluate(
         BadInput: there is no episode; episodes, faults or modality do not fit the filter's task; or there are several
             workers for an external filter that has no build function.
     """
+    faults.check(filter_.task, max(map(len, episodes), default=0))
     offsets = torch.from_numpy(start_offset.vectors(filter_.task, episodes, seed))
     members = list(zip(range(len(episodes)), episodes, offsets, strict=True))
     block_runs = partial(

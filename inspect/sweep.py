@@ -109,7 +109,9 @@ class Inputs:
                 used.add(data_path)
                 episodes = range(len(data)) if self.all_episodes else data.held_out()
                 for faults in self.faults:
-                    text = str(read_faults(faults, data.task))
+                    injected = read_faults(faults, data.task)
+                    injected.check(data.task, data.most_steps(episodes))
+                    text = str(injected)
                     for seed in self.seeds:
                         cells += [
                             Cell(path, checkpoint.hash, data_path, data.hash, text, seed, self.particles, block)

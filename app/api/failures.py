@@ -82,10 +82,11 @@ def _arguments(store: TraceStore, request: SurveyRequest) -> dict[str, Any]:
     """Arguments of the job. Raises BadInput for an unknown name or invalid faults."""
     faults = Faults.parse(request.faults)
     name, data = store.dataset(request.task, request.data)
-    faults.check(store.checkpoint(request.task, request.filter).task)
+    episodes = data.held_out() if request.among == "held-out" else list(range(len(data)))
+    faults.check(store.checkpoint(request.task, request.filter).task, data.most_steps(episodes))
     return asdict(request) | {
         "settings": store.settings.to_json(),
         "data": name,
         "faults": str(faults),
-        "episodes": data.held_out() if request.among == "held-out" else list(range(len(data))),
+        "episodes": episodes,
     }

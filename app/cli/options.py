@@ -235,12 +235,6 @@ class Runs:
         checkpoint = open_filter(definition_of(self.task, self.data), self.filter)
         return checkpoint, read_faults(self.faults, checkpoint.task)
 
-    def clean_episodes(self, dataset: Dataset, indices: Iterable[int], faults: Faults) -> dict[int, Episode]:
-        """Episodes by index, without the faults. Raises BadInput for a fault that starts after all of them."""
-        episodes = {index: dataset[index] for index in indices}
-        faults.check(dataset.task, max(map(len, episodes.values())))
-        return episodes
-
     def settings(self, faults: Faults) -> dict[str, Any]:
         """Arguments that all functions that run a filter over episodes have."""
         return {"faults": faults, "seed": self.seed, "particles": self.particles}

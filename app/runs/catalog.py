@@ -116,6 +116,7 @@ class TaskCatalog:
             "components": [component.to_json() for component in task.components],
             "modalities": list(task.modalities),
             "dt": task.dt,
+            "simulated": task.simulate is not None,
             "map": {"components": list(task.map_components), "half_width": task.map_half_width},
             "main": {
                 "name": main.name,

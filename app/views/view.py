@@ -203,7 +203,8 @@ class View:
         except BadInput as error:
             await _send_error(websocket, serial, str(error))
         except Exception as error:
-            if websocket is not self._socket and isinstance(error, WebSocketDisconnect | RuntimeError):
+            gone = isinstance(error, WebSocketDisconnect)  # the page was closed
+            if gone or (websocket is not self._socket and isinstance(error, RuntimeError)):
                 return
             log.exception("The cursor could not be drawn")
             await _send_error(websocket, serial, f"The server failed: {error}")

@@ -75,11 +75,11 @@ class Faults:
     def check(self, task: Task, steps: int | None = None) -> None:
         """Raise BadInput for a fault of a sensor that the task does not have, or that starts after the last step.
 
-        steps: number of steps of the longest episode; None if unknown.
+        steps: number of steps of the longest episode; None or 0 if unknown.
         """
         for fault in self.sequence:
             fault.keys(task)
-            if steps is not None and fault.from_ >= steps:
+            if steps and fault.from_ >= steps:
                 raise BadInput(f"fault {fault} starts after the last step, {steps - 1}")
 
     def apply(self, episode: Episode, seed: int = 0) -> Episode:

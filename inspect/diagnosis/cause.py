@@ -161,7 +161,7 @@ class Diagnosis:
         masked: whether a sensor is faulty and the filter is unaffected.
         headline: one sentence.
         causes: most probable first; empty if healthy.
-        provenance: task, filter, hash, episodes and healthy record.
+        provenance: task, filter, hash, episodes, healthy record and numbers of compared statistics.
     """
 
     state: Literal["healthy", "fault", "unsure"]

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
+from beliefscope.datasets.task import display_name
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
-from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, label_of
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -30,8 +32,35 @@ EVIDENCE = 5
 
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
-    text = f"Healthy: all statistics are within the record of {case.profile.episodes} healthy episodes."
-    return Diagnosis("healthy", False, text, (), _provenance(case))
+    numbers = statistics_by_subject(case)
+    record = f"the record of {case.profile.episodes} healthy episodes"
+    text = f"Healthy: all {sum(numbers.values())} statistics are within {record}"
+    if unchecked := [display_name(key) for key in case.setting.checkpoint.task.observations if key not in numbers]:
+        text += f"; none is about {' or '.join(unchecked)}"
+    if undefined := _undefined(case):
+        text += f"; {len(undefined)} cannot be measured here, such as {label_of(undefined[0])}"
+    return Diagnosis("healthy", False, f"{text}.", (), _provenance(case))
+
+
+def _undefined(case: Case) -> list[str]:
+    """Statistics of sensors in the record that none of the episodes has, such as those of free motion."""
+    known = {deviation.statistic for deviation in case.deviations}
+    of_sensors = dict.fromkeys(name for row in case.sensors for name in row)
+    healthy = case.profile.statistics
+    return [n for n in of_sensors if n in healthy and n not in known and np.isfinite(healthy[n]).sum() >= MIN_HEALTHY]
+
+
+def statistics_by_subject(case: Case) -> dict[str, int]:
+    """Number of compared statistics about each sensor, the controls, the labels, the models and the filter."""
+    of_sensors = {name for row in case.sensors for name in row}
+
+    def subject(statistic: str) -> str:
+        kind, about, _ = statistic.split("/")
+        if statistic in of_sensors or about == "labels":
+            return about.partition(" ")[0]
+        return "models" if kind.startswith(("module", "dynamics", "process noise")) else "filter"
+
+    return dict(Counter(subject(deviation.statistic) for deviation in case.deviations))
 
 
 def conclude(
@@ -122,5 +151,6 @@ def _provenance(case: Case) -> dict[str, Any]:
         "checkpoint_hash": checkpoint.hash,
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
+        "statistics": statistics_by_subject(case),
         "alarm_rate": case.alarm_rate,
     }

@@ -28,7 +28,10 @@ from beliefscope.inspect.diagnosis.window_checks import (
     window_values,
 )
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys
-from beliefscope.inspect.statistics.signals import Array, Mask, deviating_interval, long_runs, repeats
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
+
+BIASED = 0.3
+"""Largest level of the steps without a bias, relative to that of those with it."""
 
 
 def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
@@ -54,6 +57,8 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
     if marked is not None:
         steps = np.flatnonzero(marked)
         return (int(steps[0]), int(steps[-1])) if len(steps) else None
+    if kind == "level":
+        return biased_steps(episode, key, axis_index(axis))
     series = _series(kind, key, axis, episode, reference)
     if series is not None:
         return deviating_interval(series)
@@ -81,6 +86,22 @@ def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | No
             marked[present] = saturated(readings[present, axis_index(axis)].astype(np.float64))
             return marked
     return None
+
+
+def biased_steps(episode: Episode, key: str, axis: int) -> tuple[int, int] | None:
+    """First and last step with a large level in free motion; None if the other free steps have it as well.
+
+    Contact hides a bias: at the first or the last step in free motion, the episode begins or ends with it.
+    """
+    free = np.flatnonzero(free_motion(episode) & episode.present(key))
+    if len(free) < MIN_STEPS:
+        return None
+    size = np.abs(episode.observations[key][free, axis].astype(np.float64))
+    first, last = deviating_interval(size)
+    others = np.delete(size, np.s_[first : last + 1])
+    if not len(others) or np.median(others) > BIASED * np.median(size[first : last + 1]):
+        return None
+    return int(free[first]) if first else 0, int(free[last]) if last < len(free) - 1 else len(episode) - 1
 
 
 def _in_runs(mask: Mask, present: Mask) -> Mask:
@@ -111,6 +132,4 @@ def _series(kind: str, key: str, axis: str, episode: Episode, reference: Referen
             return np.interp(steps, steps[present], _without_lost(series, episode.observations[key][present]))
         case "brightness" if reference is not None and reference.image.shape == readings.shape[1:]:
             return _without_lost(np.abs(brightness_of(readings, reference) - 1.0), episode.observations[key])
-        case "level":
-            return np.where(free_motion(episode) & present, np.abs(readings[:, axis_index(axis)]), 0.0)
     return None

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
+from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
 from beliefscope.inspect.diagnosis.setting import Deviations, Setting, Undo
-from beliefscope.inspect.diagnosis.vector_checks import CHANGE, FORCE, TORQUE, in_contact, lever
+from beliefscope.inspect.diagnosis.vector_checks import CHANGE, FORCE, TORQUE, free_motion, in_contact, lever
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
 from beliefscope.inspect.statistics.signals import MIN_STEPS
@@ -39,13 +41,17 @@ def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], f
             continue
         if key not in episode.observations:
             return None
-        readings = episode.observations[key]
-        changed = change(readings.astype(np.float64), episode.dt)
-        if readings.dtype == np.uint8:
-            changed = np.rint(changed).clip(0, 255)
-        observations = {**episode.observations, key: changed.astype(readings.dtype)}
-        episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
+        episodes[index] = _changed(episode, key, change(episode.observations[key].astype(np.float64), episode.dt))
     return replace(setting, episodes=episodes)
+
+
+def _changed(episode: Episode, key: str, readings: NDArray[Any]) -> Episode:
+    """The episode with other readings of a sensor, and the controls that derive from them."""
+    kind = episode.observations[key].dtype
+    if kind == np.uint8:
+        readings = np.rint(readings).clip(0, 255)
+    observations = {**episode.observations, key: readings.astype(kind)}
+    return replace(episode, observations=observations, controls=derived_controls(episode, observations))
 
 
 def _with_labels(setting: Setting, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Setting:
@@ -108,11 +114,25 @@ def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
 
 
 def tare(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
-    """Force or torque without its excess level in free motion."""
-    bias = [_excess(deviations, f"level/{key} {axis}/free motion") for axis in "xyz"]
-    if None in bias:
+    """Force or torque without its excess level in free motion; that of some steps only is removed from these."""
+    levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
+    if key not in setting.checkpoint.task.observations or None in levels:
         return None
-    return _with_readings(setting, key, lambda readings, dt: readings - np.array(bias)[: readings.shape[1]])
+    episodes = dict(setting.episodes)
+    for index in setting.affected:
+        episode = episodes[index]
+        readings = episode.observations[key].astype(np.float64)
+        for axis, level in enumerate(levels[: readings.shape[1]]):
+            assert level is not None
+            steps = biased_steps(episode, key, axis)
+            if steps is None:
+                readings[:, axis] -= level.value - level.healthy
+            else:
+                part = np.s_[steps[0] : steps[1] + 1]
+                free = free_motion(episode)[part] & episode.present(key)[part]
+                readings[part, axis] -= np.median(readings[part, axis][free]) - level.healthy
+        episodes[index] = _changed(episode, key, readings)
+    return replace(setting, episodes=episodes)
 
 
 def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -159,9 +179,8 @@ def restore_contact(setting: Setting, deviations: Deviations) -> Setting | None:
     for index in setting.affected:
         episode = episodes[index]
         size = np.linalg.norm(episode.observations[FORCE].astype(np.float64) - zero, axis=1)
-        contact = (size > CLEARLY * unflagged).astype(episode.observations[CONTACT].dtype)[:, None]
-        observations = {**episode.observations, CONTACT: contact}
-        episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
+        contact = (size > CLEARLY * unflagged)[:, None]
+        episodes[index] = _changed(episode, CONTACT, contact)
     return replace(setting, episodes=episodes)
 
 

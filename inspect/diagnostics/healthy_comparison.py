@@ -77,21 +77,29 @@ KINDS = {
     "ancestors": ("share of particles with offspring", False, 0.01),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),
-    "black": ("share of steps without an image", False, 0.02),
+    "black": ("share of lost readings", False, 0.02),
     "frozen": ("share of repeated readings", False, 0.02),
     "sharpness": ("sharpness", True, 0.05),
-    "brightness": ("exposure relative to healthy images", True, 0.03),
+    "brightness": ("exposure{of} relative to healthy images", True, 0.03),
     "occlusion": ("share of occluded pixels", False, 0.01),
     "shift": ("shift in pixels", False, 0.2),
-    "lag": ("delay in steps", False, 0.5),
-    "hand offset": ("distance in pixels of the hand in the image from its measured position", False, 0.1),
-    "hand match": ("similarity of the hand in the image to healthy images", True, 0.05),
-    "object offset": ("distance in pixels of the object in the image from its labelled position", False, 0.1),
-    "object match": ("similarity of the object in the image to healthy images", True, 0.05),
-    "contact distance": ("distance in m of the hand from the labelled object, beyond healthy contacts", False, 5e-4),
-    "contact distance error": ("deviation in m of the hand from the labelled object in contact", False, 5e-4),
-    "contact distance scatter": ("variation between episodes in m of the hand from the labelled object", False, 5e-4),
-    "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
+    "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
+    "hand offset": ("distance in pixels of the hand in the image from its measured position{axis}", False, 0.1),
+    "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
+    "object offset": ("distance in pixels of the object in the image from its labelled position{axis}", False, 0.1),
+    "object match": ("similarity of the object in the image to healthy images{axis}", True, 0.05),
+    "contact distance": (
+        "distance in m of the hand from the labelled object beyond healthy ones{axis}",
+        False,
+        5e-4,
+    ),
+    "contact distance error": ("deviation in m of the hand from the labelled object{axis}", False, 5e-4),
+    "contact distance scatter": (
+        "variation in m of the hand's deviation between episodes{axis}",
+        False,
+        5e-4,
+    ),
+    "offset": ("offset{of} from the measured hand or the estimates (m, rad)", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
     "change": ("second difference", False, 0.05),
@@ -99,19 +107,20 @@ KINDS = {
     "position noise": ("noise in m", False, 5e-4),
     "stuck": ("share of repeated readings", False, 0.02),
     "saturation": ("share of saturated readings", False, 0.01),
-    "share": ("share of steps with the flag", False, 0.02),
-    "toggles": ("share of steps at which the flag changes", False, 0.01),
-    "agreement": ("correlation with the force", False, 0.05),
-    "opposition": ("negative correlation with the force", False, 0.05),
-    "unflagged force": ("force in N without the flag", True, 0.2),
+    "share": ("share of steps with the flag{of}", False, 0.02),
+    "toggles": ("share of steps at which the flag{of} changes", False, 0.01),
+    "agreement": ("correlation{of} with the force", False, 0.05),
+    "opposition": ("negative correlation{of} with the force", False, 0.05),
+    "unflagged force": ("force in N without the flag{of}", True, 0.2),
     "size": ("standard deviation", True, 0.1),
-    "lever": ("lever in m of the torque", False, 0.01),
+    "lever": ("lever in m of the torque{axis}", False, 0.01),
     "axes": ("evidence for the order of the axes", False, 0.3),
-    "direction": ("cosine between force and motion of the hand", False, 0.05),
-    "scale": ("scale relative to the motion of the hand", False, 0.02),
+    "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),
+    "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
-standard deviation between trajectories, below which differences are irrelevant."""
+standard deviation between trajectories, below which differences are irrelevant. A name may have a place ``{of}`` for
+the statistic's subject, or ``{axis}`` for its axis only, if they are not at its end."""
 
 UNITS = {"force": "N", "torque": "N m", "image": "gray levels"}
 """Units of the readings of sensors that all simulated tasks have."""
@@ -167,20 +176,27 @@ class Deviation:
 
     @property
     def label(self) -> str:
-        """Display name, such as ``effective weight of image, hinge x in contact``."""
-        kind, subject, phase = self.statistic.split("/")
-        title = KINDS[kind][0] if kind in KINDS else kind
-        if kind in IN_UNITS and (unit := UNITS.get(subject.partition(" ")[0])):
-            title += f" in {unit}{IN_UNITS[kind]}"
-        subject = display_name(subject.replace(" ", ", "))  # modality, component
-        before, after = PHASES.get(phase, ("", f" in {phase}"))
-        return f"{before}{title}{f' of {subject}' if subject else ''}{after}"
+        """Display name of the statistic."""
+        return label_of(self.statistic)
 
     @property
     def text(self) -> str:
         """Label, value and healthy range."""
         numbers = (_number(x) for x in (self.value, self.healthy, self.low, self.high))
         return "{} is {}, healthy {} ({} to {})".format(self.label, *numbers)
+
+
+def label_of(statistic: str) -> str:
+    """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``."""
+    kind, subject, phase = statistic.split("/")
+    title = KINDS[kind][0] if kind in KINDS else kind
+    if kind in IN_UNITS and (unit := UNITS.get(subject.partition(" ")[0])):
+        title += f" in {unit}{IN_UNITS[kind]}"
+    name, _, axis = subject.partition(" ")
+    of, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
+    title = title.format(of=of + axis, axis=axis) if "{" in title else title + of + axis
+    before, after = PHASES.get(phase, ("", f" in {phase}"))
+    return f"{before}{title}{after}"
 
 
 @dataclass(frozen=True)

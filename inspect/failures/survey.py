@@ -45,6 +45,8 @@ def survey_of(
     external filter that has no build function.
     """
     indices = list(episodes)
+    longest = data.most_steps(indices) if isinstance(data, Dataset) else max((len(data[i]) for i in indices), default=0)
+    faults.check(checkpoint.task, longest)
     settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
     if by is not None:
         try_score(by, checkpoint, data, indices[:1], **settings)

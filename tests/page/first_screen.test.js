@@ -116,7 +116,9 @@ test('a fault comes first, then the outage, then the largest error', () => {
   const unknown = finding(run(14), 0, { ...FAULT, state: 'unsure', causes: [] });
   assert.deepEqual([unknown.tone, unknown.step], ['warn', 10]);
   assert.match(unknown.evidence, /^Largest error at step 10\. /, 'no cause has evidence');
-  assert.equal(finding(run(14), 0, HEALTHY).tone, 'good');
+  const accurate = { ...run(14), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
+  assert.equal(finding(accurate, 0, HEALTHY).tone, 'good');
+  assert.equal(finding(run(14), 0, HEALTHY).tone, 'warn', 'overconfident, as its healthy record');
   assert.equal(finding(run(14), 0, HEALTHY).step, 8);
   const plain = finding(run(11), 0, null);
   assert.equal(plain.headline, 'Largest error at step 10.');

@@ -74,6 +74,11 @@ def test_pooled_results_equal_the_evaluation(inputs: Inputs, sweep: Path) -> Non
     assert components["angle"][0].as_py() == pytest.approx(expected.rmse["angle_deg"], rel=1e-4)
 
 
+def test_faults_after_all_steps_are_refused(inputs: Inputs) -> None:
+    with pytest.raises(BadInput, match="starts after the last step, 99"):
+        replace(inputs, faults=("", "blackout:from=100")).cells(BLOCK)
+
+
 def test_phases_partition_the_steps(sweep: Path) -> None:
     steps = Experiments([sweep]).query(
         "SELECT phase, sum(steps) AS steps FROM results WHERE faults = '' GROUP BY phase"

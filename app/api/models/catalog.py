@@ -151,12 +151,16 @@ class Component(Reply):
 
 
 class TaskInfo(Reply):
-    """A task in the catalog, its filters and data sets; the first of each is the default."""
+    """A task in the catalog, its filters and data sets; the first of each is the default.
+
+    simulated: whether more episodes can be collected.
+    """
 
     name: str
     components: list[Component]
     modalities: list[str]
     dt: float
+    simulated: bool
     map: MapArea
     main: MainError
     fault_presets: list[FaultPreset]

@@ -34,7 +34,10 @@ class DiagnosisCause(Reply):
 
 
 class Diagnosis(Reply):
-    """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected."""
+    """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
+
+    statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
+    """
 
     state: Literal["healthy", "fault", "unsure"]
     masked: bool
@@ -45,6 +48,7 @@ class Diagnosis(Reply):
     checkpoint_hash: str
     episodes: int
     healthy_episodes: int
+    statistics: dict[str, int]
     alarm_rate: float
 
 

@@ -53,8 +53,8 @@ def diagnose(
     other = None if base is None else open_filter(checkpoint.task, str(base))
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
-        clean = runs.clean_episodes(data, indices, faults)
-        episodes = {index: faults.apply(clean_episode, runs.seed) for index, clean_episode in clean.items()}
+        faults.check(data.task, data.most_steps(indices))
+        episodes = {index: faults.apply(data[index], runs.seed) for index in indices}
         failed = None if repair is None else data[repair]
     profile = _profile(checkpoint, profile_from)
     with console.progress("Diagnosing") as advance:

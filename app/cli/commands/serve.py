@@ -123,16 +123,24 @@ def serve_page(
 
 
 def filters_of_command_line(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path | Checkpoint]:
-    """Displayed name -> checkpoint file or external filter, of the filters and tasks on the command line."""
+    """Displayed name -> checkpoint file or external filter; the page opens the first one."""
     from beliefscope.app.runs.catalog import PRETRAINED, short_names
     from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.names import is_code
 
     given = [load_task(name) for name in tasks]
-    external = [load_external(name, given=given) for name in filters if is_code(name)]
-    paths = [Path(name) for name in filters if not is_code(name)]
-    return {**short_names(paths, PRETRAINED), **{checkpoint.name: checkpoint for checkpoint in external}}
+    files = short_names((Path(name) for name in filters if not is_code(name)), PRETRAINED)
+    names = {path: name for name, path in files.items()}
+    checkpoints: dict[str, Path | Checkpoint] = {}
+    for text in filters:
+        if is_code(text):
+            external = load_external(text, given=given)
+            checkpoints[external.name] = external
+        else:
+            path = Path(text).resolve()
+            checkpoints[names[path]] = path
+    return checkpoints
 
 
 @contextmanager

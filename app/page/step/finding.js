@@ -3,7 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Diagnosis } from '../types/server.js' */
 
-import { fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
+import { displayName, fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { stepSummary } from './step_summary.js';
 
@@ -35,12 +35,13 @@ export function finding(trace, component, diagnosis) {
     const diagnosed = diagnosis ? `Diagnosis: ${sentence(diagnosis.headline)}` : '';
     return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
   }
-  const outage = fault ? null : outageFinding(trace, component);
-  if (outage) return { ...outage, tone: diagnosis ? 'good' : 'none' };
   const worst = worstFinding(trace, component);
+  const healthy = worst.tone === 'bad' ? 'warn' : 'good'; // as its record, which may be poor
+  const outage = fault ? null : outageFinding(trace, component);
+  if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
   if (!diagnosis) return worst;
   const evidence = `${worst.headline} ${worst.evidence}`.trim();
-  const { tone = 'good', headline = sentence(diagnosis.headline) } = fault ?? {};
+  const { tone = healthy, headline = sentence(diagnosis.headline) } = fault ?? {};
   return { tone, headline, evidence, step: worst.step };
 }
 
@@ -130,8 +131,10 @@ export function outageFinding(trace, component) {
       ? `until the image returns at ${trace.stepLabel(last + 1)}`
       : 'to the end';
   const action = successor ? `; ${successor.name} takes over ${end}` : `, ${end}`;
+  const scope = trace.weightWidth > 1 ? ` in ${displayName(trace.components[component].name)}` : '';
   const evidence = weights.map(
-    ({ name, before, during }) => `the effective weight of ${name} ${change(before, during)}`,
+    ({ name, before, during }) =>
+      `the effective weight of ${name}${scope} ${change(before, during)}`,
   );
   const worst = Math.max(...(trace.error('fused', 'main')?.subarray(first, last + 1) ?? [NaN]));
   if (worst >= 0)

@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, html } from '../core/dom.js';
-import { fixed, percent, sentence, stepLabel, typeset } from '../core/units.js';
+import { displayName, fixed, percent, sentence, stepLabel, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
@@ -211,9 +211,12 @@ function stateOf(entry) {
 }
 
 /** @param {Result} result */
-function aboutOf({ episodes, healthy_episodes: healthy, alarm_rate: rate }) {
+function aboutOf({ episodes, healthy_episodes: healthy, alarm_rate: rate, statistics }) {
   const text = `${episodes} ${episodes === 1 ? 'episode' : 'episodes'} against ${healthy} healthy ones`;
-  return `${text}; probability of a false alarm ${percent(rate)}.`;
+  const numbers = Object.entries(statistics).map(
+    ([name, count]) => `${displayName(name)} ${count}`,
+  );
+  return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.`;
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */

@@ -35,8 +35,8 @@ export function missingStudy(study, catalog, store) {
       [ABOUT],
       ...(buttons.length ? [[`The ${source} has results for `, ...buttons]] : []),
     ],
-    purpose: `To make one, collect data of ${name}, train, and serve the results.`,
-    commands: studyCommands(name, selected?.modalities ?? []),
+    purpose: `To make one, ${selected?.simulated ? 'collect data' : 'use your data'} of ${name}, train, and serve the results.`,
+    commands: studyCommands(name, selected?.modalities ?? [], selected?.simulated ?? false),
   });
 }
 
@@ -44,12 +44,13 @@ export function missingStudy(study, catalog, store) {
  * Commands that make a study of a task: the crossmodal filter beside those of one modality.
  * @param {string} task
  * @param {readonly string[]} modalities
+ * @param {boolean} simulated whether its data can be collected
  */
-export function studyCommands(task, modalities) {
+export function studyCommands(task, modalities, simulated) {
   const single = modalities.filter((name) => SINGLE.includes(name));
   const filters = ['crossmodal', ...single].map((name) => ` --filter ${name}-ekf`).join('');
   return [
-    `beliefscope collect ${task} --episodes 300 -o ${task}.h5`,
+    ...(simulated ? [`beliefscope collect ${task} --episodes 300 -o ${task}.h5`] : []),
     `beliefscope study --task ${task} --data ${task}=${task}.h5${filters} -o study`,
     'beliefscope serve --study study',
   ];

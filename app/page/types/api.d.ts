@@ -144,6 +144,8 @@ export interface components {
         /**
          * Diagnosis
          * @description The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
+         *
+         *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
          */
         Diagnosis: {
             /**
@@ -167,6 +169,10 @@ export interface components {
             episodes: number;
             /** Healthy Episodes */
             healthy_episodes: number;
+            /** Statistics */
+            statistics: {
+                [key: string]: number;
+            };
             /** Alarm Rate */
             alarm_rate: number;
         };
@@ -1845,6 +1851,8 @@ export interface components {
         /**
          * TaskInfo
          * @description A task in the catalog, its filters and data sets; the first of each is the default.
+         *
+         *     simulated: whether more episodes can be collected.
          */
         TaskInfo: {
             /** Name */
@@ -1855,6 +1863,8 @@ export interface components {
             modalities: string[];
             /** Dt */
             dt: number;
+            /** Simulated */
+            simulated: boolean;
             map: components["schemas"]["MapArea"];
             main: components["schemas"]["MainError"];
             /** Fault Presets */

@@ -21,7 +21,7 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from beliefscope.app.cli.commands.serve import _browser_opener
+from beliefscope.app.cli.commands.serve import _browser_opener, filters_of_command_line
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server import timeouts
@@ -92,6 +92,14 @@ def test_other_signals_end_the_jobs(tmp_path: Path) -> None:
         assert server.communicate() == ("", "")
     (job,) = (json.loads(path.read_text()) for path in workspace.glob("jobs/*/job.json"))
     assert (job["state"], job["error"]) == ("interrupted", "the server stopped")
+
+
+def test_filters_keep_their_order(tmp_path: Path) -> None:
+    """The page opens the first one, whether it is a file or code."""
+    code = "examples/04_own_filter.py:build"
+    filters = filters_of_command_line([str(tmp_path / "b.safetensors"), code, str(tmp_path / "a.safetensors")], [])
+    assert [type(source).__name__ for source in filters.values()] == ["PosixPath", "ExternalFilter", "PosixPath"]
+    assert [name for name in filters if len(name) == 1] == ["b", "a"]
 
 
 def test_workspace_is_private(settings: Settings) -> None:

@@ -22,6 +22,7 @@ from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, focus, observe
+from beliefscope.inspect.diagnosis.conclusion import healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
@@ -71,6 +72,35 @@ def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
     if cause == "image.frozen":
         assert first.steps is not None
         assert 28 <= first.steps[0] <= 32
+
+
+def test_a_healthy_diagnosis_states_what_was_compared() -> None:
+    """Statistics by sensor, of controls, labels, models and filter; and those that these episodes cannot have."""
+    result = diagnose(checkpoint(), simulated(100, 6), profile=profile())
+    numbers = result.to_json()["statistics"]
+    assert {*checkpoint().task.observations, "control", "labels", "models", "filter"} == set(numbers)
+    assert f"all {sum(numbers.values())} statistics" in result.headline
+    touching = {i: with_contact(episode) for i, episode in simulated(100, 6).items()}
+    compared_ = diagnose(checkpoint(), touching, profile=profile())
+    assert compared_.to_json()["statistics"]["force"] < numbers["force"]
+
+
+def with_contact(episode: Episode) -> Episode:
+    """The episode with the contact flag at every step, hence without free motion."""
+    flag = np.ones_like(episode.observations["contact"])
+    return replace(episode, observations={**episode.observations, "contact": flag})
+
+
+def test_sensors_without_statistics_are_named() -> None:
+    sensors = {name: np.ones(20) for name in ("level/force x/free motion", "noise/force x/all")}
+    record = HealthyProfile("test", 20, None, {name: values + 0.1 * np.arange(20) for name, values in sensors.items()})
+    rows = [{"noise/force x/all": 1.5 + 0.1 * i} for i in range(3)]
+    setting = Setting(checkpoint(), {}, 300, frozenset())
+    sensed = [{**row, "level/force x/free motion": np.nan} for row in rows]
+    text = healthy(compared(setting, [], rows, sensed, record, 0.05)).headline
+    assert "Healthy: all 1 statistics" in text
+    assert "none is about image or" in text
+    assert text.endswith("1 cannot be measured here, such as level in N of force (x) in free motion.")
 
 
 def test_focused_episodes_are_compared_with_each_other() -> None:

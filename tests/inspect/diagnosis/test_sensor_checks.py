@@ -16,8 +16,8 @@ from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 from beliefscope.datasets.store import open_dataset
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
-from beliefscope.inspect.diagnosis.vector_checks import saturated
+from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
+from beliefscope.inspect.diagnosis.vector_checks import free_motion, saturated
 from beliefscope.inspect.diagnosis.window_checks import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
@@ -105,6 +105,17 @@ def test_a_fault_of_a_fifth_of_the_steps_shows_in_the_windows_only(
     assert change(task, faults, statistic) == pytest.approx(amount, abs=tolerance)
     kind, subject, _ = statistic.split("/")
     assert abs(change(task, faults, f"{kind}/{subject}/all")) < 0.2 * amount
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_bias_begins_in_free_motion(task: str) -> None:
+    """A bias of all steps has no first one; another begins at its first step, or at the first free one after it."""
+    for clean in (episode for episode in episodes(task) if free_motion(episode).sum() > 30):
+        free = np.flatnonzero(free_motion(clean))
+        assert biased_steps(Faults.parse("force_bias=8").apply(clean), "force", 0) is None
+        first = int(free[len(free) // 2])
+        steps = biased_steps(Faults.parse(f"force_bias=8:from={first}").apply(clean), "force", 0)
+        assert steps == (first, len(clean) - 1)
 
 
 def test_windows_that_deviate_are_adjacent() -> None:

@@ -24,6 +24,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, brings_back, undo
+from beliefscope.inspect.diagnosis.vector_checks import free_motion
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -161,6 +162,20 @@ def test_readings_without_a_fault_are_the_original_ones(
         np.testing.assert_allclose(
             changed.episodes[index].observations[key][inner], episode.observations[key][inner], atol=1e-4
         )
+
+
+def test_a_bias_of_some_steps_is_removed_from_these() -> None:
+    """Without knowledge of its steps, up to the noise of their level; contact hides where it begins and ends."""
+    faulty = {index: Faults.parse("force_bias=8:from=60").apply(episode) for index, episode in episodes().items()}
+    changed = undo("tare force", setting(checkpoint("crossmodal-ekf"), faulty), BIAS)
+    assert changed is not None
+    free = [free_motion(episode) for episode in episodes().values()]
+    true, wrong, restored = (
+        np.concatenate([e[i].observations["force"][at, 0] for i, at in zip(e, free, strict=True)])
+        for e in (episodes(), faulty, changed.episodes)
+    )
+    assert len(true) > 50
+    assert np.abs(restored - true).mean() < 0.1 * np.abs(wrong - true).mean()
 
 
 def test_controls_that_derive_from_readings_are_restored_with_them() -> None:

@@ -14,6 +14,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
 from beliefscope.inspect.failures.step_scores import Survey, disagreement, phases_of, scores_of
@@ -366,6 +367,16 @@ def test_unknown_names_list_the_available_ones(checkpoint: Checkpoint, survey: S
         find_failures(checkpoint, {}, by="eror")
     with pytest.raises(BadInput, match=r"phase 'contact' does not exist\. Available: contact made, contact lost"):
         failures_of(survey).worst(phase="contact")
+
+
+def test_faults_after_all_steps_are_refused(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> None:
+    """They would change nothing, and the results would be those of clean episodes."""
+    faults, longest = Faults.parse(f"blackout:from={CUT}"), list(episodes.values())
+    message = rf"fault blackout:from={CUT} starts after the last step, {CUT - 1}"
+    with pytest.raises(BadInput, match=message):
+        find_failures(checkpoint, episodes, faults=faults)
+    with pytest.raises(BadInput, match=message):
+        evaluate(checkpoint.filter, longest, faults=faults)
 
 
 def test_exact_estimates_have_no_events(traces: list[Trace]) -> None:
