@@ -9,7 +9,9 @@ import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from itertools import islice
+from multiprocessing.context import BaseContext
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -33,8 +35,7 @@ def run_in_processes(
     remaining, losses = iter(items), 0
     queue: list[Item] = []
     while True:
-        # Spawn instead of fork: locks held by threads of the caller would stay locked in a fork.
-        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _exit_with_parent)
+        pool = ProcessPoolExecutor(workers, _context(function), _exit_with_parent)
         running: dict[Future[Result], Item] = {}
         try:
             while True:
@@ -56,6 +57,28 @@ def run_in_processes(
             queue = [*running.values(), *queue]
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _context(function: Callable[..., object]) -> BaseContext:
+    """How processes start: not as forks of this one, since locks held by its threads would stay locked.
+
+    Where possible they are forks of a process that has only imported the modules of the function, so that PyTorch is
+    imported once instead of by every process.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(sorted(_modules(function)))
+    return context
+
+
+def _modules(function: Callable[..., object]) -> set[str]:
+    """Modules that define a function, or the functions of a partial one."""
+    if isinstance(function, partial):
+        parts = [function.func, *(value for value in function.args if callable(value))]
+        return set().union(*map(_modules, parts))
+    owner = getattr(function, "__self__", function)  # a bound method is defined by its object's class
+    return {getattr(owner, "__module__", __name__)} - {"__main__"}
 
 
 def _exit_with_parent() -> None:

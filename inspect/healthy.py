@@ -39,8 +39,13 @@ class SensorRecord:
     reference: Reference | None
 
 
-def sensor_record(episodes: Sequence[Episode]) -> SensorRecord:
-    """The statistics of the sensors of clean episodes, and their images."""
+def sensor_record(episodes: Sequence[Episode], reference: Reference | None = None) -> SensorRecord:
+    """The statistics of the sensors of clean episodes, and their images.
+
+    reference: images of other clean episodes of the same camera; default: measured, which takes most of the time.
+    """
+    if reference is not None:
+        return SensorRecord([sensor_statistics(episode, reference) for episode in episodes], reference)
     groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
     references = [measure_reference(group) for group in groups]
     rows = [sensor_statistics(episode, references[i % FOLDS]) for i, episode in enumerate(episodes)]
@@ -67,9 +72,14 @@ def profile_of(
     return HealthyProfile(data, len(rows), particles, columns, sensors.reference)
 
 
-def measure_profile(filter_: Filter, name: str, episodes: Sequence[Episode], data: str) -> dict[str, Any] | None:
-    """JSON of the healthy profile of a trained filter over the held-out of the episodes; None if there are none."""
+def measure_profile(
+    filter_: Filter, name: str, episodes: Sequence[Episode], data: str, reference: Reference | None = None
+) -> dict[str, Any] | None:
+    """JSON of the healthy profile of a trained filter over the held-out of the episodes; None if there are none.
+
+    data: where the episodes come from. reference: as for ``sensor_record``.
+    """
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
-    return profile_of(Checkpoint(filter_, name, "", {}), held_out, data).to_json()
+    return profile_of(Checkpoint(filter_, name, "", {}), held_out, data, sensor_record(held_out, reference)).to_json()

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint, shipped
+from beliefscope.filters.names import filter_names
 from beliefscope.inspect.statistics.reference_images import Reference
 
 Array = NDArray[np.float64]
@@ -94,15 +96,24 @@ def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: 
     return _beside_shipped(task, filter_, checkpoint_hash) or own
 
 
-@lru_cache(maxsize=4)  # shipped files do not change; reading one takes 10 ms
+def included_reference(task: Task) -> Reference | None:
+    """Healthy images of a task, from the file beside one of its shipped checkpoints; None without one."""
+    documents = (_file_beside_shipped(task.name, name) for name in filter_names(task))
+    images = (document["healthy_profile"]["reference"] for document in documents if document)
+    return next((Reference.from_json(image) for image in images if image is not None), None)
+
+
 def _beside_shipped(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
     """JSON of the profile in the file beside the shipped checkpoint of this hash."""
+    document = _file_beside_shipped(task, filter_)
+    return document["healthy_profile"] if document and document["checkpoint"] == checkpoint_hash else None
+
+
+@lru_cache(maxsize=4)  # shipped files do not change; reading one takes 10 ms
+def _file_beside_shipped(task: str, filter_: str) -> dict[str, Any] | None:
     try:
         path = shipped(task, filter_)
     except BadInput:
         return None
     path = path.with_name(path.stem + SUFFIX)
-    if not path.is_file():
-        return None
-    document = read_json(path.read_text())
-    return document["healthy_profile"] if document["checkpoint"] == checkpoint_hash else None
+    return read_json(path.read_text()) if path.is_file() else None

@@ -16,8 +16,8 @@ from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_che
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
-from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile
-from beliefscope.inspect.healthy import measure_profile
+from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile, included_reference
+from beliefscope.inspect.healthy import measure_profile, sensor_record
 from beliefscope.inspect.statistics.reference_images import measure_reference
 
 NAMES = [f"nees/{layer}/{phase}" for layer in ("image", "haptics", "fused") for phase in ("all", "contact")]
@@ -88,7 +88,7 @@ def test_one_deviating_trajectory_is_unusual_but_no_alarm_in_words() -> None:
     healthy = np.random.default_rng(7).normal(0.0, 0.05, 99)
     reference = HealthyProfile("", 99, None, {"autocorrelation/haptics hinge_y/all": healthy})
     one, five = (compare(reference, count * [{"autocorrelation/haptics hinge_y/all": 0.9}]) for count in (1, 5))
-    subject = "autocorrelation at lag 1 of the innovations of haptics, hinge y is 0.9"
+    subject = "autocorrelation at lag 1 of the innovations of haptics (hinge y) is 0.9"
     compared = f"compared with the healthy record of 99 trajectories: {subject}"
     assert one.sentence.startswith(f"Unusual episode (as up to 1 in 50 healthy ones), {compared}")
     assert five.sentence.startswith(f"Alarm, {compared}")
@@ -207,3 +207,18 @@ def test_a_run_without_common_statistics_raises_no_alarm() -> None:
     profile = HealthyProfile("simulated", 20, None, {NAMES[0]: np.ones(20)})
     for tested in ([], [{}], [{"other/fused/all": 1.0}]):
         assert not compare(profile, tested).alarms
+
+
+@pytest.mark.slow
+def test_included_images_replace_those_of_the_episodes() -> None:
+    """They are of the same camera: statistics of new episodes agree with those compared with the episodes' own."""
+    with open_dataset("datasets/samples/push.h5") as data:
+        task, episodes = data.task, [data[i] for i in range(140, 152)]
+    images = included_reference(task)
+    assert images is not None
+    own, included = (sensor_record(episodes, reference) for reference in (None, images))
+    assert included.reference is images
+    for name in ("shift/image x/all", "hand offset/image x/all", "brightness/image/all"):  # pixels; ratio
+        a, b = (np.array([row[name] for row in record.rows]) for record in (own, included))
+        assert np.nanmean(a) == pytest.approx(np.nanmean(b), abs=0.25)  # of 9 episodes, and of 120
+    assert included_reference(replace(task, name="unknown")) is None
