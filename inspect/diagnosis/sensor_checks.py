@@ -30,8 +30,8 @@ from beliefscope.inspect.diagnosis.window_checks import (
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
 
-BIASED = 0.3
-"""Largest level of the steps without a bias, relative to that of those with it."""
+CONTRAST = {"level": 0.3, "noise": 0.7, "position noise": 0.7, "brightness": 0.5}
+"""Kind of statistic -> largest size of its deviation in the other steps, relative to the affected ones."""
 
 
 def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
@@ -59,9 +59,9 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
         return (int(steps[0]), int(steps[-1])) if len(steps) else None
     if kind == "level":
         return biased_steps(episode, key, axis_index(axis))
-    series = _series(kind, key, axis, episode, reference)
-    if series is not None:
-        return deviating_interval(series)
+    sizes = _sizes(kind, key, axis, episode, reference)
+    if sizes is not None:
+        return _interval(sizes, kind)
     if phase not in (EXTREME, RANGE):
         return None
     windows = window_values(episode, reference)
@@ -96,11 +96,10 @@ def biased_steps(episode: Episode, key: str, axis: int) -> tuple[int, int] | Non
     free = np.flatnonzero(free_motion(episode) & episode.present(key))
     if len(free) < MIN_STEPS:
         return None
-    size = np.abs(episode.observations[key][free, axis].astype(np.float64))
-    first, last = deviating_interval(size)
-    others = np.delete(size, np.s_[first : last + 1])
-    if not len(others) or np.median(others) > BIASED * np.median(size[first : last + 1]):
+    steps = _interval(np.abs(episode.observations[key][free, axis].astype(np.float64)), "level")
+    if steps is None:
         return None
+    first, last = steps
     return int(free[first]) if first else 0, int(free[last]) if last < len(free) - 1 else len(episode) - 1
 
 
@@ -120,16 +119,23 @@ def _without_lost(series: Array, readings: NDArray[Any]) -> Array:
     return np.interp(steps, steps[~lost], series[~lost]) if not lost.all() else series
 
 
-def _series(kind: str, key: str, axis: str, episode: Episode, reference: Reference | None) -> Array | None:
+def _sizes(kind: str, key: str, axis: str, episode: Episode, reference: Reference | None) -> Array | None:
     """(T,) sizes of the deviation that a statistic measures; None if it has none."""
     readings, present = episode.observations[key].astype(np.float64), episode.present(key)
     match kind:
         case "noise" | "position noise" if present.sum() > 2:
             chosen = readings[:, [axis_index(axis)]] if axis else readings.reshape(len(readings), -1)
             size = np.median(np.abs(np.diff(chosen[present], n=2, axis=0)), axis=1)
-            series = np.log(np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12))
+            series = np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12)
             steps = np.arange(len(readings))
             return np.interp(steps, steps[present], _without_lost(series, episode.observations[key][present]))
         case "brightness" if reference is not None and reference.image.shape == readings.shape[1:]:
             return _without_lost(np.abs(brightness_of(readings, reference) - 1.0), episode.observations[key])
     return None
+
+
+def _interval(sizes: Array, kind: str) -> tuple[int, int] | None:
+    """First and last step of the interval with the largest sizes (T,); None if the other steps deviate as well."""
+    first, last = deviating_interval(np.log(sizes) if "noise" in kind else sizes)  # noise varies by factors
+    inside, others = sizes[first : last + 1], np.delete(sizes, np.s_[first : last + 1])
+    return (first, last) if len(others) and np.median(others) <= CONTRAST[kind] * np.median(inside) else None
