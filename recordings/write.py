@@ -119,7 +119,8 @@ def new_recording(
     with _complete_or_absent(path) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
         with closing_layout(layout):
-            stream.save(unfinished, default_blueprint=layout)
+            stream.save(unfinished)
+            stream.send_blueprint(layout)  # active at once, also in a viewer that shows another recording
         send_header(stream, sample, bodies, steps)
         stream.flush()  # so that a truncated file has a header
         yield stream

@@ -43,7 +43,7 @@ EXAMPLES = (
     Example(
         "Biased force sensor",
         "The measured force has a bias of 8 N; the diagnosis names the cause.",
-        "?task=push-field&filter=crossmodal-pf&faults=force_bias%3Ax%3D8&tab=diagnosis",
+        "?task=push-field&filter=information-ekf&faults=force_bias%3Ax%3D8&tab=diagnosis",
     ),
     Example(
         "External filter",

@@ -161,7 +161,7 @@ class Diagnosis:
         masked: whether a sensor is faulty and the filter is unaffected.
         headline: one sentence.
         causes: most probable first; empty if healthy.
-        provenance: task, filter, hash, episodes, healthy record and numbers of compared statistics.
+        provenance: task, filter, hash, episodes, healthy record, and what was compared and what was not.
     """
 
     state: Literal["healthy", "fault", "unsure"]
@@ -180,10 +180,14 @@ class Diagnosis:
         return head | {"causes": [candidate.to_json() for candidate in self.causes], **self.provenance}
 
     def tables(self) -> list[Table]:
-        """The ranked causes, and the evidence and next action of each."""
+        """The ranked causes, the evidence and next action of each, and what was not measured."""
         causes = [cause for cause in self.causes if cause.probability >= SHOWN]
+        unmeasured = [(text,) for text in self.provenance.get("unmeasured", ())]
+        missing = (
+            [Table("Not measured in these episodes", ("sensor or statistic",), tuple(unmeasured))] if unmeasured else []
+        )
         if not causes:
-            return []
+            return missing
         rows = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
         tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
         listed = [(c.cause.name, e) for c in causes for e in c.evidence]
@@ -195,6 +199,7 @@ class Diagnosis:
             *tables,
             Table("Evidence", heads, evidence),
             Table("Next", ("cause", "action"), actions),
+            *missing,
         ]
 
 

@@ -32,22 +32,26 @@ EVIDENCE = 5
 
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
-    numbers = statistics_by_subject(case)
-    record = f"the record of {case.profile.episodes} healthy episodes"
-    text = f"Healthy: all {sum(numbers.values())} statistics are within {record}"
-    if unchecked := [display_name(key) for key in case.setting.checkpoint.task.observations if key not in numbers]:
-        text += f"; none is about {' or '.join(unchecked)}"
-    if undefined := _undefined(case):
-        text += f"; {len(undefined)} cannot be measured here, such as {label_of(undefined[0])}"
-    return Diagnosis("healthy", False, f"{text}.", (), _provenance(case))
+    count, record = len(case.deviations), case.profile.episodes
+    text = f"Healthy: all {count} statistics are within the record of {record} healthy episodes."
+    return Diagnosis("healthy", False, text, (), _provenance(case))
 
 
-def _undefined(case: Case) -> list[str]:
-    """Statistics of sensors in the record that none of the episodes has, such as those of free motion."""
-    known = {deviation.statistic for deviation in case.deviations}
+def unmeasured(case: Case) -> list[str]:
+    """What the diagnosis cannot judge: sensors that no statistic is about, and those of sensors that no episode has.
+
+    Of statistics in the record, such as those of free motion, which an episode that begins in contact lacks.
+    """
+    numbers, known = statistics_by_subject(case), {deviation.statistic for deviation in case.deviations}
+    unchecked = [key for key in case.setting.checkpoint.task.observations if key not in numbers]
     of_sensors = dict.fromkeys(name for row in case.sensors for name in row)
-    healthy = case.profile.statistics
-    return [n for n in of_sensors if n in healthy and n not in known and np.isfinite(healthy[n]).sum() >= MIN_HEALTHY]
+    healthy_values = {name: case.profile.statistics[name] for name in of_sensors if name in case.profile.statistics}
+    absent = [
+        name
+        for name, values in healthy_values.items()
+        if name not in known and np.isfinite(values).sum() >= MIN_HEALTHY
+    ]
+    return [*map(display_name, unchecked), *map(label_of, absent)]
 
 
 def statistics_by_subject(case: Case) -> dict[str, int]:
@@ -152,5 +156,6 @@ def _provenance(case: Case) -> dict[str, Any]:
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
         "statistics": statistics_by_subject(case),
+        "unmeasured": unmeasured(case),
         "alarm_rate": case.alarm_rate,
     }

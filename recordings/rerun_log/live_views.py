@@ -70,7 +70,8 @@ class LiveViews:
                     layout, bodies = blueprint(first, task, growing=True), Bodies(first, task)
                     with closing_layout(layout):
                         # Without footer: the index of all chunks would fill the memory of a long run.
-                        stream.save(self._live.with_suffix(".rrd"), default_blueprint=layout, write_footer=False)
+                        stream.save(self._live.with_suffix(".rrd"), write_footer=False)
+                        stream.send_blueprint(layout)
                     send_header(stream, first, bodies)
                 if ended and not self._write_rest:
                     return

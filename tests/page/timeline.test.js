@@ -105,6 +105,9 @@ test('a comparison run adds its lines', () => {
   assert.equal(weights.series.length, 2);
   assert.deepEqual(estimates.series.at(-1)?.comparison, true);
   assert.equal(estimates.series.length, 5);
+  const [alone] = tracks(other, state, trace);
+  assert.match(alone.title, /, comparison$/, 'the only run with weights');
+  assert.ok(alone.series.every(({ stacked, comparison }) => stacked && !comparison));
 });
 
 test('estimates of modalities are labelled as updates, weights are not', () => {

@@ -37,6 +37,7 @@ class Diagnosis(Reply):
     """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
 
     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
+    unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
     """
 
     state: Literal["healthy", "fault", "unsure"]
@@ -49,6 +50,7 @@ class Diagnosis(Reply):
     episodes: int
     healthy_episodes: int
     statistics: dict[str, int]
+    unmeasured: list[str]
     alarm_rate: float
 
 

@@ -108,7 +108,7 @@ export class ComparisonForm {
   show(trace) {
     const isNew = this.#trace?.steps !== trace.steps;
     this.#trace = trace;
-    const { against, filter, task: name, step } = this.#store.state;
+    const { against, filter, task: name, step, faults } = this.#store.state;
     const task = this.#catalog.tasks.find((t) => t.name === name);
     const others = (task?.filters ?? []).map((f) => f.name).filter((other) => other !== filter);
     this.#filter.replaceChildren(...others.map((other) => new Option(other, other)));
@@ -122,8 +122,11 @@ export class ComparisonForm {
     if (against) this.#read(new URLSearchParams(against));
     else if (!others.length && this.#kind === 'filter') this.#kind = 'edit';
     this.#clearButton.disabled = !against;
-    this.#showFaults(task?.fault_presets ?? []);
-    this.#showEditFaults(task?.fault_presets ?? []);
+    const presets = task?.fault_presets ?? [];
+    if (!against && this.#faults === faults)
+      this.#faults = faults ? '' : (presets[0]?.faults ?? '');
+    this.#showFaults(presets);
+    this.#showEditFaults(presets);
     this.#buildBetas(trace);
     this.#showKind();
   }

@@ -27,6 +27,7 @@ const OVER = [
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MAX_RESULTS = 24; // in the cache
 const SHOWN = 0.005; // smallest probability of a listed cause
+const LISTED = 3; // statistics that were not measured
 const SETTLING = 500; // ms until the job of a selection starts
 
 export class Diagnosis {
@@ -211,12 +212,21 @@ function stateOf(entry) {
 }
 
 /** @param {Result} result */
-function aboutOf({ episodes, healthy_episodes: healthy, alarm_rate: rate, statistics }) {
+function aboutOf({
+  episodes,
+  healthy_episodes: healthy,
+  alarm_rate: rate,
+  statistics,
+  unmeasured,
+}) {
   const text = `${episodes} ${episodes === 1 ? 'episode' : 'episodes'} against ${healthy} healthy ones`;
   const numbers = Object.entries(statistics).map(
     ([name, count]) => `${displayName(name)} ${count}`,
   );
-  return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.`;
+  const listed = unmeasured.slice(0, LISTED).join('; ');
+  const more = unmeasured.length > LISTED ? `; and ${unmeasured.length - LISTED} more` : '';
+  const missing = listed && ` Not measured: ${listed}${more}.`;
+  return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.${missing}`;
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */

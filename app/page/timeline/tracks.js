@@ -121,7 +121,11 @@ function overlay(track, other, standalone) {
       stacked,
       comparison: true,
     }));
-  if (track.note) return { ...other, series: lines };
+  if (track.note) {
+    const areas = lines.some(({ stacked }) => stacked); // edges alone would leave the chart empty
+    const title = `${other.title}, comparison`;
+    return { ...other, title, series: areas ? other.series : lines };
+  }
   /** @type {[number, number] | undefined} */
   const limits = track.limits &&
     other.limits && [

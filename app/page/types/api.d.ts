@@ -146,6 +146,7 @@ export interface components {
          * @description The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
          *
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
+         *     unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
          */
         Diagnosis: {
             /**
@@ -173,6 +174,8 @@ export interface components {
             statistics: {
                 [key: string]: number;
             };
+            /** Unmeasured */
+            unmeasured: string[];
             /** Alarm Rate */
             alarm_rate: number;
         };

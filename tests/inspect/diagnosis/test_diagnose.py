@@ -97,10 +97,11 @@ def test_sensors_without_statistics_are_named() -> None:
     rows = [{"noise/force x/all": 1.5 + 0.1 * i} for i in range(3)]
     setting = Setting(checkpoint(), {}, 300, frozenset())
     sensed = [{**row, "level/force x/free motion": np.nan} for row in rows]
-    text = healthy(compared(setting, [], rows, sensed, record, 0.05)).headline
-    assert "Healthy: all 1 statistics" in text
-    assert "none is about image or" in text
-    assert text.endswith("1 cannot be measured here, such as level in N of force (x) in free motion.")
+    result = healthy(compared(setting, [], rows, sensed, record, 0.05))
+    *sensors_, statistic = result.to_json()["unmeasured"]
+    assert sensors_ == [name.replace("_", " ") for name in checkpoint().task.observations if name != "force"]
+    assert statistic == "level in N of force (x) in free motion"
+    assert result.tables()[0].rows[-1] == (statistic,)
 
 
 def test_focused_episodes_are_compared_with_each_other() -> None:
