@@ -58,7 +58,13 @@ def test_clean_episodes_are_healthy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("faults", "cause"), [("image_frozen:from=30", "image.frozen"), ("force_bias=3", "force.bias")]
+    ("faults", "cause"),
+    [
+        ("image_frozen:from=30", "image.frozen"),
+        ("force_bias=3", "force.bias"),
+        ("force_bias=8:from=30", "force.bias"),
+        ("force_drift=2", "force.drift"),
+    ],
 )
 def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
     progress: list[float] = []
