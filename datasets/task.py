@@ -141,10 +141,12 @@ class Ingredient:
 
     Attributes:
         meaning: one line, with units. ranges: parameter -> smallest and largest value, drawn uniformly per episode.
+        units: parameter -> SI unit; others have none. Data files do not contain them.
     """
 
     meaning: str
     ranges: Mapping[str, tuple[float, float]]
+    units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True)

@@ -248,9 +248,9 @@ def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses and mappings as dictionaries, tuples as lists."""
+    """Dataclasses (their compared fields) and mappings as dictionaries, tuples as lists."""
     if is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value) if f.compare}
     if isinstance(value, Mapping):
         return {name: _plain(v) for name, v in value.items()}
     return [*map(_plain, value)] if isinstance(value, list | tuple) else value

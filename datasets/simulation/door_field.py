@@ -110,6 +110,7 @@ DOOR_FIELD = replace(
         "panel": Ingredient(
             "width of the panel and offset of the bar (m), damping (N m s/rad) and friction (N m) of the hinge",
             {"width": (0.42, 0.58), "bar_offset": (0.07, 0.1), "damping": (4.0, 12.0), "friction": (0.5, 3.0)},
+            {"width": "m", "bar_offset": "m", "damping": "N m s/rad", "friction": "N m"},
         ),
         "hidden-frame": Ingredient("the frame, which shows the hinge, is invisible to the camera", {}),
         "camera-pose": camera_pose(0.03, float(np.deg2rad(1.0))),
@@ -118,10 +119,12 @@ DOOR_FIELD = replace(
         "aim": Ingredient(
             "error of the door that the policy assumes, standard deviations: hinge (m), angle (rad)",
             {"hinge": (0.01, 0.02), "angle": (0.02, 0.06)},
+            {"hinge": "m", "angle": "rad"},
         ),
         "nudges": Ingredient(
             "external torques on the door: number per s, mean rotation in rad",
             {"per_second": (0.05, 0.12), "angle": (0.1, 0.25)},
+            {"per_second": "1/s", "angle": "rad"},
         ),
         "start": start_ingredient(START),
     },

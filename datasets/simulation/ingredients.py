@@ -57,36 +57,44 @@ XYZ = ("x", "y", "z")
 def camera_pose(shift: float, turn: float) -> Ingredient:
     """Pose error of the camera: up to ``shift`` m along and ``turn`` rad about each axis."""
     turns = _symmetric(turn, "turn_x", "turn_y", "turn_z")
-    return Ingredient("pose error of the camera: m along, rad about each axis", _symmetric(shift, *XYZ) | turns)
+    units = dict.fromkeys(XYZ, "m") | dict.fromkeys(turns, "rad")
+    return Ingredient("pose error of the camera: m along, rad about each axis", _symmetric(shift, *XYZ) | turns, units)
 
 
 def wrist(force: float) -> Ingredient:
     """Errors of the force/torque sensor for forces of the order of ``force`` N, with levers of 0.1 m."""
-    return Ingredient(
-        "bias (N, N m), drift (N/s) and noise of the force/torque sensor",
-        {
-            **_symmetric(force, *(f"force_{axis}" for axis in XYZ)),
-            **_symmetric(0.02 * force, *(f"drift_{axis}" for axis in XYZ)),
-            **_symmetric(0.04 * force, *(f"torque_{axis}" for axis in XYZ)),
-            "force_noise": (0.1 * force, 0.4 * force),
-            "torque_noise": (0.01 * force, 0.04 * force),
-        },
-    )
+    ranges = {
+        **_symmetric(force, *(f"force_{axis}" for axis in XYZ)),
+        **_symmetric(0.02 * force, *(f"drift_{axis}" for axis in XYZ)),
+        **_symmetric(0.04 * force, *(f"torque_{axis}" for axis in XYZ)),
+        "force_noise": (0.1 * force, 0.4 * force),
+        "torque_noise": (0.01 * force, 0.04 * force),
+    }
+    of = {"force": "N", "drift": "N/s", "torque": "N m"}
+    units = {name: of[name.partition("_")[0]] for name in ranges}
+    return Ingredient("bias (N, N m), drift (N/s) and noise of the force/torque sensor", ranges, units)
 
 
 SENSOR_INGREDIENTS = {
-    "sleeve": Ingredient("sleeve around the hand, hides the object: m", {"radius": (0.05, 0.1), "end": (0.03, 0.07)}),
+    "sleeve": Ingredient(
+        "sleeve around the hand, hides the object: m",
+        {"radius": (0.05, 0.1), "end": (0.03, 0.07)},
+        {"radius": "m", "end": "m"},
+    ),
     "image-quality": Ingredient(
         "exposure (factor), blur (pixels) and noise (gray levels) of the images",
         {"exposure": (0.6, 1.4), "blur": (0.0, 1.0), "noise": (2.0, 8.0)},
+        {"blur": "pixels", "noise": "gray levels"},
     ),
     "outages": Ingredient(
         "stretches without images: share of all steps, mean duration in s",
         {"fraction": (0.3, 0.5), "seconds": (1.0, 3.0)},
+        {"seconds": "s"},
     ),
     "hand-pose": Ingredient(
         "bias and noise of the measured hand position, m",
         _symmetric(0.003, *XYZ) | {"noise": (0.0005, 0.002)},
+        dict.fromkeys((*XYZ, "noise"), "m"),
     ),
 }
 """Sensor errors with the same ranges in all field tasks."""
@@ -154,7 +162,11 @@ def finish(task: Task, episode: Episode, draws: Draws, extra: Mapping[str, Any])
 def start_ingredient(distances: Mapping[str, tuple[float, float]]) -> Ingredient:
     """Distance of the first belief's mean from the true state: unit -> range."""
     units = " and ".join(distances)
-    return Ingredient(f"distance of the first belief from the true state, {units}", dict(distances))
+    return Ingredient(
+        f"distance of the first belief from the true state, {units}",
+        dict(distances),
+        {unit: unit for unit in distances},
+    )
 
 
 def _start_offset(task: Task, drawn: Draw) -> NDArray[np.float64]:

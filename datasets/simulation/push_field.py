@@ -131,16 +131,20 @@ PUSH_FIELD = replace(
         "puck": Ingredient(
             "radius (m), mass (kg) and friction of the puck",
             {"radius": (0.042, 0.058), "mass": (0.4, 0.9), "friction": (0.2, 0.8)},
+            {"radius": "m", "mass": "kg"},
         ),
         "camera-pose": camera_pose(0.015, float(np.deg2rad(1.0))),
         "wrist": wrist(0.5),
         **SENSOR_INGREDIENTS,
         "aim": Ingredient(
-            "error of the position at which the policy aims, standard deviation in m", {"std": (0.01, 0.02)}
+            "error of the position at which the policy aims, standard deviation in m",
+            {"std": (0.01, 0.02)},
+            {"std": "m"},
         ),
         "nudges": Ingredient(
             "external impulses on the puck: number per s, mean distance in m",
             {"per_second": (0.05, 0.12), "distance": (0.02, 0.04)},
+            {"per_second": "1/s", "distance": "m"},
         ),
         "start": start_ingredient(START),
     },

@@ -64,7 +64,9 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
             return about.partition(" ")[0]
         return "models" if kind.startswith(("module", "dynamics", "process noise")) else "filter"
 
-    return dict(Counter(subject(deviation.statistic) for deviation in case.deviations))
+    numbers = Counter(subject(deviation.statistic) for deviation in case.deviations)
+    order = [*case.setting.checkpoint.task.observations, "control", "labels", "models", "filter"]
+    return {name: numbers[name] for name in dict.fromkeys([*order, *numbers]) if numbers[name]}
 
 
 def conclude(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.statistics import measures
@@ -95,8 +96,14 @@ def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:
     counted, task = measures.counted(trace), trace.task
     for name, unit, values in _step_columns(trace, task):
         yield name, (unit, values[counted])
+    definition = TASKS.get(task.name, task)  # data files have no units
+    units = {
+        _name("ingredients", ingredient, parameter): unit
+        for ingredient, drawn in definition.ingredients.items()
+        for parameter, unit in drawn.units.items()
+    }
     for name, value in _provenance(trace.episode.provenance):
-        yield name, ("", np.full(int(counted.sum()), value))
+        yield name, (units.get(name, ""), np.full(int(counted.sum()), value))
 
 
 def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[Any]]]:
@@ -142,10 +149,15 @@ def _duration(mask: Mask, durations: Array) -> Array:
     return np.where(mask, times - np.maximum.accumulate(np.where(mask, 0.0, times)), np.nan)
 
 
+def _name(*keys: str) -> str:
+    """Display name of a value of the provenance, from the keys of its nested mappings."""
+    return " ".join(map(display_name, keys)).strip().replace("ingredients ", "").replace("-", " ")
+
+
 def _provenance(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Display name and value of each number, boolean and text of the provenance, nested ones included."""
     for key, value in values.items():
-        name = f"{prefix} {display_name(key)}".strip().replace("ingredients ", "").replace("-", " ")
+        name = _name(prefix, key)
         if key in IGNORED:
             continue
         if isinstance(value, Mapping):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
+from beliefscope.datasets.task import display_unit
 from beliefscope.inspect.slices.covariates import StepCovariate
 from beliefscope.inspect.statistics.measures import Array, Mask
 
@@ -74,10 +75,18 @@ class Condition:
         if self.category is not None:
             switch = {"yes": self.covariate, "no": f"no {self.covariate}"}
             return switch.get(self.category, f"{self.covariate} is {self.category}")
-        low, high = (None if end is None else f"{end:.3g} {self.unit}".strip() for end in (self.low, self.high))
+        unit, factor = _shown(self.unit)
+        low, high = (None if end is None else f"{factor * end:.3g} {unit}".strip() for end in (self.low, self.high))
         if low is None:
             return f"{self.covariate} <= {high}"
         return f"{self.covariate} > {low}" if high is None else f"{low} < {self.covariate} <= {high}"
+
+
+def _shown(unit: str) -> tuple[str, float]:
+    """Unit for display, also of a rate, and the factor from the SI unit."""
+    base, per, rest = unit.partition("/")
+    shown, factor = display_unit(base)
+    return shown + per + rest, factor
 
 
 @dataclass(frozen=True)
