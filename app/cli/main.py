@@ -51,7 +51,8 @@ def main() -> None:
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
         message = error.format_message().rstrip(".").replace("Value error, ", "")
-        console.fail(f"{message}. See: {command} --help", error.exit_code)
+        end = "" if message.endswith("?") else "."
+        console.fail(f"{message}{end} See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
         console.fail("interrupted", INTERRUPTED)
     except Exception as error:

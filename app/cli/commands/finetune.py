@@ -101,6 +101,7 @@ def finetune(
     from beliefscope.filters.finetuning.defaults import settings_from
     from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
+    from beliefscope.inspect.diagnostics.healthy_profile import included_reference
     from beliefscope.inspect.healthy import measure_profile
 
     opt.check_folder(log, "--log")
@@ -114,17 +115,32 @@ def finetune(
     values["success"] = Criterion.parse(success) if success else None
     settings = settings_from(base, train, freeze, slices, fault_sets, events, rates, **values)
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
-        command, members = finetune_command(target, filter, data, settings), list(episodes)
-        source = {"data_hash": episodes.hash, "command": command, "settings": settings, "partial": _partial(output)}
+        members, data_hash = _training_episodes(episodes, data, output.parent)
+        command = finetune_command(target, filter, data, settings)
+        source = {"data_hash": data_hash, "command": command, "settings": settings, "partial": _partial(output)}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source)
         tuned = _run(base, members, log, rerun, source)
-        profile = measure_profile(tuned.filter, base.name, members, command)
+        images = included_reference(base.task) if data is None else None  # of the same camera
+        profile = measure_profile(tuned.filter, base.name, members, command, images)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
+
+
+def _training_episodes(data: Dataset, path: Path | None, folder: Path) -> tuple[list[Episode], str]:
+    """The episodes, and their hash; those of a sample set without training episodes are simulated into ``folder``."""
+    from beliefscope.filters.finetuning.training_data import training_episodes
+
+    name = "sample" if path is None else path.name
+    with console.bars() as update:
+
+        def on_simulation(done: int, count: int) -> None:
+            update(f"Simulating {count} training episodes of {data.task.name}", done / count, "")
+
+        return training_episodes(name, data, path is None, folder, on_simulation)
 
 
 def _partial(output: Path) -> Path:

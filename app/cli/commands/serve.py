@@ -131,15 +131,15 @@ def filters_of_command_line(filters: Sequence[str], tasks: Sequence[str]) -> dic
 
     given = [load_task(name) for name in tasks]
     files = short_names((Path(name) for name in filters if not is_code(name)), PRETRAINED)
-    names = {path: name for name, path in files.items()}
+    names = {path.resolve(): name for name, path in files.items()}
     checkpoints: dict[str, Path | Checkpoint] = {}
     for text in filters:
         if is_code(text):
             external = load_external(text, given=given)
             checkpoints[external.name] = external
         else:
-            path = Path(text).resolve()
-            checkpoints[names[path]] = path
+            name = names[Path(text).resolve()]
+            checkpoints[name] = files[name]
     return checkpoints
 
 

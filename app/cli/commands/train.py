@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
-from beliefscope.datasets.errors import check_name
+from beliefscope.datasets.errors import BadInput, check_name
 
 ARCHITECTURES = (
     "{crossmodal,information,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf, lstm or transformer "
@@ -73,6 +73,11 @@ def train(
             write("training", stage, step, loss)
 
         episodes = list(dataset)
+        if data is None and target.simulate is not None and all(episode.split != "train" for episode in episodes):
+            raise BadInput(
+                f"the sample set of {target.name} has no training episodes; collect some, beliefscope collect "
+                f"{target.name} -o {target.name}.h5, and train with --data {target.name}.h5"
+            )
         trained = train_filter(
             settings,
             episodes + (faulty_copies(injected, episodes, seed) if injected else []),

@@ -27,6 +27,7 @@ const OVER = [
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MAX_RESULTS = 24; // in the cache
 const SHOWN = 0.005; // smallest probability of a listed cause
+const PRESENT = 'Probability that this cause is present, alone or together with another one';
 const LISTED = 3; // statistics that were not measured
 const SETTLING = 500; // ms until the job of a selection starts
 
@@ -179,7 +180,7 @@ export class Diagnosis {
       {},
       create('h4', { textContent: cause.title, title: cause.cause }),
       bar,
-      create('output', { textContent: `probability ${probability.toFixed(2)}` }),
+      create('output', { textContent: `probability ${probability.toFixed(2)}`, title: PRESENT }),
       create('div', { className: 'details' }, ...lines),
     );
   }
