@@ -22,7 +22,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> Any:
         report(0.0, "reading the episodes")
         result = diagnose(
             store.checkpoint(arguments["task"], arguments["filter"]),
-            {index: faults.apply(data[index], seed) for index in arguments["episodes"]},
+            faults.apply_all(data, arguments["episodes"], seed),
             seed=seed,
             particles=store.settings.particles,
             progress=lambda share: report(share, "comparing with the healthy record"),

@@ -93,8 +93,7 @@ class Assistant:
         catalog = self._catalog(task)
         source, checkpoint = catalog.dataset(data), catalog.filter(filter)
         indices = (source.held_out() if episodes is None else episodes)[:MOST_EPISODES]
-        injected = read_faults(faults, catalog.task)
-        by_index = {index: injected.apply(catalog.episode(data, index), self._seed) for index in indices}
+        by_index = read_faults(faults, catalog.task).apply_all(source, indices, self._seed)
         result = diagnose(checkpoint, by_index, seed=self._seed, particles=self._particles)
         return as_json(result.to_json())
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode, FloatArray, hold
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.control_faults import ControlFault
@@ -72,15 +73,20 @@ class Faults:
     def __add__(self, other: Faults) -> Faults:
         return Faults(self.sequence + other.sequence)
 
-    def check(self, task: Task, steps: int | None = None) -> None:
+    def check(self, task: Task, steps: int = 0) -> None:
         """Raise BadInput for a fault of a sensor that the task does not have, or that starts after the last step.
 
-        steps: number of steps of the longest episode; None or 0 if unknown.
+        steps: number of steps of the longest episode; 0 if unknown.
         """
         for fault in self.sequence:
             fault.keys(task)
             if steps and fault.from_ >= steps:
                 raise BadInput(f"fault {fault} starts after the last step, {steps - 1}")
+
+    def apply_all(self, data: Dataset, indices: Sequence[int], seed: int = 0) -> dict[int, Episode]:
+        """Faulty copies of episodes by index. Raises BadInput as ``apply`` and ``check``."""
+        self.check(data.task, data.most_steps(indices))
+        return {index: self.apply(data[index], seed) for index in indices}
 
     def apply(self, episode: Episode, seed: int = 0) -> Episode:
         """Return a faulty copy. Random numbers depend only on the seed, the episode's digest and each fault's position.

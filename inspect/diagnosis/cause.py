@@ -182,10 +182,8 @@ class Diagnosis:
     def tables(self) -> list[Table]:
         """The ranked causes, the evidence and next action of each, and what was not measured."""
         causes = [cause for cause in self.causes if cause.probability >= SHOWN]
-        unmeasured = [(text,) for text in self.provenance.get("unmeasured", ())]
-        missing = (
-            [Table("Not measured in these episodes", ("sensor or statistic",), tuple(unmeasured))] if unmeasured else []
-        )
+        unmeasured = tuple((text,) for text in self.provenance.get("unmeasured", ()))
+        missing = [Table("Not measured in these episodes", ("sensor or statistic",), unmeasured)] if unmeasured else []
         if not causes:
             return missing
         rows = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)

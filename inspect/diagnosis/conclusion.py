@@ -37,26 +37,9 @@ def healthy(case: Case) -> Diagnosis:
     return Diagnosis("healthy", False, text, (), _provenance(case))
 
 
-def unmeasured(case: Case) -> list[str]:
-    """What the diagnosis cannot judge: sensors that no statistic is about, and those of sensors that no episode has.
-
-    Of statistics in the record, such as those of free motion, which an episode that begins in contact lacks.
-    """
-    numbers, known = statistics_by_subject(case), {deviation.statistic for deviation in case.deviations}
-    unchecked = [key for key in case.setting.checkpoint.task.observations if key not in numbers]
-    of_sensors = dict.fromkeys(name for row in case.sensors for name in row)
-    healthy_values = {name: case.profile.statistics[name] for name in of_sensors if name in case.profile.statistics}
-    absent = [
-        name
-        for name, values in healthy_values.items()
-        if name not in known and np.isfinite(values).sum() >= MIN_HEALTHY
-    ]
-    return [*map(display_name, unchecked), *map(label_of, absent)]
-
-
 def statistics_by_subject(case: Case) -> dict[str, int]:
     """Number of compared statistics about each sensor, the controls, the labels, the models and the filter."""
-    of_sensors = {name for row in case.sensors for name in row}
+    of_sensors = _of_sensors(case)
 
     def subject(statistic: str) -> str:
         kind, about, _ = statistic.split("/")
@@ -67,6 +50,29 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
     numbers = Counter(subject(deviation.statistic) for deviation in case.deviations)
     order = [*case.setting.checkpoint.task.observations, "control", "labels", "models", "filter"]
     return {name: numbers[name] for name in dict.fromkeys([*order, *numbers]) if numbers[name]}
+
+
+def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
+    """What the diagnosis cannot judge: sensors without statistics, and statistics of sensors that no episode has.
+
+    The latter are in the record, such as those of free motion, which an episode of contact only lacks.
+
+    Args:
+        numbers: of ``statistics_by_subject``.
+    """
+    sensors = [display_name(key) for key in case.setting.checkpoint.task.observations if key not in numbers]
+    of_sensors, compared = _of_sensors(case), case.by_statistic
+    absent = [
+        label_of(name)
+        for name, values in case.profile.statistics.items()
+        if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
+    ]
+    return sensors + absent
+
+
+def _of_sensors(case: Case) -> set[str]:
+    """Statistics that are about sensors and controls only."""
+    return {name for row in case.sensors for name in row}
 
 
 def conclude(
@@ -150,14 +156,14 @@ def _since(case: Case, candidate: Candidate) -> str:
 
 
 def _provenance(case: Case) -> dict[str, Any]:
-    checkpoint = case.setting.checkpoint
+    checkpoint, numbers = case.setting.checkpoint, statistics_by_subject(case)
     return {
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
         "checkpoint_hash": checkpoint.hash,
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
-        "statistics": statistics_by_subject(case),
-        "unmeasured": unmeasured(case),
+        "statistics": numbers,
+        "unmeasured": unmeasured(case, numbers),
         "alarm_rate": case.alarm_rate,
     }

@@ -27,8 +27,10 @@ NUDGE = 1e-3
 """m: step of the difference quotient of the camera's map."""
 
 
-def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], float], NDArray[Any]]) -> Setting | None:
-    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes dt.
+def _with_readings(
+    setting: Setting, key: str, change: Callable[[NDArray[Any], Episode], NDArray[Any]]
+) -> Setting | None:
+    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes the episode.
 
     Controls that derive from the readings are recomputed, as when faults are injected.
     """
@@ -36,22 +38,18 @@ def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], f
     for index in setting.affected:
         episode = episodes[index]
         if key == "control":
-            controls = change(episode.controls, episode.dt).astype(np.float32)
+            controls = change(episode.controls, episode).astype(np.float32)
             episodes[index] = replace(episode, controls=controls)
             continue
         if key not in episode.observations:
             return None
-        episodes[index] = _changed(episode, key, change(episode.observations[key].astype(np.float64), episode.dt))
+        readings = episode.observations[key]
+        changed = change(readings.astype(np.float64), episode)
+        if readings.dtype == np.uint8:
+            changed = np.rint(changed).clip(0, 255)
+        observations = {**episode.observations, key: changed.astype(readings.dtype)}
+        episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
     return replace(setting, episodes=episodes)
-
-
-def _changed(episode: Episode, key: str, readings: NDArray[Any]) -> Episode:
-    """The episode with other readings of a sensor, and the controls that derive from them."""
-    kind = episode.observations[key].dtype
-    if kind == np.uint8:
-        readings = np.rint(readings).clip(0, 255)
-    observations = {**episode.observations, key: readings.astype(kind)}
-    return replace(episode, observations=observations, controls=derived_controls(episode, observations))
 
 
 def _with_labels(setting: Setting, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Setting:
@@ -79,7 +77,7 @@ def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | Non
     result: Setting | None = setting
     for name in keys:
         if result is not None:
-            result = _with_readings(result, name, lambda values, dt: ahead(values))
+            result = _with_readings(result, name, lambda values, episode: ahead(values))
     return result if steps else None
 
 
@@ -89,7 +87,7 @@ def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:
     if x is None or y is None:
         return None
 
-    def back(images: NDArray[Any], dt: float) -> NDArray[Any]:
+    def back(images: NDArray[Any], episode: Episode) -> NDArray[Any]:
         rows, columns = (np.arange(size) + round(n) for size, n in zip(images.shape[1:], (y, x), strict=True))
         height, width = images.shape[1:]
         return images[:, rows.clip(0, height - 1)][:, :, columns.clip(0, width - 1)]
@@ -110,18 +108,17 @@ def _shift(deviations: Deviations, axis: str) -> float | None:
 def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
     """Images of healthy brightness."""
     ratio = _ratio(deviations, "brightness/image/all")
-    return None if not ratio else _with_readings(setting, "image", lambda images, dt: images / ratio)
+    return None if not ratio else _with_readings(setting, "image", lambda images, episode: images / ratio)
 
 
 def tare(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
     """Force or torque without its excess level in free motion; that of some steps only is removed from these."""
     levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
-    if key not in setting.checkpoint.task.observations or None in levels:
+    if None in levels:
         return None
-    episodes = dict(setting.episodes)
-    for index in setting.affected:
-        episode = episodes[index]
-        readings = episode.observations[key].astype(np.float64)
+
+    def unbiased(readings: NDArray[Any], episode: Episode) -> NDArray[Any]:
+        free = free_motion(episode) & episode.present(key)
         for axis, level in enumerate(levels[: readings.shape[1]]):
             assert level is not None
             steps = biased_steps(episode, key, axis)
@@ -129,10 +126,10 @@ def tare(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
                 readings[:, axis] -= level.value - level.healthy
             else:
                 part = np.s_[steps[0] : steps[1] + 1]
-                free = free_motion(episode)[part] & episode.present(key)[part]
-                readings[part, axis] -= np.median(readings[part, axis][free]) - level.healthy
-        episodes[index] = _changed(episode, key, readings)
-    return replace(setting, episodes=episodes)
+                readings[part, axis] -= np.median(readings[part, axis][free[part]]) - level.healthy
+        return readings
+
+    return _with_readings(setting, key, unbiased)
 
 
 def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -141,19 +138,19 @@ def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
     if None in slope:
         return None
     return _with_readings(
-        setting, "force", lambda f, dt: f - np.array(slope)[: f.shape[1]] * dt * np.arange(len(f))[:, None]
+        setting, "force", lambda f, episode: f - np.array(slope)[: f.shape[1]] * episode.dt * np.arange(len(f))[:, None]
     )
 
 
 def scale_force(setting: Setting, deviations: Deviations) -> Setting | None:
     """Force of healthy size."""
     gain = _ratio(deviations, "size/force/contact")
-    return None if not gain else _with_readings(setting, "force", lambda force, dt: force / gain)
+    return None if not gain else _with_readings(setting, "force", lambda force, episode: force / gain)
 
 
 def negate_force(setting: Setting, deviations: Deviations) -> Setting | None:
     """Force with the opposite sign."""
-    return _with_readings(setting, "force", lambda force, dt: -force)
+    return _with_readings(setting, "force", lambda force, episode: -force)
 
 
 def permute_force(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -166,7 +163,7 @@ def permute_force(setting: Setting, deviations: Deviations) -> Setting | None:
             force, torque = (observations[key].astype(np.float64)[at] for key in (FORCE, TORQUE))
             left += [lever(force[:, order], torque)[1] for order in orders]
     order = orders[int(left.argmin())]
-    return None if order == (0, 1, 2) else _with_readings(setting, FORCE, lambda force, dt: force[:, order])
+    return None if order == (0, 1, 2) else _with_readings(setting, FORCE, lambda force, episode: force[:, order])
 
 
 def restore_contact(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -175,13 +172,12 @@ def restore_contact(setting: Setting, deviations: Deviations) -> Setting | None:
     if setting.healthy is None or not all(name in setting.healthy.statistics for name in names):
         return None
     unflagged, *zero = (float(np.nanmean(setting.healthy.statistics[name])) for name in names)
-    episodes = dict(setting.episodes)
-    for index in setting.affected:
-        episode = episodes[index]
+
+    def restored(flag: NDArray[Any], episode: Episode) -> NDArray[Any]:
         size = np.linalg.norm(episode.observations[FORCE].astype(np.float64) - zero, axis=1)
-        contact = (size > CLEARLY * unflagged)[:, None]
-        episodes[index] = _changed(episode, CONTACT, contact)
-    return replace(setting, episodes=episodes)
+        return (size > CLEARLY * unflagged)[:, None]
+
+    return _with_readings(setting, CONTACT, restored)
 
 
 def shift_hand(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -203,7 +199,7 @@ def shift_hand(setting: Setting, deviations: Deviations) -> Setting | None:
         shift[:2] = -np.linalg.lstsq(nudged.T / NUDGE, np.array(pixels, dtype=np.float64), rcond=None)[0]
     else:
         return None
-    return _with_readings(setting, HAND, lambda position, dt: position - shift[: position.shape[1]])
+    return _with_readings(setting, HAND, lambda position, episode: position - shift[: position.shape[1]])
 
 
 def _hand_camera(setting: Setting) -> LandmarkFilter | None:
@@ -234,7 +230,7 @@ def scale_control(setting: Setting, deviations: Deviations) -> Setting | None:
     scale = _ratio(deviations, "scale/control/all")
     channels = CHANGE if setting.checkpoint.task.control_size >= CHANGE.stop else slice(None)
 
-    def rescaled(controls: NDArray[Any], dt: float) -> NDArray[Any]:
+    def rescaled(controls: NDArray[Any], episode: Episode) -> NDArray[Any]:
         controls = controls.copy()
         controls[:, channels] /= scale
         return controls

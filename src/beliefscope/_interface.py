@@ -172,7 +172,7 @@ def diagnose(
     if profile_from is not None:
         clean = _episodes(profile_from, checkpoint)
         profile = profile_of(checkpoint, [clean[i] for i in clean.held_out()], str(clean.path))
-    by_index = {index: injected.apply(source[index], seed) for index in indices}
+    by_index = injected.apply_all(source, indices, seed)
     return diagnose_episodes(
         checkpoint, by_index, seed=seed, particles=particles, alarm_rate=alarm_rate, profile=profile
     )

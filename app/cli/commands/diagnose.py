@@ -53,8 +53,7 @@ def diagnose(
     other = None if base is None else open_filter(checkpoint.task, str(base))
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
-        faults.check(data.task, data.most_steps(indices))
-        episodes = {index: faults.apply(data[index], runs.seed) for index in indices}
+        episodes = faults.apply_all(data, indices, runs.seed)
         failed = None if repair is None else data[repair]
     profile = _profile(checkpoint, profile_from)
     with console.progress("Diagnosing") as advance:

@@ -47,7 +47,6 @@ def evaluate(
         check_standalone(checkpoint, only)
     offset = StartOffset.parse(start_offset, checkpoint.task)
     with runs.episodes(checkpoint.task) as data:
-        faults.check(data.task, data.most_steps(data.held_out()))
         data_hash, held_out = data.hash, [data[index] for index in data.held_out()]
     held_out = runs.check(checkpoint, held_out, align)
     with console.progress("Evaluating") as advance:

@@ -132,15 +132,16 @@ def finetune(
 
 def _training_episodes(data: Dataset, path: Path | None, folder: Path) -> tuple[list[Episode], str]:
     """The episodes, and their hash; those of a sample set without training episodes are simulated into ``folder``."""
+    if path is not None:
+        return list(data), data.hash
     from beliefscope.filters.finetuning.training_data import training_episodes
 
-    name = "sample" if path is None else path.name
     with console.bars() as update:
 
         def on_simulation(done: int, count: int) -> None:
             update(f"Simulating {count} training episodes of {data.task.name}", done / count, "")
 
-        return training_episodes(name, data, path is None, folder, on_simulation)
+        return training_episodes(data.path.name, data, True, folder, on_simulation)
 
 
 def _partial(output: Path) -> Path:

@@ -3,9 +3,9 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Diagnosis } from '../types/server.js' */
 
-import { displayName, fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
+import { fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
-import { stepSummary } from './step_summary.js';
+import { stepSummary, weightScope } from './step_summary.js';
 
 const MIN_STEPS = 5; // of an outage
 const MIN_CHANGE = 0.05; // of a weight
@@ -131,7 +131,7 @@ export function outageFinding(trace, component) {
       ? `until the image returns at ${trace.stepLabel(last + 1)}`
       : 'to the end';
   const action = successor ? `; ${successor.name} takes over ${end}` : `, ${end}`;
-  const scope = trace.weightWidth > 1 ? ` in ${displayName(trace.components[component].name)}` : '';
+  const scope = weightScope(trace, component);
   const evidence = weights.map(
     ({ name, before, during }) =>
       `the effective weight of ${name}${scope} ${change(before, during)}`,

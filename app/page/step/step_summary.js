@@ -30,8 +30,7 @@ export function stepSummary(trace, step, component) {
     const uninformative = uninformativeReason(dominant.name, trace, step);
     const better = moreAccurateModality(dominant.name, trace, step, tone);
     if (dominant.weight >= DOMINANT_SHARE || better) {
-      const scope =
-        trace.weightWidth > 1 ? ` in ${displayName(trace.components[component].name)}` : '';
+      const scope = weightScope(trace, component);
       const reasons = [uninformative, better].filter(Boolean).join(' and ');
       sentences.push(
         `Dominated by ${displayName(dominant.name)} (${percent(dominant.weight)}${scope})${reasons && `, although ${reasons}`}.`,
@@ -45,6 +44,14 @@ export function stepSummary(trace, step, component) {
     sentences.push(`Effective sample size ${fixed(size, 0)} of ${count} particles.`);
   return { tone, text: sentences.join(' ') };
 }
+
+/**
+ * Returns `` in hinge x`` where the weights of components differ, else an empty text.
+ * @param {Trace} trace
+ * @param {number} component
+ */
+export const weightScope = (trace, component) =>
+  trace.weightWidth > 1 ? ` in ${displayName(trace.components[component].name)}` : '';
 
 /**
  * Compares the error of the estimate with its predicted standard deviation.

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+import beliefscope as bs
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -108,6 +109,12 @@ def test_sensors_without_statistics_are_named() -> None:
     assert sensors_ == [name.replace("_", " ") for name in checkpoint().task.observations if name != "force"]
     assert statistic == "level in N of force (x) in free motion"
     assert result.tables()[0].rows[-1] == (statistic,)
+
+
+def test_faults_after_all_steps_are_refused() -> None:
+    """By everything that injects faults before a diagnosis."""
+    with pytest.raises(BadInput, match=r"blackout:from=100 starts after the last step, 99"):
+        bs.diagnose("push/crossmodal-ekf", "push", [0, 1], faults="blackout:from=100")
 
 
 def test_focused_episodes_are_compared_with_each_other() -> None:
