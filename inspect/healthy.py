@@ -15,7 +15,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
-from beliefscope.inspect.traces.batch import trace_all
+from beliefscope.inspect.traces.batch import Progress, trace_all
 
 MAX_EPISODES = 120
 """Maximum number of episodes of a profile; more hardly change it."""
@@ -53,18 +53,23 @@ def sensor_record(episodes: Sequence[Episode], reference: Reference | None = Non
 
 
 def profile_of(
-    checkpoint: Checkpoint, episodes: Sequence[Episode], data: str, sensors: SensorRecord | None = None
+    checkpoint: Checkpoint,
+    episodes: Sequence[Episode],
+    data: str,
+    sensors: SensorRecord | None = None,
+    progress: Progress | None = None,
 ) -> HealthyProfile:
     """The healthy profile of a filter over clean episodes.
 
     Args:
         data: where the episodes come from.
         sensors: record of their sensors, if it is known.
+        progress: called with the completed fraction of the runs, 0..1.
     """
     sensors = sensors or sensor_record(episodes)
     rows: list[dict[str, float]] = []
     particles = None
-    for trace in trace_all(checkpoint, episodes, range(len(episodes))):
+    for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=progress):
         rows.append(episode_statistics(trace, checkpoint, sensors.rows[trace.episode_index]))
         particles = trace.particle_count
     names = dict.fromkeys(name for row in rows for name in row)

@@ -92,17 +92,19 @@ LATER: dict[str, str] = {
     "reports/door-crossmodal-pf-episode9-01234567/manifest.json": '{"format": "beliefscope-report 2", "title": 2}',
     "reports/door-crossmodal-pf-episode9-01234567/report.html": "<!doctype html>",
     "recordings/a.rrd": "RRF9 of a later Rerun",
-    "recordings/.about/a.rrd.json": '{"format": 2}',
     "live/a.live": "of a later version",
     "jobs/0123456789abcdef/job.json": '{"format": 2, "id": "0123456789abcdef"}',
 }
 """Files of a later version, under names that this version reads."""
 
+METADATA = "recordings/.about/a.rrd.json"
+"""Derived from the recording, and written again by the version that reads it."""
+
 
 def test_a_workspace_of_a_later_version_is_readable_and_kept(
     tmp_path: Path, open_server: Callable[[], TestClient]
 ) -> None:
-    for name, text in LATER.items():
+    for name, text in (LATER | {METADATA: '{"format": 2}'}).items():
         path = tmp_path / "ws" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)

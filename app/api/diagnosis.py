@@ -1,6 +1,7 @@
-"""Routes under ``/api/diagnosis`` and ``/api/repair``.
+"""Routes under ``/api/diagnosis``, ``/api/repair`` and ``/api/healthy-record``.
 
 The probable cause of a fault is preliminary from a trace and confirmed by a job; a job searches the smallest repair.
+Another job measures the healthy record of a filter that has none.
 """
 
 import json
@@ -13,14 +14,17 @@ from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.api.jobs import key_over_episodes, result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
-from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob, SmallestRepair
+from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob, HealthyRecord, SmallestRepair
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.diagnosis.diagnose import preliminary
+from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.views import as_json
+from beliefscope.inspect.healthy import MAX_EPISODES as MAX_RECORDED
 
 Over = Annotated[Literal["episode", "held-out"], Query(description="the run's episode, or held-out ones")]
 
@@ -67,6 +71,26 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         title = f"Smallest repair of {selection.describe()}"
         return JobReply(job=jobs.submit("repair", title, arguments, store.key(selection), link))
 
+    @router.get(
+        "/api/healthy-record/{task}/{filter}", response_model=HealthyRecord, responses={202: {"model": JobReply}}
+    )
+    def get_record(task: str, filter: str, data: str = "") -> Response:
+        """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
+        if measured := store.measured_record(task, filter):
+            return JSONResponse({"data": measured})
+        job = jobs.find("healthy", key_over_episodes(store, _record_arguments(store, task, filter, data)))
+        return JSONResponse({"job": job and asdict(job)}, status_code=202)
+
+    @router.post("/api/healthy-record/{task}/{filter}", status_code=202)
+    def measure_record(task: str, filter: str, data: str = "") -> JobReply:
+        arguments = _record_arguments(store, task, filter, data)
+        count, name = len(arguments["episodes"]), arguments["data"]
+        if count < MIN_HEALTHY:
+            raise BadInput(f"{name!r} has {count} held-out episodes; a healthy record needs at least {MIN_HEALTHY}")
+        title = f"Healthy record of {filter}, {task}, {count} held-out episodes of {name}"
+        link = page_link(task=task, filter=filter, data=name, tab="diagnosis")
+        return JobReply(job=jobs.submit("healthy", title, arguments, key_over_episodes(store, arguments), link))
+
     return router
 
 
@@ -109,4 +133,16 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
         "data": name,
         "faults": str(selection.faults),
         "episodes": [selection.episode, *(held_out if over == "held-out" else ())],
+    }
+
+
+def _record_arguments(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:
+    """Arguments of the job that measures a healthy record. Raises BadInput for an unknown name."""
+    name, episodes = store.dataset(task, data)
+    return {
+        "settings": store.settings.to_json(),
+        "task": task,
+        "filter": filter_,
+        "data": name,
+        "episodes": episodes.held_out()[:MAX_RECORDED],
     }

@@ -118,7 +118,8 @@ def _selections(store: TraceStore, selection: Selection, episodes: Episodes) -> 
 def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> object:
     """Everything the result depends on, including the indices of the episodes."""
     traces = [(selection.episode, store.key(selection)) for selection in selections]
-    return entry.name, traces, sorted(options.items())
+    measured = {store.measured_record(selection.task, selection.filter) for selection in selections}
+    return entry.name, traces, sorted(options.items()), *filter(None, measured)
 
 
 def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:

@@ -50,6 +50,7 @@ def key_over_episodes(store: TraceStore, arguments: Mapping[str, Any]) -> object
     task, filter_, data = (arguments[name] for name in ("task", "filter", "data"))
     hashes = store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash
     others = [value for name, value in arguments.items() if name != "settings"]  # names occur in links
+    others += filter(None, [store.measured_record(task, filter_)])
     return others, hashes, store.settings.seed, store.settings.particles
 
 

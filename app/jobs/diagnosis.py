@@ -1,4 +1,4 @@
-"""Jobs that diagnose a filter over episodes of a data set, and search the smallest repair of a run."""
+"""Jobs that diagnose a filter over episodes, search the smallest repair of a run, and measure a healthy record."""
 
 from collections.abc import Mapping
 from contextlib import closing
@@ -12,6 +12,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
 from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.views import as_json
+from beliefscope.inspect.healthy import profile_of
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> Any:
@@ -47,3 +48,19 @@ def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
         limit = run.checkpoint.task.main_error.text(bound)
         return {"sentence": f"{text}, {limit}.", "bound": bound, "replays": 0, **none}
     return as_json({"sentence": repair.sentence, **repair.to_json()})
+
+
+def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
+    """Measure the healthy record of a filter over clean episodes, and keep it in the workspace."""
+    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+        checkpoint = store.checkpoint(arguments["task"], arguments["filter"])
+        data = store.dataset(arguments["task"], arguments["data"])[1]
+        report(0.0, "measuring the sensors")
+        profile = profile_of(
+            checkpoint,
+            [data[index] for index in arguments["episodes"]],
+            f"{len(arguments['episodes'])} held-out episodes of {arguments['data']}",
+            progress=lambda share: report(share, "running the filter over the clean episodes"),
+        )
+        store.healthy_records.put(checkpoint.hash, profile.to_json())
+    return {"data": profile.data}

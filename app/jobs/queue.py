@@ -36,6 +36,7 @@ KINDS: dict[str, str] = {
     "diagnostic": "beliefscope.app.jobs.diagnostic:run",
     "failures": "beliefscope.app.jobs.failures:run",
     "finetune": "beliefscope.app.jobs.finetune:run",
+    "healthy": "beliefscope.app.jobs.diagnosis:measure_record",
     "reading": "beliefscope.app.jobs.recording:open_run",
     "recording": "beliefscope.app.jobs.recording:record",
     "repair": "beliefscope.app.jobs.diagnosis:search_repair",

@@ -21,6 +21,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
+from beliefscope.app.workspace.healthy_records import HealthyRecords
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
@@ -47,6 +48,7 @@ class TraceStore:
         """worker: process that runs the filters; without one, they run in a thread."""
         self.settings = settings
         self.live = LiveRuns(settings.workspace / "live", settings.definitions)
+        self.healthy_records = HealthyRecords(settings.workspace / "healthy")
         self._worker = worker
         self._lock = threading.RLock()
         self._key = lru_cache(MAX_KEYS)(self._compute_key)
@@ -123,7 +125,7 @@ class TraceStore:
             return live_run
         with self._lock:
             run = self._in_use.get(self.key(selection))
-            if run is None or (run.future.done() and run.future.exception() is not None):
+            if run is None or self._is_outdated(run):
                 checkpoint, episode = self._resolve(selection)
                 if self._waiting >= MAX_WAITING:
                     raise QueueFull(f"{self._waiting} filter runs are waiting already; try again later")
@@ -132,6 +134,13 @@ class TraceStore:
                 self._executor.submit(self._compute, run, selection, episode)
             self._remember(run)
             return run
+
+    def _is_outdated(self, run: TracedRun) -> bool:
+        """Whether the run failed, or the healthy record of its filter was measured after its start."""
+        if run.future.done() and run.future.exception() is not None:
+            return True
+        record = self.healthy_records.get(run.checkpoint.hash)
+        return record is not None and record is not run.checkpoint.healthy_profile
 
     def cached(self, selection: Selection) -> TracedRun | None:
         """The selected run if its trace is complete and in memory."""
@@ -168,9 +177,15 @@ class TraceStore:
             return self._catalog(task).data
 
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
-        """Raises BadInput for an unknown name."""
+        """With the healthy record of the workspace, if it was measured. Raises BadInput for an unknown name."""
         with self._lock:
-            return self._catalog(task).filter(filter_)
+            return self.healthy_records.complete(self._catalog(task).filter(filter_))
+
+    def measured_record(self, task: str, filter_: str) -> str | None:
+        """Which data the healthy record of the workspace is from; None if there is none. Raises as ``checkpoint``."""
+        with self._lock:
+            record = self.healthy_records.get(self._catalog(task).filter(filter_).hash)
+            return None if record is None else str(record.get("data"))
 
     def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
         """Name and data set; the task's first for an empty name. Raises BadInput for an unknown name."""
@@ -219,7 +234,7 @@ class TraceStore:
 
     def _resolve(self, selection: Selection) -> tuple[Checkpoint, Episode]:
         catalog = self._catalog(selection.task)
-        checkpoint = catalog.filter(selection.filter)
+        checkpoint = self.healthy_records.complete(catalog.filter(selection.filter))
         live = selection.data.startswith(LIVE_PREFIX)
         episode = self.live.episode(selection.data) if live else catalog.episode(selection.data, selection.episode)
         selection.faults.check(checkpoint.task, len(episode))

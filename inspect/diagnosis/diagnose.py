@@ -181,23 +181,23 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
     """The healthy profile of a filter. Raises BadInput without one."""
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None:
-        raise BadInput(no_diagnosis(checkpoint) or "")
+        source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
+        raise BadInput(
+            f"{no_diagnosis(checkpoint)}; compare it with clean episodes: beliefscope diagnose "
+            f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
+        )
     return profile
 
 
 def no_diagnosis(checkpoint: Checkpoint) -> str | None:
-    """Reason why a filter has no diagnosis, and what it needs; None if it has one."""
+    """Reason why a filter has no diagnosis; None if it has one."""
     lacking = "no healthy record"
     if (document := profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)) is not None:
         count = document.get("episodes") if isinstance(document, dict) else None
         if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
             return None
         lacking = f"a healthy record of {count} episodes, fewer than the {MIN_HEALTHY} needed"
-    source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
-    return (
-        f"filter {checkpoint.name!r} has {lacking}; compare it with clean episodes: beliefscope diagnose "
-        f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
-    )
+    return f"this filter has {lacking}"
 
 
 def confirm(

@@ -37,9 +37,9 @@ def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: A
     page.until("() => document.querySelector('#scene').dataset.state === 'empty'")
     assert "No 3D scene" in text("#scene .note").text_content()
     page.page.evaluate("document.querySelector('#tab-diagnosis').click()")
-    page.until("() => document.querySelector('#diagnosis').dataset.state === 'refused'")
-    assert "--profile-from" in text("#diagnosis .headline").text_content()
-    assert not text("#diagnosis .doing button").is_visible()
+    page.until("() => document.querySelector('#diagnosis').dataset.state === 'absent'")
+    assert "has no healthy record" in text("#diagnosis .headline").text_content()
+    assert text("#diagnosis > .doing button").text_content() == "Measure a healthy record"
     assert not text("#diagnosis .repair").is_visible()
     page.page.evaluate("document.querySelector('#tab-failures').click()")
     text("#failures").get_by_role("button", name="Search for failures", exact=True).click()

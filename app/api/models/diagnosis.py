@@ -81,3 +81,9 @@ class SmallestRepair(Reply):
     repaired: Number
     repair: RepairedInterval | None
     replays: int
+
+
+class HealthyRecord(Reply):
+    """Which clean episodes the healthy record of a filter is from."""
+
+    data: str

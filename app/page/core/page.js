@@ -126,6 +126,7 @@ export class Page {
     );
     this.diagnosis = new Diagnosis(html('#diagnosis'), catalog, store, this.jobs, this.timeline);
     this.diagnosis.confirmed = (trace, result) => this.finding.confirm(trace, result);
+    this.diagnosis.recorded = () => this.#load();
     this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
     this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new ComparisonTab(

@@ -249,6 +249,24 @@ export const startDiagnostic = (selection, name, query) =>
 const diagnosisUrl = ({ task, filter, episode, data, faults }, over) =>
   path(['diagnosis', task, filter, episode], { data, faults, over });
 
+/** @param {Selection} run */
+const recordUrl = ({ task, filter, data }) => path(['healthy-record', task, filter], { data });
+
+/**
+ * Gets the healthy record that was measured for a filter, or the job that measures it.
+ * @param {Selection} run
+ * @param {AbortSignal} signal
+ * @returns {Promise<import('../types/server.js').HealthyRecord | JobReply>}
+ */
+export const healthyRecord = (run, signal) => get(recordUrl(run), signal);
+
+/**
+ * Starts the measurement of a filter's healthy record from the held-out episodes of a run's data.
+ * @param {Selection} run
+ * @returns {Promise<JobReply>}
+ */
+export const measureHealthyRecord = (run) => send(recordUrl(run));
+
 /**
  * Gets the diagnosis of a filter, or its job.
  * @param {Selection} selection

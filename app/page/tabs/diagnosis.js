@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
-/** @import { Catalog, Diagnosis as Result, DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
+/** @import { Catalog, Diagnosis as Result, DiagnosisCause, DiagnosisEvidence, HealthyRecord } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
@@ -16,7 +16,7 @@ import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
 import { Repair } from './repair.js';
 
-/** @typedef {JobResult<Result> | {state: 'live' | 'refused', job?: undefined, preliminary?: undefined}} Entry */
+/** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
 
 /** @type {[string, string][]} */
 const OVER = [
@@ -25,6 +25,7 @@ const OVER = [
 ];
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
+const MEASURE = 'Measure a healthy record';
 const MAX_RESULTS = 24; // in the cache
 const SHOWN = 0.005; // smallest probability of a listed cause
 const PRESENT = 'Probability that this cause is present, alone or together with another one';
@@ -40,12 +41,18 @@ export class Diagnosis {
   #trace = null;
   /** @type {JobResults<Result>} */
   #results;
+  /** @type {JobResults<HealthyRecord>} for filters without a record */
+  #records;
+  /** @type {Set<string>} keys of records after which the run was loaded again */
+  #announced = new Set();
   #loading = new AbortController();
   #open = false;
   /** @type {Result | null | undefined} */
   #listed; // result whose causes are listed
   /** Called with the confirmed diagnosis of the displayed episode. @type {(trace: Trace, result: Result) => void} */
   confirmed = () => {};
+  /** Called when the displayed filter has got a healthy record, so that its runs are diagnosed. */
+  recorded = () => {};
 
   /**
    * @param {HTMLElement} host
@@ -61,6 +68,9 @@ export class Diagnosis {
     this.#repair = new Repair(html('.repair', host), jobs, timeline);
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
       finished.includes(this.#key) ? this.load() : this.#draw(),
+    );
+    this.#records = new JobResults(jobs, MAX_RESULTS, (finished) =>
+      finished.includes(this.#recordKey) ? this.load() : this.#draw(),
     );
   }
 
@@ -85,12 +95,32 @@ export class Diagnosis {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     this.#repair.show(trace);
-    if (trace.live || trace.header.no_diagnosis) return this.#draw();
+    if (trace.live) return this.#draw();
+    if (trace.header.no_diagnosis) return this.#loadRecord(trace, signal);
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
     if (this.#entry.state !== 'absent' || !this.#starts) return;
     await new Promise((resolve) => setTimeout(resolve, SETTLING));
     if (!signal.aborted && this.#open && this.#entry.state === 'absent') this.#startOrCancel();
+  }
+
+  /**
+   * Loads the healthy record of a filter that had none when it ran, or the state of its job.
+   * @param {Trace} trace
+   * @param {AbortSignal} signal
+   */
+  async #loadRecord(trace, signal) {
+    const key = this.#recordKey;
+    await this.#records.load(key, () => api.healthyRecord(trace.selection, signal), signal);
+    if (signal.aborted || this.#records.get(key).state !== 'ready' || this.#announced.has(key))
+      return;
+    this.#announced.add(key);
+    this.recorded();
+  }
+
+  get #recordKey() {
+    const { task, filter, data } = this.#trace?.selection ?? {};
+    return JSON.stringify([task, filter, data]);
   }
 
   get #key() {
@@ -102,7 +132,7 @@ export class Diagnosis {
   /** @returns {Entry} */
   get #entry() {
     if (this.#trace?.live) return { state: 'live' };
-    return this.#trace?.header.no_diagnosis ? { state: 'refused' } : this.#results.get(this.#key);
+    return this.#results.get(this.#key);
   }
 
   #startOrCancel() {
@@ -114,6 +144,8 @@ export class Diagnosis {
 
   #draw() {
     if (!this.#open) return;
+    if (this.#trace && !this.#trace.live && this.#trace.header.no_diagnosis)
+      return this.#drawRecord(this.#trace, this.#trace.header.no_diagnosis);
     const entry = this.#entry;
     const { over } = this.#store.state;
     const set = (/** @type {string} */ value) => this.#store.set({ over: value });
@@ -124,11 +156,8 @@ export class Diagnosis {
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? (result.masked ? 'masked' : result.state) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
-    const state = stateOf(entry) || sentence(this.#trace?.header.no_diagnosis ?? '');
-    const text = result?.headline ?? state;
-    const headline = html('.headline', this.#host);
-    if (headline.dataset.text !== text) headline.replaceChildren(...withCode(text));
-    headline.dataset.text = text;
+    const state = stateOf(entry);
+    this.#writeHeadline(result?.headline ?? state);
     const { episode } = this.#store.state;
     html('.status', this.#host).textContent = entry.preliminary
       ? `Preliminary, from episode ${episode} alone and before any cause is undone. ${state}`
@@ -147,6 +176,39 @@ export class Diagnosis {
         .map((cause, i) => this.#row(cause, !i)),
     );
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
+  }
+
+  /**
+   * Shows why there is no diagnosis, and the measurement of a healthy record.
+   * @param {Trace} trace
+   * @param {string} reason
+   */
+  #drawRecord(trace, reason) {
+    const entry = this.#records.get(this.#recordKey);
+    this.#host.dataset.state = entry.state;
+    this.#host.dataset.finding = '';
+    this.#host.ariaBusy = String(entry.state === 'active');
+    choice(html('.choice', this.#host), [], '', () => {});
+    this.#writeHeadline(sentence(reason));
+    const { data } = trace.selection;
+    const about = `A record of its runs over the held-out episodes of ${data}, which must be healthy, is what this and other episodes are compared with.`;
+    html('.status', this.#host).textContent = this.#starts ? stateOf(entry) || about : '';
+    showJobButton(html('.doing', this.#host), entry, {
+      action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
+      progress: 'Progress of the healthy record',
+      press: () =>
+        this.#records.startOrCancel(this.#recordKey, () =>
+          api.measureHealthyRecord(trace.selection),
+        ),
+      next: html('.scroll', this.#host),
+    });
+  }
+
+  /** @param {string} text */
+  #writeHeadline(text) {
+    const headline = html('.headline', this.#host);
+    if (headline.dataset.text !== text) headline.replaceChildren(...withCode(text));
+    headline.dataset.text = text;
   }
 
   #finetuneButton() {
@@ -202,7 +264,7 @@ export class Diagnosis {
 
 /**
  * The state of a diagnosis that is not ready.
- * @param {Entry} entry
+ * @param {Entry | JobResult<HealthyRecord>} entry
  */
 function stateOf(entry) {
   if (entry.state === 'error') return sentence(entry.error);

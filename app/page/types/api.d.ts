@@ -867,6 +867,14 @@ export interface components {
             late: number;
         };
         /**
+         * HealthyRecord
+         * @description Which clean episodes the healthy record of a filter is from.
+         */
+        HealthyRecord: {
+            /** Data */
+            data: string;
+        };
+        /**
          * Job
          * @description State of one job.
          *
@@ -2107,6 +2115,7 @@ export type FineTuneRunSummary = components['schemas']['FineTuneRunSummary'];
 export type FineTunedCheckpoint = components['schemas']['FineTunedCheckpoint'];
 export type Freed = components['schemas']['Freed'];
 export type Health = components['schemas']['Health'];
+export type HealthyRecord = components['schemas']['HealthyRecord'];
 export type Job = components['schemas']['Job'];
 export type JobReply = components['schemas']['JobReply'];
 export type JobWithLog = components['schemas']['JobWithLog'];

@@ -16,9 +16,12 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
 from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.views import as_json
+from beliefscope.inspect.healthy import MAX_EPISODES
 
 pytestmark = pytest.mark.slow
 
@@ -101,6 +104,47 @@ def test_the_smallest_repair_is_that_of_the_command(tmp_path: Path, open_client:
     assert expected is not None
     assert expected.candidate is not None
     assert result == as_json({"sentence": expected.sentence, **expected.to_json()})
+
+
+def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
+    tmp_path: Path, open_client: Callable[..., TestClient]
+) -> None:
+    settings = Settings(workspace=tmp_path)
+    record, url = "/api/healthy-record/door/hand-on-arc", "/api/diagnosis/door/hand-on-arc/9"
+    with open_client(settings) as client:
+        assert client.get(record).json() == {"job": None}
+        while (reply := client.get(url)).status_code == 202:
+            time.sleep(0.05)
+        assert "this filter has no healthy record" in reply.text
+        job = client.post(record).json()["job"]
+        assert job["title"].startswith("Healthy record of hand-on-arc, door, ")
+        end = time.monotonic() + TIMEOUT
+        while (answer := client.get(record)).status_code == 202:
+            assert answer.json()["job"]["state"] in ("waiting", "running"), answer.text
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert answer.json()["data"].endswith("held-out episodes of sample")
+        assert "no_diagnosis" not in client.get(url).text
+    with open_client(settings) as client:  # the record is kept in the workspace
+        while (reply := client.get(url, params={"faults": FAULTS})).status_code == 202 and "progress" in reply.json():
+            time.sleep(0.05)
+        result = reply.json()
+        assert result["preliminary"]["causes"][0]["cause"] == "image.frozen", result
+    store = TraceStore(settings)
+    checkpoint = store.checkpoint("door", "hand-on-arc")
+    indices = store.dataset("door", "")[1].held_out()[:MAX_EPISODES]
+    assert required_profile(checkpoint).episodes == len(indices)
+    assert checkpoint.hash == load_external("beliefscope.filters.external.hand_on_arc:build", "door").hash
+    store.close()
+
+
+def test_a_healthy_record_needs_ten_episodes(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
+    with open_dataset(sample_path("door")) as data:
+        write_dataset(tmp_path / "few.h5", data.task, [data[index] for index in range(7)])
+    with open_client(Settings(workspace=tmp_path, data={"few": tmp_path / "few.h5"})) as client:
+        reply = client.post("/api/healthy-record/door/hand-on-arc", params={"data": "few"})
+        assert reply.status_code == 400
+        assert "'few' has 7 held-out episodes; a healthy record needs at least 10" in reply.text
 
 
 def test_unknown_names_are_reported(client: TestClient) -> None:
