@@ -45,11 +45,12 @@ LINKS = {
     "three-sensors": "?task=cart&step=40",
     "six-sensors": "?task=submarine&step=40",
     "external": "?task=door&filter=hand-on-arc&step=29",
+    "no-record": "?task=door&filter=hand-on-arc&step=29&tab=diagnosis",
     "live": "?data=live:go",
     "bad-link": "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp",
 }
 """View -> address that opens it: the first visit, an injected fault on each task, a comparison run, a
-filter without weights, a task without a study, external filters of other tasks, one without an image, a run in
+filter without weights, a task without a study, external filters of other tasks, one without a healthy record, a run in
 progress, and a selection that does not exist."""
 
 FIRST_VISIT = ("first",)

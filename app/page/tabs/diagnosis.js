@@ -191,7 +191,7 @@ export class Diagnosis {
     choice(html('.choice', this.#host), [], '', () => {});
     this.#writeHeadline(sentence(reason));
     const { data } = trace.selection;
-    const about = `A record of its runs over the held-out episodes of ${data}, which must be healthy, is what this and other episodes are compared with.`;
+    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them.`;
     html('.status', this.#host).textContent = this.#starts ? stateOf(entry) || about : '';
     showJobButton(html('.doing', this.#host), entry, {
       action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
