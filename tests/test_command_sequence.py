@@ -175,6 +175,7 @@ def test_skip_bad(run: Run, folder: Path) -> None:
     assert json.loads(out)["episode"] == 18, "the first remaining held-out episode"
 
 
+@pytest.mark.long
 def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
     run("collect door --episodes 10 --steps 20 --workers 1 -o ten.h5")
     line = "train door --filter crossmodal-pf --data ten.h5 --preset smoke -o pf.safetensors --json -"

@@ -73,6 +73,7 @@ def example(name: str, argument: object, capsys: pytest.CaptureFixture[str]) -> 
     return capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = example("01_diagnose.py", tmp_path, capsys)
     assert all(f"{entry.title}. {entry.question}\n  " in output for entry in DIAGNOSTICS.values())

@@ -39,6 +39,7 @@ def test_recorded_ensemble_reproduces_the_published_run(tmp_path: Path, run: Any
     assert {"consistency", "errors", "ensemble"} <= set(results)
 
 
+@pytest.mark.long
 def test_recurrent_gain_learns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES / "gallery"))
     example = runpy.run_path(str(EXAMPLES / "gallery" / "recurrent_gain.py"))

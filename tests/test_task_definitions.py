@@ -108,6 +108,7 @@ print("served")
 """
 
 
+@pytest.mark.long
 def test_commands_and_server_need_no_definition(folder: Path) -> None:
     run = ["rover", "--filter", "own.safetensors", "--data", "data.h5"]
     commands = [

@@ -22,6 +22,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [write_case(spec, directory) for spec in specs]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_learned_baselines_recognise_the_cases_they_were_fitted_to(folders: list[Path]) -> None:
     learned = Learned.fit(folders)

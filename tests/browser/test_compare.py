@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 READY = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
 RUN = "?filter=crossmodal-ekf&episode=9&step=45"
 
@@ -56,6 +58,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     assert page.state["against"] == second.state["against"]
 
 
+@pytest.mark.long
 def test_two_filters_are_compared(open_page: Any) -> None:
     page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", theme="dark")
     page.until(READY)

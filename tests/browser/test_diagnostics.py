@@ -60,6 +60,7 @@ def test_diagnostic_is_opened_by_keyboard_and_in_the_permalink(open_page: Any) -
     assert page.page.evaluate("() => document.activeElement.textContent") == "Consistency"
 
 
+@pytest.mark.long
 def test_charts_and_cursor_are_synchronized(open_page: Any) -> None:
     page = open_diagnostic(open_page, "particles", "&step=40&faults=blackout%3D0.4", size=(1440, 900))
     plot = page.page.locator(".curves .u-over").first
@@ -106,6 +107,7 @@ def test_a_table_is_copied_as_csv(open_page: Any) -> None:
     assert cell.evaluate("(e) => getComputedStyle(e).textAlign") == "right"
 
 
+@pytest.mark.long
 def test_slow_diagnostic_survives_a_reload(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=maps&filter=crossmodal-ekf")
     page.until("() => document.querySelector('#diagnostics article').dataset.state === 'absent'")

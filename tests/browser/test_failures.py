@@ -64,6 +64,7 @@ def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
     assert other.state["filter"] == "crossmodal-ekf"
 
 
+@pytest.mark.long
 def test_worst_step_of_a_slice_is_opened(open_page: Any) -> None:
     page = open_page("?tab=failures&list=slices&task=push-field&filter=information-ekf", size=(1280, 720))
     page.page.get_by_role("button", name="Search for failures").click()

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
@@ -64,6 +66,7 @@ window.close_widget = widget.render({ model, el: document.querySelector('#cell')
 """A notebook as the widget sees it: the model with its traits, and an element."""
 
 
+@pytest.mark.long
 def test_widget_shares_its_cursor(context: Any) -> None:
     from beliefscope.recordings.interactive.widget import RunWidget  # imports IPython
 

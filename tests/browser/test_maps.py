@@ -226,6 +226,7 @@ def check_tiles(page: Any) -> None:
     page.page.locator("#heatmaps canvas").first.wait_for()
 
 
+@pytest.mark.long
 def test_summary_and_zoom_of_a_step(open_page: Any) -> None:
     page = open_page("?task=push&filter=crossmodal-ekf&episode=79&step=68")
     assert (

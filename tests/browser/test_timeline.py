@@ -151,6 +151,7 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     third.until(f"() => ({titles})().join() === 'Effective,Hinge,Particles'")
 
 
+@pytest.mark.long
 def test_event_marks_and_comparison_run(open_page: Any) -> None:
     page = open_page(LINK + "&track=signed", theme="dark")
     events = [{"step": s, "label": f"{s / 10} cm", "measure": "error"} for s in (70, 12, 55)]

@@ -63,7 +63,7 @@ def test_record_has_the_training_command(name: str) -> None:
     assert {"seed", "metrics", "versions", "seconds"} <= record.keys()
 
 
-@pytest.mark.parametrize("faults", ["", "blackout=0.8"])
+@pytest.mark.parametrize("faults", ["", pytest.param("blackout=0.8", marks=pytest.mark.long)])
 def test_accuracy(checkpoint: Checkpoint, held_out: list[Episode], faults: str) -> None:
     """As recorded, and with fusion no worse than the better modality; with blackouts better for the moving angle."""
     fused = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults), particles=100).rmse

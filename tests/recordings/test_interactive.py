@@ -88,6 +88,7 @@ def test_text_of_a_trace_cannot_end_the_script(run_: Trace, tmp_path: Path) -> N
     assert "maps need the filter" in embedded(tmp_path / "run.html")["no_maps"]
 
 
+@pytest.mark.long
 def test_folder_with_an_index(run: Run, run_: Trace, tmp_path: Path) -> None:
     for name in ("a", "b"):
         save_trace(run_, tmp_path / f"{name}.trace")

@@ -52,7 +52,7 @@ def test_external_filter(run: Run, assert_same: Compare, tmp_path: Path) -> None
 
 def test_ctrl_c_leaves_complete_files(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "beliefscope", "live", "door", "--filter", "crossmodal-ekf", "--json", "-"]
-    command += ["--rate", "2", "--workspace", str(tmp_path)]  # the run lasts much longer than the test
+    command += ["--rate", "1", "--workspace", str(tmp_path)]  # the run lasts much longer than the test
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         start = time.monotonic()
         while not (paths := list(tmp_path.glob("live/*.live"))) or LiveFileReader(paths[0]).poll() < 3:

@@ -55,6 +55,7 @@ def sweep(inputs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_pooled_results_equal_the_evaluation(inputs: Inputs, sweep: Path) -> None:
     overview = Experiments([sweep]).overview().to_pylist()
     assert len(overview) == 4

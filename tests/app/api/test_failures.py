@@ -99,6 +99,7 @@ def test_every_score_is_ranked_or_has_a_reason(client: TestClient) -> None:
                 assert event["value"] == event["error"][result["layers"].index("fused")]
 
 
+@pytest.mark.long
 def test_slices_are_those_of_the_command(client: TestClient) -> None:
     url = "/api/failures/push-field/information-ekf"
     client.post(url)

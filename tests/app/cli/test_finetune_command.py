@@ -16,6 +16,7 @@ pytestmark = pytest.mark.slow
 Run = Callable[..., tuple[int, str, str]]
 
 
+@pytest.mark.long
 def test_training_episodes_of_a_field_task_are_simulated(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

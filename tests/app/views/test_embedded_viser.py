@@ -247,6 +247,7 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
+@pytest.mark.long
 @pytest.mark.anyio
 async def test_idle_views_are_replaced_at_the_limit(settings: Settings) -> None:
     views = Views(TraceStore(settings), limit=2)

@@ -32,6 +32,7 @@ def test_scene(run_: bs.Trace) -> None:
         urllib.request.urlopen(scene.url, timeout=10)
 
 
+@pytest.mark.long
 def test_widget_starts_at_the_largest_error(run_: bs.Trace) -> None:
     widget = bs.show(run_)
     assert widget.step == int(np.linalg.norm(run_.estimate_mean - run_.episode.states, axis=1).argmax())

@@ -194,6 +194,7 @@ def test_task_variants(folder: Path, task: Any) -> None:
         np.testing.assert_allclose(np.stack([w * w - z * z, 2 * w * z], 1), turned, atol=1e-6)
 
 
+@pytest.mark.long
 def test_field_task_has_the_recorded_haptics_and_another_camera(folder: Path) -> None:
     with open_dataset(folder / "val", PUSH_REAL_FIELD) as data:
         episodes, again = [data[i] for i in range(12)], data[3]

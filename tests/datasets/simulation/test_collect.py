@@ -73,6 +73,7 @@ def running(pid: int) -> bool:
         return False
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_killed_collection_keeps_finished_episodes_and_no_worker(tmp_path: Path) -> None:
     path, folder = tmp_path / "door.h5", tmp_path / "door.h5.partial"

@@ -40,6 +40,7 @@ def test_calibrated_nees_is_1_and_estimates_stay(episodes: list[Episode], name: 
     assert after.rmse["position_cm"] == pytest.approx(before.rmse["position_cm"], rel=0.05)
 
 
+@pytest.mark.long
 def test_fine_tuning_calibrates_on_validation_episodes(episodes: list[Episode]) -> None:
     base = load_checkpoint(shipped("push", "crossmodal-ekf"))
     settings = FineTune(train=("noise-only",), length=6, windows=4, steps=2, check=2, calibrate=True)

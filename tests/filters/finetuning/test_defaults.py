@@ -22,6 +22,8 @@ from beliefscope.filters.subsets import input_modalities
 pytestmark = pytest.mark.slow
 
 FILTERS = [(task, name) for task in ("door", "push") for name in filters_of(find_task(task))]
+FIRST = ("crossmodal-ekf", "feature-pf", "information-ekf", "lstm")
+"""Each kind of filter once; the others are tested by ``make check-all`` only."""
 
 
 @pytest.mark.parametrize(("task", "name"), FILTERS)
@@ -41,7 +43,10 @@ def test_defaults_train_a_model_of_the_filter_on_a_fault_of_its_sensors(task: st
     assert parse_slices([slice_.name], (), filter_.task) == [slice_]
 
 
-@pytest.mark.parametrize("name", filters_of(find_task("door")))
+@pytest.mark.parametrize(
+    "name",
+    [name if name in FIRST else pytest.param(name, marks=pytest.mark.long) for name in filters_of(find_task("door"))],
+)
 def test_every_offered_preset_has_a_gradient(name: str, short_episodes: Callable[..., list[Episode]]) -> None:
     filter_ = build(architecture("door", name))
     settings = FineTune(length=6, windows=2, particles=5)

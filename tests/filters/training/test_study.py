@@ -265,6 +265,7 @@ def test_cell_with_a_changed_checkpoint_is_not_finished(data: Path, finished: Pa
     assert first.finished(folder) is None
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_figures")
 def test_failed_cell_is_reported_and_the_others_run(
     data: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

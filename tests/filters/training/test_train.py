@@ -26,6 +26,8 @@ pytestmark = pytest.mark.slow
 
 SMOKE = PLANS["smoke"]
 NAMES = tuple(filters_of(find_task("door")))
+FIRST = ("crossmodal-ekf", "feature-pf", "information-ekf", "lstm")
+"""Each kind of filter once; the others are tested by ``make check-all`` only."""
 KINDS = (
     "crossmodal-ekf",
     "crossmodal-pf",
@@ -79,7 +81,9 @@ def make_trainer(episodes: list[Episode]) -> Callable[..., Trainer]:
     return make
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [name if name in FIRST else pytest.param(name, marks=pytest.mark.long) for name in NAMES]
+)
 def test_each_stage_trains_only_its_parameters(name: str, make_trainer: Callable[..., Trainer]) -> None:
     trainer = make_trainer(name)
     filter_ = trainer.filter

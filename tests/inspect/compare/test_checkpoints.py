@@ -221,6 +221,7 @@ def test_numbers_equal_evaluate(data: Dataset) -> None:
     assert not result.regressions()
 
 
+@pytest.mark.long
 def test_values_do_not_depend_on_the_number_of_processes(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beliefscope.filters.evaluate.BLOCK", 2)
     members = {index: episode_of(data, index, 40) for index in EPISODES[:5]}

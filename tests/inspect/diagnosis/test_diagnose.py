@@ -151,6 +151,7 @@ def deviations_in(values: Callable[[float, float], list[float]]) -> Case:
     return compared(setting, [], rows, rows, HealthyProfile("test", 44, None, {name: healthy}), 0.05)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_number_of_processes_does_not_matter() -> None:
     """Two blocks of episodes and up to three interventions, in one process and in two."""
@@ -217,6 +218,7 @@ def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
     assert no_diagnosis(replace(filter_, healthy_profile=enough)) is None
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_external_filters_are_compared_with_a_measured_profile() -> None:
     external = open_filter("door", "examples/04_own_filter.py:build")

@@ -88,6 +88,7 @@ def test_an_inverted_contact_flag_opposes_the_force(task: str) -> None:
     assert change(task, "contact_flipped=1", "opposition/contact/all") > 0.3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
     ("faults", "statistic", "amount", "tolerance"),
@@ -228,6 +229,7 @@ def test_faults_are_localised(faults: str, statistic: str, steps: tuple[int, int
     assert localise("lag/image/all", faulty, reference("push")) is None
 
 
+@pytest.mark.long
 def test_labels_with_an_offset_move_the_object_and_not_the_hand() -> None:
     """The puck is seen where it was, to a fifth of a pixel (3 mm along x): the distance is that of the labels."""
     with open_dataset("datasets/samples/push.h5") as data:
@@ -247,6 +249,7 @@ def test_labels_with_an_offset_move_the_object_and_not_the_hand() -> None:
     np.testing.assert_allclose(np.mean(moved, axis=0), expected, atol=0.2)
 
 
+@pytest.mark.long
 def test_the_hand_touches_a_larger_puck_farther_from_its_centre() -> None:
     """By the difference of the radii, in simulation; the fingers are the same."""
     with open_dataset("datasets/samples/push.h5") as data:

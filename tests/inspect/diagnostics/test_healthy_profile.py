@@ -41,6 +41,7 @@ def profile(rows: list[dict[str, float]]) -> HealthyProfile:
     return HealthyProfile("simulated", len(rows), None, columns)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [1, 5, 20])
 def test_healthy_trajectories_rarely_raise_an_alarm(count: int) -> None:
     rng = np.random.default_rng(count)
@@ -128,6 +129,7 @@ def test_profiles_of_format_1_have_no_reference() -> None:
     assert set(again.statistics) == set(NAMES)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_measured_profile_is_that_of_new_episodes() -> None:
     """Statistics of images are measured with references that the episode is not part of."""
@@ -209,6 +211,7 @@ def test_a_run_without_common_statistics_raises_no_alarm() -> None:
         assert not compare(profile, tested).alarms
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_included_images_replace_those_of_the_episodes() -> None:
     """They are of the same camera: statistics of new episodes agree with those compared with the episodes' own."""

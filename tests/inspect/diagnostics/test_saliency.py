@@ -118,6 +118,7 @@ INFORMATION = ("information-ekf", "information-pf")
 KINDS = ("crossmodal-ukf", *INFORMATION, "unimodal-ekf", "unimodal-pf", "feature-ekf", "lstm", "haptics-pf")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf", *KINDS])
 def test_original_inputs_reproduce_the_trace(name: str) -> None:
     replay = builtin(name) if name in ("crossmodal-ekf", "crossmodal-pf") else untrained(name)

@@ -309,6 +309,7 @@ def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[i
         np.testing.assert_allclose(survey.nees[survey.episode == index], single.nees, rtol=1e-2)  # float32 covariances
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_values_do_not_depend_on_the_number_of_processes() -> None:
     filter_ = load_checkpoint(shipped("push", "crossmodal-ekf"))

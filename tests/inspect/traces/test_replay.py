@@ -13,6 +13,7 @@ from beliefscope.inspect.trace import ARRAYS, trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", ["crossmodal-ukf", "information-ekf", "information-pf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"]
 )

@@ -113,6 +113,7 @@ def test_a_guessed_map_imports_the_recording(tmp_path: Path) -> None:
     assert episode.states[:, 0].tolist() == [*range(20)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

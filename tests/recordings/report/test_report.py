@@ -117,6 +117,7 @@ def test_manifest_has_the_hash_of_every_file(report: Path, run_: Trace) -> None:
     assert names == files.keys() - {"report.html"}, "the page names every file"
 
 
+@pytest.mark.long
 def test_same_traces_give_the_same_bytes(report: Path, run_: Trace, checkpoint: Checkpoint, tmp_path: Path) -> None:
     link = lambda index, step: f"http://127.0.0.1:8000/?episode={EPISODE}&step={step}"  # noqa: E731
     content = compose([run_], checkpoint, title=TITLE, steps=[(0, 40)], link=link)
@@ -241,6 +242,7 @@ def test_information_filters_are_described(new_trace: Callable[..., Trace], kind
     assert (r"\prod_k" in passage.equations[0]) == (kind == "pf")
 
 
+@pytest.mark.long
 def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     content = compose([new_trace("ekf", steps=80)], None, steps=[(0, 50)])
     document = write_report(content, tmp_path / "report")
@@ -295,6 +297,7 @@ def test_command_adds_permalinks(run: Any, run_: Trace, tmp_path: Path, monkeypa
     assert (tmp_path / "report" / "report.html").is_file()
 
 
+@pytest.mark.long
 def test_slices_are_searched_in_enough_episodes() -> None:
     filter_ = load_checkpoint(shipped("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
