@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
@@ -18,7 +19,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
-from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile
+from beliefscope.inspect.diagnostics.healthy_profile import SENSORS_SUFFIX, SUFFIX, HealthyProfile
 from beliefscope.inspect.healthy import SensorRecord, profile_of, sensor_record
 
 REAL = "beliefscope convert push-real --data mit_push -o push-real.h5"
@@ -39,10 +40,26 @@ def held_out(task: str, real: Path | None) -> tuple[list[Episode], str]:
         return [data[s.index] for s in data.summaries if s.split == "val"], REAL
 
 
-def write(path: Path, checkpoint_hash: str, profile: HealthyProfile) -> None:
+def write_sensors(task: str, sensors: SensorRecord, profile: HealthyProfile) -> None:
+    """What is the same for all filters of a task: one line per statistic."""
+    document = profile.to_json()
+    names = dict.fromkeys(name for row in sensors.rows for name in row)
+    common = {name: values for name, values in document["statistics"].items() if name in names}
+    write(PRETRAINED / (task + SENSORS_SUFFIX), {"statistics": common, "reference": document["reference"]})
+
+
+def write_profile(path: Path, checkpoint_hash: str, sensors: SensorRecord, profile: HealthyProfile) -> None:
+    """The profile without what is the same for all filters of the task."""
+    document = profile.to_json()
+    names = {name for row in sensors.rows for name in row}
+    own = {name: values for name, values in document["statistics"].items() if name not in names}
+    head = {key: value for key, value in document.items() if key not in ("statistics", "reference")}
+    write(path, {"checkpoint": checkpoint_hash, "healthy_profile": head | {"statistics": own}})
+
+
+def write(path: Path, document: dict[str, Any]) -> None:
     """One line per statistic."""
-    text = json.dumps({"checkpoint": checkpoint_hash, "healthy_profile": profile.to_json()})
-    text = text.replace('], "', '],\n"').replace('"statistics": {', '"statistics": {\n')
+    text = json.dumps(document).replace('], "', '],\n"').replace('"statistics": {', '"statistics": {\n')
     write_atomically(path, (text + "\n").encode())
 
 
@@ -61,7 +78,9 @@ def main() -> None:
             clean, source = held_out(task, options.push_real)
             episodes[task] = clean, source, sensor_record(clean)
         profile = profile_of(checkpoint, *episodes[task])
-        write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
+        sensors = episodes[task][2]
+        write_sensors(task, sensors, profile)
+        write_profile(path.with_name(path.stem + SUFFIX), checkpoint.hash, sensors, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)
 
 

@@ -39,7 +39,8 @@ Evaluation on these {} episodes at the end of training, from starts at the truth
 """
 FIELD = """
 Evaluation on these {} episodes at the end of training, with the task's outages and starts, from step 0, and further
-image blackouts. Results on fresh test episodes: [docs/field_tasks.md](../../docs/field_tasks.md).
+image blackouts. Afterwards the matrices were stored as bfloat16 (`python bench/store_bfloat16.py`). Results on fresh
+test episodes: [docs/field_tasks.md](../../docs/field_tasks.md).
 """
 
 
@@ -93,7 +94,15 @@ def section(task: str, paths: list[Path]) -> list[str]:
     field = bool(TASKS[task].start_distance)
     output = "" if field else " -o {}"
     lines += [c.record["command"] + output.format(p.name) for c, p in zip(checkpoints, paths, strict=True)]
-    lines += ["```", "", f"Data hash of the file: `{first['data_hash']}`."]
+    names: dict[str, list[str]] = {}
+    for c in checkpoints:
+        names.setdefault(c.record["data_hash"], []).append(c.name)
+    lines += ["```", ""]
+    if len(names) == 1:
+        lines.append(f"Data hash of the file: `{first['data_hash']}`.")
+    else:  # collected on several types of CPU
+        lines.append("Data hash of the file:\n")
+        lines += [f"- `{hash_}`: {', '.join(filters)}" for hash_, filters in names.items()]
     lines += ["", "| file | SHA-256 | training, s | device |", "| --- | --- | --- | --- |"]
     for c, p in zip(checkpoints, paths, strict=True):
         lines.append(f"| `{p.name}` | `{c.hash}` | {c.record['seconds']:.0f} | {c.record['device']} |")

@@ -3,7 +3,7 @@
     python bench/store_bfloat16.py filters/pretrained/push-field-image-ekf.safetensors
 
 Tensors with at least 1024 values and two axes are rounded to 8 significant bits; filters compute in 32 bits as before.
-Prints the errors and the NEES before and after, of 10 episodes of the task's sample set. Then run
+Prints the errors and the NEES before and after, of 10 held-out episodes. Then run
 ``bench/healthy_profiles.py`` and ``bench/shipped.py``: profiles and README contain the hash of the file.
 """
 
@@ -44,19 +44,17 @@ def errors(path: Path, episodes: list[Episode]) -> Metrics:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="+", type=Path, metavar="FILE")
+    parser.add_argument("--data", type=Path, help="episodes; default: the sample set of the filter's task")
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    for path in parser.parse_args().paths:
-        sample = sample_path(load_checkpoint(path).task.name)
-        episodes: list[Episode] = []
-        if sample.exists():
-            with open_dataset(sample) as data:
-                episodes = [data[s.index] for s in data.summaries if s.split == "test"][:EPISODES]
-        before = errors(path, episodes) if episodes else None
+    for path in options.paths:
+        with open_dataset(options.data or sample_path(load_checkpoint(path).task.name)) as data:
+            episodes = [data[index] for index in data.held_out()[:EPISODES]]
+        before = errors(path, episodes)
         halve(path)
-        if before is not None:
-            after = errors(path, episodes)
-            changes = ", ".join(f"{key} {value:.4f} -> {after.rmse[key]:.4f}" for key, value in before.rmse.items())
-            print(f"{path.stem}: {changes}; NEES {before.nees:.3f} -> {after.nees:.3f}", flush=True)
+        after = errors(path, episodes)
+        changes = ", ".join(f"{key} {value:.4f} -> {after.rmse[key]:.4f}" for key, value in before.rmse.items())
+        print(f"{path.stem}: {changes}; NEES {before.nees:.3f} -> {after.nees:.3f}", flush=True)
 
 
 if __name__ == "__main__":

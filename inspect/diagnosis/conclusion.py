@@ -16,6 +16,7 @@ from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, label_of
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -29,12 +30,23 @@ LISTED = 5
 EVIDENCE = 5
 """Maximum number of listed deviations by cause."""
 
+MAX_NEES = 2.0
+"""Largest ratio of a healthy record's NEES to 1, and of 1 to it, that the headline does not mention."""
+
 
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
-    text = f"Healthy: all {count} statistics are within the record of {record} healthy episodes."
-    return Diagnosis("healthy", False, text, (), _provenance(case))
+    text = f"Healthy: all {count} statistics are within the record of {record} healthy episodes"
+    return Diagnosis("healthy", False, f"{text}{_miscalibration(case.profile)}.", (), _provenance(case))
+
+
+def _miscalibration(profile: HealthyProfile) -> str:
+    """What a comparison with the record cannot show: that the filter has never been consistent."""
+    nees = float(np.nanmean(profile.statistics.get("nees/fused/all", [np.nan])))
+    if not np.isfinite(nees) or 1 / MAX_NEES <= nees <= MAX_NEES:
+        return ""
+    return f", whose NEES is {nees:.2g} instead of 1: the filter is always {'over' if nees > 1 else 'under'}confident"
 
 
 def statistics_by_subject(case: Case) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Healthy profile: trajectory statistics of a checkpoint on clean held-out episodes, which its later runs should match.
 
-New checkpoints have it in their header; shipped ones have a file beside them, which keeps their hash.
+New checkpoints have it in their header; shipped ones have a file beside them, which keeps their hash. What is the same
+for all shipped filters of a task, such as statistics of its sensors, is in a file of the task.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint, shipped
-from beliefscope.filters.names import filter_names
+from beliefscope.filters.names import PRETRAINED
 from beliefscope.inspect.statistics.reference_images import Reference
 
 Array = NDArray[np.float64]
@@ -26,6 +27,8 @@ FORMAT = 2
 """Version 1 had no reference and no statistics of sensors and modules; it is still read."""
 SUFFIX = ".profile.json"
 """Of the file beside a shipped checkpoint."""
+SENSORS_SUFFIX = ".sensors.json"
+"""Of the file of a task: ``statistics`` and ``reference`` of the profiles of all its shipped filters."""
 
 DIGITS = 3
 """Significant digits of stored values, whose rounding is small against the differences between trajectories."""
@@ -97,10 +100,9 @@ def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: 
 
 
 def included_reference(task: Task) -> Reference | None:
-    """Healthy images of a task, from the file beside one of its shipped checkpoints; None without one."""
-    documents = (_file_beside_shipped(task.name, name) for name in filter_names(task))
-    images = (document["healthy_profile"]["reference"] for document in documents if document)
-    return next((Reference.from_json(image) for image in images if image is not None), None)
+    """Healthy images of a task with shipped filters; None without any."""
+    image = _sensors_of_shipped(task.name)["reference"]
+    return None if image is None else Reference.from_json(image)
 
 
 def _beside_shipped(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
@@ -116,4 +118,15 @@ def _file_beside_shipped(task: str, filter_: str) -> dict[str, Any] | None:
     except BadInput:
         return None
     path = path.with_name(path.stem + SUFFIX)
-    return read_json(path.read_text()) if path.is_file() else None
+    if not path.is_file():
+        return None
+    document, sensors = read_json(path.read_text()), _sensors_of_shipped(task)
+    profile = document["healthy_profile"]
+    profile |= {"statistics": profile["statistics"] | sensors["statistics"], "reference": sensors["reference"]}
+    return document
+
+
+@lru_cache(maxsize=4)
+def _sensors_of_shipped(task: str) -> dict[str, Any]:
+    path = PRETRAINED / (task + SENSORS_SUFFIX)
+    return read_json(path.read_text()) if path.is_file() else {"statistics": {}, "reference": None}

@@ -70,6 +70,8 @@ test('a weight that does not react to an outage stays, although the image is los
   });
   assert.match(low, /weight of haptics stays at 50 %, although the image is lost;/);
   assert.match(high, /weight of haptics stays at 98 %;/);
+  const slight = { ...run(14), weight: () => series((t) => (t >= 8 ? 0.77 : 0.75)) };
+  assert.match(outageFinding(slight, 0)?.headline ?? '', /in contact, until the image returns/);
 });
 
 test('short outages and those in free motion are no finding', () => {

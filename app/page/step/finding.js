@@ -125,7 +125,9 @@ export function outageFinding(trace, component) {
       const before = mean(values.subarray(Math.max(0, first - BEFORE), first));
       return [{ name, before, during: mean(values.subarray(first, last + 1)) }];
     });
-  const successor = weights.find(({ before, during }) => during > before && during > 0.5);
+  const successor = weights.find(
+    ({ before, during }) => during - before >= MIN_CHANGE && during > 0.5,
+  );
   const end =
     last + 1 < trace.steps
       ? `until the image returns at ${trace.stepLabel(last + 1)}`

@@ -59,6 +59,22 @@ def test_clean_episodes_are_healthy() -> None:
 
 
 @pytest.mark.parametrize(
+    ("nees", "end"),
+    [
+        (4.0, "whose NEES is 4 instead of 1: the filter is always overconfident."),
+        (0.2, "whose NEES is 0.2 instead of 1: the filter is always underconfident."),
+        (1.3, "44 healthy episodes."),
+    ],
+)
+def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, end: str) -> None:
+    """A filter whose covariance has always been too small does not deviate from its own record."""
+    name = "nees/fused/all"
+    record = HealthyProfile("test", 44, None, {name: nees * np.linspace(0.9, 1.1, 44)})
+    case = compared(Setting(checkpoint(), {}, 300, frozenset()), [], [{name: nees}] * 2, [{}] * 2, record, 0.05)
+    assert healthy(case).headline.endswith(end)
+
+
+@pytest.mark.parametrize(
     ("faults", "cause"),
     [
         ("image_frozen:from=30", "image.frozen"),
