@@ -11,8 +11,9 @@ from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
 from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
+from beliefscope.inspect.diagnostics.healthy_profile import included_reference
 from beliefscope.inspect.diagnostics.views import as_json
-from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.healthy import profile_of, sensor_record
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> Any:
@@ -56,10 +57,14 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
         checkpoint = store.checkpoint(arguments["task"], arguments["filter"])
         data = store.dataset(arguments["task"], arguments["data"])[1]
         report(0.0, "measuring the sensors")
+        episodes = [data[index] for index in arguments["episodes"]]
+        is_sample = arguments["data"] not in store.settings.data
+        images = included_reference(checkpoint.task) if is_sample else None  # of the same camera
         profile = profile_of(
             checkpoint,
-            [data[index] for index in arguments["episodes"]],
-            f"{len(arguments['episodes'])} held-out episodes of {arguments['data']}",
+            episodes,
+            f"{len(episodes)} held-out episodes of {arguments['data']}",
+            sensor_record(episodes, images),
             progress=lambda share: report(share, "running the filter over the clean episodes"),
         )
         store.healthy_records.put(checkpoint.hash, profile.to_json())
