@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
@@ -58,6 +60,7 @@ def profile_of(
     data: str,
     sensors: SensorRecord | None = None,
     progress: Progress | None = None,
+    indices: Sequence[int] | None = None,
 ) -> HealthyProfile:
     """The healthy profile of a filter over clean episodes.
 
@@ -65,13 +68,22 @@ def profile_of(
         data: where the episodes come from.
         sensors: record of their sensors, if it is known.
         progress: called with the completed fraction of the runs, 0..1.
+        indices: of the episodes in their data set, for messages.
+
+    Raises BadInput if the filter fails; an external one in an episode, which is named.
     """
     sensors = sensors or sensor_record(episodes)
     rows: list[dict[str, float]] = []
     particles = None
-    for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=progress):
-        rows.append(episode_statistics(trace, checkpoint, sensors.rows[trace.episode_index]))
-        particles = trace.particle_count
+    try:
+        for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=progress):
+            rows.append(episode_statistics(trace, checkpoint, sensors.rows[trace.episode_index]))
+            particles = trace.particle_count
+    except BadInput as error:
+        if not isinstance(checkpoint, ExternalFilter):  # which run together
+            raise
+        failed = len(rows) if indices is None else indices[len(rows)]
+        raise BadInput(f"{error} (healthy episode {failed})") from None
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     return HealthyProfile(data, len(rows), particles, columns, sensors.reference)

@@ -60,12 +60,14 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
         episodes = [data[index] for index in arguments["episodes"]]
         is_sample = arguments["data"] not in store.settings.data
         images = included_reference(checkpoint.task) if is_sample else None  # of the same camera
+        sensors = sensor_record(episodes, images)
         profile = profile_of(
             checkpoint,
             episodes,
             f"{len(episodes)} held-out episodes of {arguments['data']}",
-            sensor_record(episodes, images),
-            progress=lambda share: report(share, "running the filter over the clean episodes"),
+            sensors,
+            lambda share: report(0.5 + 0.5 * share, "running the filter over the healthy episodes"),
+            arguments["episodes"],
         )
         store.healthy_records.put(checkpoint.hash, profile.to_json())
     return {"data": profile.data}

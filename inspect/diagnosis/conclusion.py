@@ -43,10 +43,11 @@ def healthy(case: Case) -> Diagnosis:
 
 def _miscalibration(profile: HealthyProfile) -> str:
     """What a comparison with the record cannot show: that the filter has never been consistent."""
-    nees = float(np.nanmean(profile.statistics.get("nees/fused/all", [np.nan])))
-    if not np.isfinite(nees) or 1 / MAX_NEES <= nees <= MAX_NEES:
+    values = profile.statistics.get("nees/fused/all", np.empty(0))
+    values = values[np.isfinite(values)]
+    if not len(values) or 1 / MAX_NEES <= (nees := float(np.median(values))) <= MAX_NEES:
         return ""
-    return f", whose NEES is {nees:.2g} instead of 1: the filter is always {'over' if nees > 1 else 'under'}confident"
+    return f", whose median NEES is {nees:.2g} instead of 1: the filter is {'over' if nees > 1 else 'under'}confident"
 
 
 def statistics_by_subject(case: Case) -> dict[str, int]:
@@ -175,6 +176,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "checkpoint_hash": checkpoint.hash,
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
+        "healthy_data": case.profile.data,
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers),
         "alarm_rate": case.alarm_rate,

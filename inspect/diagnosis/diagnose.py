@@ -7,6 +7,7 @@ with the same random numbers. The right undo restores the healthy statistics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -77,13 +78,14 @@ def diagnose(
         engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
         progress: called with the completed fraction.
 
-    Raises BadInput without episodes, without a healthy profile, for episodes of another task, and for several workers
-    with an external filter that has no build function.
+    Raises BadInput without episodes, without a healthy profile or with too small a one, for episodes of another task,
+    and for several workers with an external filter that has no build function.
     """
     report = progress or (lambda fraction: None)
     if not episodes:
         raise BadInput("no episodes to diagnose")
     profile = profile or required_profile(checkpoint)
+    _check_size(profile, len(episodes), alarm_rate)
     items = list(episodes.items())
     blocks = [items[i : i + BLOCK] for i in range(0, len(items), BLOCK)]
     observed: dict[int, Observed] = {}
@@ -138,7 +140,7 @@ def preliminary(
 ) -> Diagnosis:
     """The diagnosis of one run before any cause is undone, within a fraction of a second; final if it is healthy.
 
-    Raises BadInput without a healthy profile.
+    Raises BadInput without a healthy profile, or with too small a one.
     """
     case = _examined(checkpoint, [trace], particles, required_profile(checkpoint), alarm_rate)
     return conclude(case, case, explain_all(case), None) if case.alarms else healthy(case)
@@ -147,9 +149,20 @@ def preliminary(
 def _examined(
     checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
+    _check_size(profile, len(traces), alarm_rate)
     rows, sensors = zip(*(observe(trace, checkpoint, profile) for trace in traces), strict=True)
     setting = _setting(checkpoint, traces, particles, profile)
     return compared(setting, traces, rows, sensors, profile, alarm_rate)
+
+
+def _check_size(profile: HealthyProfile, count: int, alarm_rate: float) -> None:
+    """A single episode has a p-value of at least 1 / (N + 1). Raises BadInput if no alarm is possible."""
+    if count == 1 and 1 / (profile.episodes + 1) > alarm_rate:
+        raise BadInput(
+            f"a healthy record of {profile.episodes} episodes cannot show a fault in a single one: an alarm rate of "
+            f"{alarm_rate:g} needs {math.ceil(1 / alarm_rate) - 1}; diagnose several episodes, or measure the record "
+            "from more"
+        )
 
 
 def _setting(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> Setting:

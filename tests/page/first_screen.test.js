@@ -74,6 +74,11 @@ test('a weight that does not react to an outage stays, although the image is los
   assert.match(outageFinding(slight, 0)?.headline ?? '', /in contact, until the image returns/);
 });
 
+test('an outage of the camera is no finding of a filter without it', () => {
+  assert.equal(outageFinding({ ...run(14), modalities: ['haptics'] }, 0), null);
+  assert.notEqual(outageFinding({ ...run(14), modalities: ['image+haptics'] }, 0), null);
+});
+
 test('short outages and those in free motion are no finding', () => {
   assert.equal(outageFinding(run(11), 0), null);
   assert.equal(outageFinding(run(14, 9), 0), null);

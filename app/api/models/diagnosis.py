@@ -49,6 +49,7 @@ class Diagnosis(Reply):
     checkpoint_hash: str
     episodes: int
     healthy_episodes: int
+    healthy_data: str = ""
     statistics: dict[str, int]
     unmeasured: list[str]
     alarm_rate: float

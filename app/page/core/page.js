@@ -305,6 +305,7 @@ export class Page {
       const text = showError(error);
       this.scene.failure = text;
       this.finding.fail(text);
+      this.diagnosis.fail(text);
     }
   }
 

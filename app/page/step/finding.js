@@ -112,6 +112,8 @@ function worstFinding(trace, component) {
  * @returns {Omit<Finding, 'tone'> | null}
  */
 export function outageFinding(trace, component) {
+  const { modalities } = trace;
+  if (modalities.length && !modalities.some((name) => name.includes('image'))) return null;
   const outage = intervals(trace.blackout).find(
     ([first, last]) => first && trace.contact[first] && last - first >= MIN_STEPS - 1,
   );

@@ -46,6 +46,7 @@ export class Diagnosis {
   /** @type {Set<string>} keys of records after which the run was loaded again */
   #announced = new Set();
   #loading = new AbortController();
+  #failure = ''; // why there is no run
   #open = false;
   /** @type {Result | null | undefined} */
   #listed; // result whose causes are listed
@@ -83,9 +84,19 @@ export class Diagnosis {
   /** @param {Trace | null} trace null while another one is loading */
   show(trace) {
     this.#trace = trace;
+    this.#failure = '';
     this.#repair.clear();
     this.#loading.abort();
     this.load();
+  }
+
+  /**
+   * Shows why there is no run.
+   * @param {string} reason
+   */
+  fail(reason) {
+    this.#failure = reason;
+    this.#draw();
   }
 
   /** Loads the diagnosis of the selected run, or a preliminary one and the state of its job, which it starts. */
@@ -131,6 +142,7 @@ export class Diagnosis {
 
   /** @returns {Entry} */
   get #entry() {
+    if (this.#failure) return { state: 'error', error: this.#failure };
     if (this.#trace?.live) return { state: 'live' };
     return this.#results.get(this.#key);
   }
@@ -163,7 +175,7 @@ export class Diagnosis {
       ? `Preliminary, from episode ${episode} alone and before any cause is undone. ${state}`
       : '';
     showJobButton(html('.doing', this.#host), entry, {
-      action: ACTIONS[entry.state] ?? '',
+      action: this.#trace ? (ACTIONS[entry.state] ?? '') : '',
       progress: 'Progress of the diagnosis',
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
@@ -189,10 +201,14 @@ export class Diagnosis {
     this.#host.dataset.finding = '';
     this.#host.ariaBusy = String(entry.state === 'active');
     choice(html('.choice', this.#host), [], '', () => {});
-    this.#writeHeadline(sentence(reason));
+    const isReady = entry.state === 'ready'; // the run is loading again
+    this.#writeHeadline(isReady ? 'Loading …' : sentence(reason));
     const { data } = trace.selection;
     const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them.`;
-    html('.status', this.#host).textContent = this.#starts ? stateOf(entry) || about : '';
+    const state = this.#starts
+      ? stateOf(entry) || about
+      : 'A server that is not read-only can measure it.';
+    html('.status', this.#host).textContent = isReady ? '' : state;
     showJobButton(html('.doing', this.#host), entry, {
       action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
       progress: 'Progress of the healthy record',
@@ -278,6 +294,7 @@ function stateOf(entry) {
 function aboutOf({
   episodes,
   healthy_episodes: healthy,
+  healthy_data: source,
   alarm_rate: rate,
   statistics,
   unmeasured,
@@ -289,7 +306,7 @@ function aboutOf({
   const listed = unmeasured.slice(0, LISTED).join('; ');
   const more = unmeasured.length > LISTED ? `; and ${unmeasured.length - LISTED} more` : '';
   const missing = listed && ` Not measured: ${listed}${more}.`;
-  return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.${missing}`;
+  return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.${missing}${source ? ` Healthy record: ${source}.` : ''}`;
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */

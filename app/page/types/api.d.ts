@@ -170,6 +170,11 @@ export interface components {
             episodes: number;
             /** Healthy Episodes */
             healthy_episodes: number;
+            /**
+             * Healthy Data
+             * @default
+             */
+            healthy_data: string;
             /** Statistics */
             statistics: {
                 [key: string]: number;

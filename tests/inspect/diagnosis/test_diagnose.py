@@ -61,15 +61,15 @@ def test_clean_episodes_are_healthy() -> None:
 @pytest.mark.parametrize(
     ("nees", "end"),
     [
-        (4.0, "whose NEES is 4 instead of 1: the filter is always overconfident."),
-        (0.2, "whose NEES is 0.2 instead of 1: the filter is always underconfident."),
+        (4.0, "whose median NEES is 4 instead of 1: the filter is overconfident."),
+        (0.2, "whose median NEES is 0.2 instead of 1: the filter is underconfident."),
         (1.3, "44 healthy episodes."),
     ],
 )
 def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, end: str) -> None:
     """A filter whose covariance has always been too small does not deviate from its own record."""
     name = "nees/fused/all"
-    record = HealthyProfile("test", 44, None, {name: nees * np.linspace(0.9, 1.1, 44)})
+    record = HealthyProfile("test", 44, None, {name: np.append(nees * np.linspace(0.9, 1.1, 43), 500.0)})
     case = compared(Setting(checkpoint(), {}, 300, frozenset()), [], [{name: nees}] * 2, [{}] * 2, record, 0.05)
     assert healthy(case).headline.endswith(end)
 
@@ -224,6 +224,15 @@ def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
         diagnose(checkpoint(), {}, profile=profile())
     with pytest.raises(BadInput, match="no healthy record"):
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
+
+
+def test_a_small_record_judges_several_episodes_and_not_one() -> None:
+    """One of N + 1 episodes is the most unusual one with probability 1 / (N + 1)."""
+    small = replace(profile(), statistics={k: v[:12] for k, v in profile().statistics.items()}, episodes=12)
+    black = faulty("blackout=0.9")
+    with pytest.raises(BadInput, match=r"12 episodes cannot show a fault in a single one: .* of 0\.02 needs 49;"):
+        diagnose(checkpoint(), {100: next(iter(black.values()))}, profile=small)
+    assert diagnose(checkpoint(), black, profile=small).state != "healthy"
 
 
 def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
