@@ -37,8 +37,8 @@ MAX_NEES = 2.0
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
-    text = f"Healthy: all {count} statistics are within the record of {record} healthy episodes"
-    return Diagnosis("healthy", False, f"{text}{_miscalibration(case.profile)}.", (), _provenance(case))
+    text = f"all {count} statistics are within the record of {record} healthy episodes."
+    return Diagnosis("healthy", False, f"Healthy{_miscalibration(case.profile)}: {text}", (), _provenance(case))
 
 
 def _miscalibration(profile: HealthyProfile) -> str:
@@ -47,7 +47,7 @@ def _miscalibration(profile: HealthyProfile) -> str:
     values = values[np.isfinite(values)]
     if not len(values) or 1 / MAX_NEES <= (nees := float(np.median(values))) <= MAX_NEES:
         return ""
-    return f", whose median NEES is {nees:.2g} instead of 1: the filter is {'over' if nees > 1 else 'under'}confident"
+    return f", though {'over' if nees > 1 else 'under'}confident (median NEES {nees:.2g})"
 
 
 def statistics_by_subject(case: Case) -> dict[str, int]:

@@ -274,7 +274,7 @@ def test_the_diagnosis_is_that_of_the_traces_and_links_to_its_moment(checkpoint:
 def test_the_diagnosis_comes_first(report: Path) -> None:
     text = (report / "report.html").read_text()
     headline = json.loads((report / "manifest.json").read_text())["diagnosis"]
-    assert headline.startswith("Healthy: ")
+    assert headline.startswith("Healthy")
     assert text.index("<h2>Diagnosis</h2>") < text.index(headline) < text.index("<h2>Verdicts</h2>")
 
 
