@@ -1,7 +1,8 @@
-"""Queue of long tasks, each in a process of its own: progress, cancellation and results in the workspace.
+"""Queue of long tasks, run in processes: progress, cancellation and results in the workspace.
 
 A job is a function listed in ``KINDS``, with JSON arguments and a JSON result; ``app/runs/worker.py`` runs it.
-Its folder ``jobs/ID`` holds ``job.json``, ``log.txt`` and, once it is done, ``result.json``.
+One process that has finished a job waits for the next one, which starts seconds sooner because all is imported.
+The folder ``jobs/ID`` of a job holds ``job.json``, ``log.txt`` and, once it is done, ``result.json``.
 """
 
 import hashlib
@@ -25,10 +26,11 @@ from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
 
 from beliefscope import __version__
 from beliefscope.app.protocol.errors import NotFound, QueueFull
-from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess
+from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess, peak_memory, redirect_output
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.io import user_code
 from beliefscope.datasets.io.atomic_write import write_atomically, write_error
 
 KINDS: dict[str, str] = {
@@ -48,6 +50,7 @@ KINDS: dict[str, str] = {
 MAX_RUNNING, MAX_WAITING, MAX_ENDED = 2, 16, 100  # jobs; the oldest ended ones are deleted
 GRACE = 3.0  # s between SIGTERM and SIGKILL
 LOG_TAIL = 8000  # bytes
+REUSED_BELOW = 1 << 30  # bytes of memory, at most, of a process that waits for the next job
 
 State = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 ACTIVE = ("waiting", "running")
@@ -109,6 +112,7 @@ class Jobs:
         self._lock = threading.RLock()
         self._executor = ThreadPoolExecutor(max_running, "job")
         self._processes: dict[str, WorkerProcess] = {}
+        self._idle: WorkerProcess | None = None
         self._stopping: dict[str, State] = {}  # job being stopped -> its final state
         self._closing = False
         self._jobs: dict[str, Job] = {}
@@ -220,6 +224,8 @@ class Jobs:
             for id in self._processes:
                 self._stop(id, "interrupted")
         self._executor.shutdown()
+        if self._idle is not None:
+            _end_process(self._idle)
 
     def _save(self, job: Job) -> None:
         write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
@@ -249,8 +255,7 @@ class Jobs:
             if job is None or job.state != "waiting":
                 return
             try:
-                with (self._folder / id / "log.txt").open("wb") as output:
-                    process = self._processes[id] = WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
+                process = self._processes[id] = self._process(self._folder / id / "log.txt")
             except OSError as error:  # deleted folder, or no memory or file descriptors left
                 self._end(job, "failed", f"it could not be started: {error.strerror or error}")
                 return
@@ -278,17 +283,31 @@ class Jobs:
                 self._jobs[id] = replace(self._jobs[id], progress=progress, message=message)
 
         call = {"function": self._kinds[self._jobs[id].kind], "folder": str(self._folder / id), "arguments": arguments}
-        with process:
-            try:
-                process.call("run_job", call, report)
-            except WorkerDied as error:
-                last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
-                return f"{error}; last output: {last_line}" if last_line else str(error)
-            except (BadInput, RuntimeError) as error:
-                return str(error)
-            finally:
-                process.signal_group(signal.SIGKILL)  # remaining subprocesses
+        reusable = False
+        try:
+            reusable = process.call("run_job", call, report)
+        except WorkerDied as error:
+            last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
+            return f"{error}; last output: {last_line}" if last_line else str(error)
+        except (BadInput, RuntimeError) as error:
+            return str(error)
+        finally:
+            with self._lock:
+                keep = reusable and self._idle is None and id not in self._stopping and not self._closing
+                if keep:
+                    self._idle = process
+            if not keep:
+                _end_process(process)
         return ""
+
+    def _process(self, log: Path) -> WorkerProcess:
+        """The waiting process, or a new one; its printed text goes to the file."""
+        log.touch()
+        process, self._idle = self._idle, None
+        if process is not None and process.poll() is None:
+            return process
+        with log.open("wb") as output:
+            return WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
 
     def _stop(self, id: str, state: State) -> None:
         if id in self._stopping:
@@ -299,11 +318,16 @@ class Jobs:
         threading.Thread(target=_kill_after_grace, args=(process,), name=f"stopping job {id}", daemon=True).start()
 
 
-def run_job(arguments: Mapping[str, Any], report: Report) -> None:
-    """Run the function of a job in its process and write the result."""
+def run_job(arguments: Mapping[str, Any], report: Report) -> bool:
+    """Run the function of a job in its process and write the result.
+
+    Returns whether the process may run another job: not after user code, which may have changed by then.
+    """
+    folder = Path(arguments["folder"])
+    redirect_output(folder / "log.txt")
     result = resolve_name(arguments["function"])(arguments["arguments"], report)
-    path = Path(arguments["folder"]) / "result.json"
-    write_atomically(path, json.dumps(result, allow_nan=False).encode())
+    write_atomically(folder / "result.json", json.dumps(result, allow_nan=False).encode())
+    return not user_code.has_run() and peak_memory() < REUSED_BELOW
 
 
 def _id(kind: str, key: object) -> str:
@@ -332,6 +356,11 @@ def _is_other_process(pid: int) -> bool:
     except PermissionError:
         pass
     return True
+
+
+def _end_process(process: WorkerProcess) -> None:
+    with process:  # closes its pipes
+        process.signal_group(signal.SIGKILL)  # with remaining subprocesses
 
 
 def _kill_after_grace(process: WorkerProcess) -> None:

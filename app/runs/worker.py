@@ -8,6 +8,7 @@ outcome. Printed text goes to standard error.
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, TextIO
 
@@ -98,6 +100,19 @@ def main(module: str) -> None:
     while True:
         name, arguments = json.loads(calls.get())
         output.write(json.dumps(_outcome(getattr(functions, name), arguments, output)) + "\n")
+
+
+def redirect_output(path: Path) -> None:
+    """Append the printed text of this process to a file from now on."""
+    with path.open("ab") as file:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+            os.dup2(file.fileno(), stream.fileno())
+
+
+def peak_memory() -> int:
+    """The most memory that this process has held, bytes. macOS counts in bytes, Linux in KiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _read_calls(calls: SimpleQueue[str]) -> None:

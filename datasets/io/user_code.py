@@ -13,9 +13,17 @@ from types import CodeType, ModuleType
 
 from beliefscope.datasets.errors import BadInput
 
+_places: set[str] = set()
+
+
+def has_run() -> bool:
+    """Whether this process has loaded user code."""
+    return bool(_places)
+
 
 def load_module(place: str) -> ModuleType:
     """Run a file or import a module. Raises BadInput if it does not exist or fails."""
+    _places.add(place)
     return _run_file(Path(place)) if place.endswith(".py") else _import(place)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.user_code import load_module
 
 
 def add(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
@@ -49,6 +50,12 @@ def refuse(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
 
 def not_json(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
     return {"value": float("nan")}
+
+
+def load(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Run a file of user code."""
+    print(load_module(arguments["place"]).VALUE)
+    return {}
 
 
 def exhaust_memory(arguments: dict[str, Any], report: Report) -> dict[str, Any]:

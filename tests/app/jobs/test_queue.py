@@ -23,7 +23,8 @@ from beliefscope.datasets.errors import BadInput
 
 pytestmark = pytest.mark.slow
 
-TEST_KINDS = {name: f"job_functions:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "not_json")}
+FUNCTIONS = ("add", "wait", "crash", "vanish", "refuse", "not_json", "load")
+TEST_KINDS = {name: f"job_functions:{name}" for name in FUNCTIONS}
 TIMEOUT = 60.0  # s
 
 OpenJobs = Callable[..., Jobs]
@@ -98,6 +99,27 @@ def test_result_is_stored_and_reused(open_jobs: OpenJobs) -> None:
     assert jobs.find("add", "one to three") == done
     assert jobs.find("add", "one to four") is None
     assert jobs.submit("add", "Add", {"numbers": [4]}, "one to four").id != job.id
+
+
+def test_a_process_is_reused_but_not_after_an_error_or_user_code(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs()
+    code = tmp_path / "user.py"
+    code.write_text("VALUE = 5")
+
+    def run(kind: str, key: str, **arguments: object) -> tuple[int | None, str]:
+        """Process that waits after the job, and the output of the job."""
+        id = wait_for(jobs, jobs.submit(kind, kind, {"numbers": [], **arguments}, key).id).id
+        return jobs._idle and jobs._idle.pid, jobs.log(id)
+
+    first, log = run("add", "a")
+    assert first
+    assert log == "adding\n"
+    assert run("add", "b") == (first, "adding\n")
+    waiting, log = run("crash", "")
+    assert waiting is None
+    assert log.startswith("about to divide\nTraceback")
+    assert run("add", "c")[0] not in (None, first)
+    assert run("load", "", place=str(code)) == (None, "5\n")
 
 
 def test_progress_and_cancellation(open_jobs: OpenJobs, tmp_path: Path) -> None:
