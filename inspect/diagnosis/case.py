@@ -82,7 +82,7 @@ def compared(
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
     scattered, grouped = with_scatter(profile, rows)
-    comparison = compare(scattered, grouped)
+    comparison = compare(scattered, grouped, task=setting.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
     return Case(setting, traces, rows, sensors, grouped, profile, deviations, comparison.p_value, alarm_rate)
 

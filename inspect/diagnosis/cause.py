@@ -103,16 +103,18 @@ class Recovery:
     """Effect of undoing a cause on the filter, by replay with the same random numbers.
 
     Attributes:
-        error: share of the position error that the undo removes; NaN without ground truth.
+        error: share of the error that the undo removes; NaN without ground truth.
         low, high: 95 % interval over episodes; NaN for too few of them.
         nll: decrease of the negative log-likelihood by step, in nats: of the true state; without ground truth, of the
             virtual observations.
+        measure: the error, such as ``position`` or ``angle``: the one of which most is removed.
     """
 
     error: float
     low: float
     high: float
     nll: float
+    measure: str
 
 
 @dataclass(frozen=True)
@@ -217,6 +219,6 @@ def _share(recovery: Recovery | None) -> str:
     if recovery is None or math.isnan(recovery.error):
         return ""
     share = f"{100 * recovery.error:.0f} %"
-    if math.isnan(recovery.low):  # a single episode has no interval
-        return share
-    return f"{share} ({100 * recovery.low:.0f} to {100 * recovery.high:.0f})"
+    if not math.isnan(recovery.low):  # a single episode has no interval
+        share += f" ({100 * recovery.low:.0f} to {100 * recovery.high:.0f})"
+    return f"{share} of {recovery.measure}"

@@ -15,8 +15,9 @@ from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evi
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
-from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, label_of
+from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.diagnostics.statistic_kinds import label_of
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""

@@ -36,14 +36,22 @@ def replay_without(
 
 
 def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
-    """Effect of an undone cause: share of the RMS position error that it removes, and the decrease of the NLL."""
+    """Effect of an undone cause: share of an RMS error that it removes, and the decrease of the NLL.
+
+    Of the main error and those of the other components, the one of which most is removed: a fault may concern one only.
+    """
     nll = float(np.mean([negative_log_likelihood(trace) for trace in before]))
     nll -= float(np.mean([negative_log_likelihood(trace) for trace in after]))
-    sums = np.array([[_squared_error(a), _squared_error(b)] for a, b in zip(before, after, strict=True)])
+    task = before[0].task
+    others = [i for i in range(len(task.components)) if i not in task.main_error.indices]
+    names = [task.main_error.name, *(task.components[i].label for i in others)]
+    columns = [0, *(1 + i for i in others)]
+    sums = np.array([[_squared_errors(trace)[columns] for trace in pair] for pair in zip(before, after, strict=True)])
     if not np.isfinite(sums).all():
-        return Recovery(np.nan, np.nan, np.nan, nll)
-    share, low, high = jackknife(sums, _removed)
-    return Recovery(float(share), float(low), float(high), nll)
+        return Recovery(np.nan, np.nan, np.nan, nll, names[0])
+    k = int(np.argmax(_removed(sums.sum(0).T)))
+    share, low, high = jackknife(sums[..., k], _removed)
+    return Recovery(float(share), float(low), float(high), nll, names[k])
 
 
 def negative_log_likelihood(trace: Trace) -> float:
@@ -66,9 +74,10 @@ def _gaussian_nll(error: Array, covariance: Array) -> Array:
     return np.asarray(0.5 * (squared + np.linalg.slogdet(covariance).logabsdet + n * np.log(2.0 * np.pi)))
 
 
-def _squared_error(trace: Trace) -> float:
-    """m^2: sum over the counted steps."""
-    return float(np.square(measures.main_error(trace)[measures.counted(trace), -1]).sum())
+def _squared_errors(trace: Trace) -> Array:
+    """(1 + n,) SI: sums over the counted steps of the squared main error and those of the components."""
+    error = measures.with_main(trace.task, measures.errors(trace)[measures.counted(trace), -1])
+    return np.asarray(np.square(error).sum(0))
 
 
 def _removed(sums: Array) -> Array:

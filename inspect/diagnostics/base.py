@@ -126,4 +126,4 @@ class Entry:
         profile = find_profile(first.task.name, first.filter, first.checkpoint_hash, checkpoint)
         if self.statistics is None or profile is None:
             return None
-        return compare(profile, [self.statistics(trace) for trace in traces])
+        return compare(profile, [self.statistics(trace) for trace in traces], task=traces[0].task)

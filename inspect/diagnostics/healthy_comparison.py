@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import display_name
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile
+from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LEVER, RISING, label_of, unit_of
 from beliefscope.inspect.diagnostics.views import Table
 
 SIGNIFICANCE = 0.01
@@ -43,114 +44,6 @@ MIN_HEALTHY = 10
 MIN_EFFECT = 0.5
 """Minimum difference of an alarm, in standard deviations between healthy trajectories."""
 
-KINDS = {
-    "nees": ("NEES/n", True, 0.05),
-    "nis": ("NIS/n", True, 0.05),
-    "autocorrelation": ("autocorrelation at lag 1 of the innovations", False, 0.02),
-    "beta": ("beta", False, 0.01),
-    "weight": ("effective weight", False, 0.01),
-    "regret": ("error relative to the oracle's weights", True, 0.02),
-    "ess": ("effective sample size", True, 0.05),
-    "error": ("RMS position error", True, 0.02),
-    "angle error": ("RMS error of angles in rad", True, 0.02),
-    "module bias": ("bias of the measurement model", False, 5e-4),
-    "module error": ("error of the measurement model", True, 0.02),
-    "module std": ("predicted standard deviation of the measurement model", True, 0.02),
-    "module power": ("sharpness of the measurement model", True, 0.02),
-    "module nis": ("squared error over predicted variance of the measurement model", True, 0.05),
-    "module spread": ("standard deviation of the error of the measurement model", True, 0.02),
-    "module scatter": ("variation of the bias between episodes of the measurement model", True, 0.05),
-    "dynamics bias": ("bias of the dynamics model", False, 2e-5),
-    "dynamics error": ("error of the dynamics model", True, 0.02),
-    "dynamics nis": ("squared error over process noise of the dynamics model", True, 0.05),
-    "dynamics slope": ("slope of the predicted on the true change", False, 0.02),
-    "dynamics spread": ("error beyond bias and slope of the dynamics model", True, 0.02),
-    "process noise": ("process noise", True, 0.02),
-    "beta logit": ("log-odds of beta", False, 0.05),
-    "beta spread": ("variation of the log-odds of beta", True, 0.05),
-    "beta contact": ("change of the log-odds of beta with contact", False, 0.02),
-    "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
-    "fusion variance": ("log-ratio of the used variance to that of the fusion rule", False, 0.02),
-    "fusion mean": ("distance of the estimate from the fusion rule", True, 1.0),
-    "prior ess": ("effective sample size after resampling", False, 0.01),
-    "particles": ("number of particles", True, 0.02),
-    "ancestors": ("share of particles with offspring", False, 0.01),
-    "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
-    "outside": ("share of steps with the true state outside of the particles", False, 0.01),
-    "black": ("share of lost readings", False, 0.02),
-    "frozen": ("share of repeated readings", False, 0.02),
-    "sharpness": ("sharpness", True, 0.05),
-    "brightness": ("exposure{of} relative to healthy images", True, 0.03),
-    "occlusion": ("share of occluded pixels", False, 0.01),
-    "shift": ("shift in pixels", False, 0.2),
-    "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
-    "hand offset": ("distance in pixels of the hand in the image from its measured position{axis}", False, 0.1),
-    "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
-    "object offset": ("distance in pixels of the object in the image from its labelled position{axis}", False, 0.1),
-    "object match": ("similarity of the object in the image to healthy images{axis}", True, 0.05),
-    "contact distance": (
-        "distance in m of the hand from the labelled object beyond healthy ones{axis}",
-        False,
-        5e-4,
-    ),
-    "contact distance error": ("deviation in m of the hand from the labelled object{axis}", False, 5e-4),
-    "contact distance scatter": (
-        "variation in m of the hand's deviation between episodes{axis}",
-        False,
-        5e-4,
-    ),
-    "offset": ("offset{of} from the measured hand or the estimates (m, rad)", False, 0.002),
-    "level": ("level", False, 0.15),
-    "drift": ("drift", False, 0.01),
-    "change": ("second difference", False, 0.05),
-    "noise": ("noise", False, 0.02),
-    "position noise": ("noise in m", False, 5e-4),
-    "stuck": ("share of repeated readings", False, 0.02),
-    "saturation": ("share of saturated readings", False, 0.01),
-    "share": ("share of steps with the flag{of}", False, 0.02),
-    "toggles": ("share of steps at which the flag{of} changes", False, 0.01),
-    "agreement": ("correlation{of} with the force", False, 0.05),
-    "opposition": ("negative correlation{of} with the force", False, 0.05),
-    "unflagged force": ("force in N without the flag{of}", True, 0.2),
-    "size": ("standard deviation", True, 0.1),
-    "lever": ("lever in m of the torque{axis}", False, 0.01),
-    "axes": ("evidence for the order of the axes", False, 0.3),
-    "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),
-    "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
-}
-"""Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
-standard deviation between trajectories, below which differences are irrelevant. A name may have a place ``{of}`` for
-the statistic's subject, or ``{axis}`` for its axis only, if they are not at its end."""
-
-UNITS = {"force": "N", "torque": "N m", "image": "gray levels"}
-"""Units of the readings of sensors that all simulated tasks have."""
-
-IN_UNITS = {"level": "", "drift": "/s", "change": "", "noise": "", "size": ""}
-"""Kinds of statistics in the units of the readings -> what follows these."""
-
-LEVER = 0.1
-"""m: smallest standard deviation of a torque (N m) relative to that of a force (N)."""
-
-PHASES = {
-    "all": ("", ""),
-    "extreme": ("most extreme ", " over 20 steps"),
-    "range": ("range of the ", " over windows of 20 steps"),
-}
-"""Phase of a statistic -> how its label begins and ends; others are phases of the task."""
-
-RISING = frozenset(
-    {"error", "angle error", "regret", "outside", "black", "frozen", "stuck", "saturation", "occlusion", "change"}
-    | {
-        "opposition",
-        "contact distance error",
-        "contact distance scatter",
-        "module error",
-        "module scatter",
-        "dynamics error",
-    }
-)
-"""Kinds of statistics whose decrease is no sign of a fault."""
-
 
 @dataclass(frozen=True)
 class Deviation:
@@ -163,6 +56,7 @@ class Deviation:
         p_value: probability of a deviation of this size in any statistic, if the trajectories are healthy.
         alarm: whether it is significant and at least ``MIN_EFFECT``.
         t: difference of the means over its standard error; of ``with_critical_values``, relative to its critical value.
+        unit, factor: for display, and the factor from the unit of the values.
     """
 
     statistic: str
@@ -173,6 +67,8 @@ class Deviation:
     p_value: float
     alarm: bool
     t: float
+    unit: str = ""
+    factor: float = 1.0
 
     @property
     def label(self) -> str:
@@ -181,22 +77,10 @@ class Deviation:
 
     @property
     def text(self) -> str:
-        """Label, value and healthy range."""
-        numbers = (_number(x) for x in (self.value, self.healthy, self.low, self.high))
-        return "{} is {}, healthy {} ({} to {})".format(self.label, *numbers)
-
-
-def label_of(statistic: str) -> str:
-    """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``."""
-    kind, subject, phase = statistic.split("/")
-    title = KINDS[kind][0] if kind in KINDS else kind
-    if kind in IN_UNITS and (unit := UNITS.get(subject.partition(" ")[0])):
-        title += f" in {unit}{IN_UNITS[kind]}"
-    name, _, axis = subject.partition(" ")
-    of, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
-    title = title.format(of=of + axis, axis=axis) if "{" in title else title + of + axis
-    before, after = PHASES.get(phase, ("", f" in {phase}"))
-    return f"{before}{title}{after}"
+        """Label, value and healthy range, in the unit for display."""
+        value, healthy, low, high = (_number(self.factor * x) for x in (self.value, self.healthy, self.low, self.high))
+        unit = self.unit and f" {self.unit}"
+        return f"{self.label} is {value}{unit}, healthy {healthy}{unit} ({low} to {high})"
 
 
 @dataclass(frozen=True)
@@ -243,17 +127,27 @@ class Comparison:
         verdict = "alarm" if self.trajectories > 1 else "unusual"
         columns = ("statistic", "value", "healthy", "95 % range from", "to", "p-value", verdict)
         rows = tuple(
-            (d.label, d.value, d.healthy, d.low, d.high, d.p_value, "yes" if d.alarm else "") for d in self.deviations
+            (
+                with_unit(d.label, d.unit),
+                *(d.factor * value for value in (d.value, d.healthy, d.low, d.high)),
+                d.p_value,
+                "yes" if d.alarm else "",
+            )
+            for d in self.deviations
         )
         return Table("Comparison with the healthy record", columns, rows)
 
 
-def compare(profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]], seed: int = 0) -> Comparison:
+def compare(
+    profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]], seed: int = 0, task: Task | None = None
+) -> Comparison:
     """Compare trajectory statistics with those of a profile; statistics that only one of them has are omitted.
 
     Max-T test of Westfall and Young: in a division of all trajectories into n and the others, each statistic has a
     t-value, the difference of the means over its standard error, with the spread of the others. ``p_value`` is the
     share of divisions whose largest absolute t is at least that of the statistic.
+
+    task: gives the units of the deviations.
     """
     names = [name for name in profile.statistics if any(name in values for values in trajectories)]
     count = len(trajectories)
@@ -279,7 +173,7 @@ def compare(profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]]
     mean, healthy = np.nanmean(values[:count], axis=0), np.nanmean(values[count:], axis=0)
     columns = [column.tolist() for column in (mean, healthy, low, high, p_value, alarm, t[0])]
     rows: Iterable[tuple[Any, ...]] = zip(names, *columns, strict=True)
-    deviations = [Deviation(*row) for row in rows]
+    deviations = [Deviation(*row, *(unit_of(row[0], task) if task else ())) for row in rows]
     order = np.argsort(-np.abs(t[0]), kind="stable")
     relative = (np.abs(t) / _own_scale(t[1:], t, count == 1)).max(1)
     extreme = int((relative[1:] * (1.0 + 1e-9) >= relative[0]).sum())

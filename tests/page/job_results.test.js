@@ -67,7 +67,16 @@ test('an error is kept, an aborted request is not, and the oldest result is drop
 });
 
 test('the effect of undoing a cause has a direction and no sign', () => {
-  const effect = { error: null, low: null, high: null };
+  const effect = { error: null, low: null, high: null, measure: 'position' };
   assert.match(recoveredText({ ...effect, nll: -0.154 }), /increases by 0\.15 nats/);
   assert.match(recoveredText({ ...effect, nll: 0.154 }), /decreases by 0\.15 nats/);
+  const angle = { error: 0.6, low: 0.5, high: 0.7, nll: 1, measure: 'angle' };
+  assert.match(
+    recoveredText(angle),
+    /^Undoing it recovers 60 % \(50 % to 70 %\) of the angle error;/,
+  );
+  assert.match(
+    recoveredText({ ...angle, error: -0.2 }),
+    /^Undoing it increases the angle error by 20 %;/,
+  );
 });

@@ -310,14 +310,15 @@ function aboutOf({
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */
-export function recoveredText({ error, low, high, nll }) {
+export function recoveredText({ error, low, high, nll, measure }) {
   const change = (nll ?? 0) < 0 ? 'increases' : 'decreases';
   const size = nll === null ? '?' : fixed(Math.abs(nll), 2);
   const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
   if (error === null) return `If undone, ${likelihood}.`;
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
-  if (error < 0) return `Undoing it increases the error by ${percent(-error)}; ${likelihood}.`;
-  return `Undoing it recovers ${percent(error)}${range} of the error; ${likelihood}.`;
+  if (error < 0)
+    return `Undoing it increases the ${measure} error by ${percent(-error)}; ${likelihood}.`;
+  return `Undoing it recovers ${percent(error)}${range} of the ${measure} error; ${likelihood}.`;
 }
 
 /**

@@ -250,6 +250,8 @@ export interface components {
             high: number | null;
             /** Nll */
             nll: number | null;
+            /** Measure */
+            measure: string;
         };
         /**
          * DiagnosticInfo

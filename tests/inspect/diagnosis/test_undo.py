@@ -308,6 +308,21 @@ def test_recovery_compares_runs() -> None:
     assert better.nll > 0.0
 
 
+def test_recovery_is_of_the_error_that_falls_most() -> None:
+    after = traces(setting(checkpoint("crossmodal-ekf")))
+
+    def moved(trace: Trace, component: int) -> Trace:
+        """An estimate that is 0.1 m or rad more wrong."""
+        truth, mean = trace.episode.states, trace.estimate_mean.copy()
+        mean[:, component] += 0.1 * np.where(mean[:, component] > truth[:, component], 1, -1)
+        return replace(trace, estimate_mean=mean)
+
+    for component, measure in enumerate(("position", "position", "angle")):
+        result = recovery([moved(trace, component) for trace in after], after)
+        assert result.measure == measure
+        assert result.error > 0.5
+
+
 def test_without_ground_truth_the_innovations_are_compared() -> None:
     (trace, *_) = traces(setting(checkpoint("crossmodal-ekf")))
     unknown = replace(trace, episode=replace(trace.episode, states=np.full_like(trace.episode.states, np.nan)))

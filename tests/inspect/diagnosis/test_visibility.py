@@ -22,7 +22,7 @@ def error(value: float, alarm: bool = False) -> dict[str, Deviation]:
 
 def effect(ratio: float, complete: bool) -> Effect:
     """The error with the fault is ``ratio`` times that without it."""
-    return Effect(Recovery(1.0 - 1.0 / ratio, 0.0, 0.0, 0.0), 0.0, {"error//all": ratio}, complete)
+    return Effect(Recovery(1.0 - 1.0 / ratio, 0.0, 0.0, 0.0, "position"), 0.0, {"error//all": ratio}, complete)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool
 
 @pytest.mark.parametrize(("nees", "visible"), [(3.0, True), (0.4, True), (1.5, False)])
 def test_calibration_may_change_in_both_directions(nees: float, visible: bool) -> None:
-    changed = Effect(Recovery(0.0, 0.0, 0.0, 0.0), 0.0, {"nees/fused/all": nees}, True)
+    changed = Effect(Recovery(0.0, 0.0, 0.0, 0.0, "position"), 0.0, {"nees/fused/all": nees}, True)
     assert is_visible({}, changed) is visible
 
 

@@ -1,0 +1,43 @@
+"""Names and units of the statistics of healthy profiles."""
+
+from __future__ import annotations
+
+import pytest
+
+from beliefscope.datasets.catalog import TASKS
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.diagnosis.diagnose import required_profile
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LENGTHS, OF_COMPONENTS, unit_of
+
+
+@pytest.mark.parametrize(
+    ("statistic", "unit", "factor"),
+    [
+        ("error//contact", "cm", 100.0),
+        ("angle error//all", "deg", 57.29577951308232),
+        ("module bias/image angle/all", "deg", 57.29577951308232),
+        ("module error/haptics hinge_x/all", "cm", 100.0),
+        ("dynamics bias/hinge_y/contact", "cm", 100.0),
+        ("contact distance/labels x/all", "cm", 100.0),
+        ("nees/fused/all", "", 1.0),
+        ("dynamics slope/hinge_x/all", "", 1.0),
+    ],
+)
+def test_unit(statistic: str, unit: str, factor: float) -> None:
+    assert unit_of(statistic, TASKS["door"]) == (unit, pytest.approx(factor))
+
+
+def test_kinds_with_units_exist_and_each_component_of_a_profile_has_a_unit() -> None:
+    assert set(KINDS) >= LENGTHS | OF_COMPONENTS
+    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    profile = required_profile(checkpoint)
+    names = [name for name in profile.statistics if name.split("/")[0] in OF_COMPONENTS]
+    assert len(names) > 10
+    assert all(unit_of(name, checkpoint.task)[0] for name in names)
+
+
+def test_a_deviation_is_written_in_its_unit() -> None:
+    unit, factor = unit_of("error//all", TASKS["door"])
+    deviation = Deviation("error//all", 0.05, 0.017, 0.015, 0.021, 0.01, True, 3.0, unit, factor)
+    assert deviation.text == "RMS position error is 5 cm, healthy 1.7 cm (1.5 to 2.1)"
