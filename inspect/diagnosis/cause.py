@@ -107,7 +107,7 @@ class Recovery:
         low, high: 95 % interval over episodes; NaN for too few of them.
         nll: decrease of the negative log-likelihood by step, in nats: of the true state; without ground truth, of the
             virtual observations.
-        measure: the error, such as ``position`` or ``angle``: the one of which most is removed.
+        measure: the error, such as ``position`` or ``angle``: that which falls most.
     """
 
     error: float

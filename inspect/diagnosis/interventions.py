@@ -38,7 +38,7 @@ def replay_without(
 def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
     """Effect of an undone cause: share of an RMS error that it removes, and the decrease of the NLL.
 
-    Of the main error and those of the other components, the one of which most is removed: a fault may concern one only.
+    Of the main error and those of the other components, that which falls most: a fault may concern one only.
     """
     nll = float(np.mean([negative_log_likelihood(trace) for trace in before]))
     nll -= float(np.mean([negative_log_likelihood(trace) for trace in after]))
