@@ -233,7 +233,8 @@ test('maps are as large as their panel allows, in two rows where that is larger'
   assert.equal(mapLayout(6, 1600, 200, 18).columns, 6);
   assert.equal(mapLayout(2, 10, 10, 18).side, 60);
   const { columns, side } = mapLayout(8, 500, 170, 18);
-  assert.ok(columns < 8 && side >= 100); // scrolled
+  assert.ok(columns < 8 && side >= 52); // scrolled
+  assert.equal(mapLayout(7, 570, 120, 28).columns, 7); // the last one, the fused map, is in view
 });
 
 test('the close-up contains peaks and regions', () => {

@@ -6,7 +6,7 @@ import { MARGIN } from './draw_map.js';
 
 const MIN_SIDE = 60; // px
 const MAX_COLUMNS = 4; // of one row, before two rows are tried
-const USEFUL_SIDE = 100; // px; more than four maps are not smaller: their area is scrolled instead
+const USEFUL_SIDE = 52; // px; more than four maps are not smaller: their area is scrolled instead
 export const CLOSE_UP = 4; // zoom while all maps of the run fit into it
 
 /**
