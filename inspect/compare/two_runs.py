@@ -187,7 +187,8 @@ class Comparison(Diagnostic):
         curves += both(main.factor * self.error, f"{main.title} error", main.unit)
         for i, component in enumerate(task.components):
             if i not in task.main_error.indices:
-                curves += both(factors[i] * np.abs(self.component_error[:, i]), f"{component.label} error", units[i])
+                title = f"{component.label[0].upper()}{component.label[1:]} error"
+                curves += both(factors[i] * np.abs(self.component_error[:, i]), title, units[i])
         if np.isfinite(self.nees_at).any():
             curves += both(np.sqrt(self.nees_at), CONSISTENCY, "standard deviations")
         if self.effective_weights_at is not None:
