@@ -6,6 +6,7 @@ Another job measures the healthy record of a filter that has none.
 
 import json
 import threading
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
@@ -43,7 +44,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         responses={202: {"model": DiagnosisJob | Progress}},
     )
     def get_diagnosis(selection: RequestedRun, over: Over = "episode") -> Response:
-        job = jobs.find("diagnosis", key_over_episodes(store, _arguments(store, selection, over)))
+        job = jobs.find("diagnosis", _key(store, _arguments(store, selection, over)))
         if path := jobs.finished_result(job):
             return FileResponse(path, media_type="application/json")
         first = preliminary_diagnosis(store, selection)
@@ -56,7 +57,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         arguments = _arguments(store, selection, over)
         scope = "" if over == "episode" else f"{len(arguments['episodes'])} held-out episodes"
         title, link = f"Diagnosis of {selection.describe(scope)}", _link(selection, arguments["data"], over)
-        return JobReply(job=jobs.submit("diagnosis", title, arguments, key_over_episodes(store, arguments), link))
+        return JobReply(job=jobs.submit("diagnosis", title, arguments, _key(store, arguments), link))
 
     @router.get(
         "/api/repair/{task}/{filter}/{episode}", response_model=SmallestRepair, responses={202: {"model": JobReply}}
@@ -76,20 +77,24 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     )
     def get_record(task: str, filter: str, data: str = "") -> Response:
         """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
-        if measured := store.measured_record(task, filter):
-            return JSONResponse({"data": measured})
         job = jobs.find("healthy", key_over_episodes(store, _record_arguments(store, task, filter, data)))
+        measured = store.measured_record(task, filter)
+        if measured and not (job and job.active):
+            return JSONResponse({"data": measured})
         return JSONResponse({"job": job and asdict(job)}, status_code=202)
 
     @router.post("/api/healthy-record/{task}/{filter}", status_code=202)
     def measure_record(task: str, filter: str, data: str = "") -> JobReply:
+        """Measures the healthy record of a filter, also if it was measured before."""
         arguments = _record_arguments(store, task, filter, data)
         count, name = len(arguments["episodes"]), arguments["data"]
         if count < MIN_HEALTHY:
             raise BadInput(f"{name!r} has {count} held-out episodes; a healthy record needs at least {MIN_HEALTHY}")
         title = f"Healthy record of {filter}, {task}, {count} held-out episodes of {name}"
         link = page_link(task=task, filter=filter, data=name, tab="diagnosis")
-        return JobReply(job=jobs.submit("healthy", title, arguments, key_over_episodes(store, arguments), link))
+        key = key_over_episodes(store, arguments)
+        job = jobs.submit("healthy", title, arguments, key, link, output_exists=False)  # a new job replaces the record
+        return JobReply(job=job)
 
     return router
 
@@ -105,9 +110,7 @@ def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> 
 
     Raises BadInput without a healthy profile, and InProgress.
     """
-    path = jobs.finished_result(
-        jobs.find("diagnosis", key_over_episodes(store, _arguments(store, selection, "episode")))
-    )
+    path = jobs.finished_result(jobs.find("diagnosis", _key(store, _arguments(store, selection, "episode"))))
     return preliminary_diagnosis(store, selection) if path is None else json.loads(path.read_bytes())
 
 
@@ -134,6 +137,11 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
         "faults": str(selection.faults),
         "episodes": [selection.episode, *(held_out if over == "held-out" else ())],
     }
+
+
+def _key(store: TraceStore, arguments: Mapping[str, Any]) -> object:
+    """Everything that a diagnosis depends on, given the arguments of its job."""
+    return key_over_episodes(store, arguments), store.record_version(arguments["task"], arguments["filter"])
 
 
 def _record_arguments(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:

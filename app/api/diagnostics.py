@@ -118,7 +118,7 @@ def _selections(store: TraceStore, selection: Selection, episodes: Episodes) -> 
 def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> object:
     """Everything the result depends on, including the indices of the episodes."""
     traces = [(selection.episode, store.key(selection)) for selection in selections]
-    measured = {store.measured_record(selection.task, selection.filter) for selection in selections}
+    measured = {store.record_version(selection.task, selection.filter) for selection in selections}
     return entry.name, traces, sorted(options.items()), *filter(None, measured)
 
 

@@ -46,11 +46,12 @@ def routes(jobs: Jobs) -> APIRouter:
 
 
 def key_over_episodes(store: TraceStore, arguments: Mapping[str, Any]) -> object:
-    """Everything that the result of a job over episodes of a data set depends on, given its arguments."""
+    """Everything that the result of a job over episodes of a data set depends on, given its arguments, except for a
+    healthy record of the workspace.
+    """
     task, filter_, data = (arguments[name] for name in ("task", "filter", "data"))
     hashes = store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash
     others = [value for name, value in arguments.items() if name != "settings"]  # names occur in links
-    others += filter(None, [store.measured_record(task, filter_)])
     return others, hashes, store.settings.seed, store.settings.particles
 
 

@@ -187,6 +187,11 @@ class TraceStore:
             record = self.healthy_records.get(self._catalog(task).filter(filter_).hash)
             return None if record is None else str(record.get("data"))
 
+    def record_version(self, task: str, filter_: str) -> int | None:
+        """Version of the healthy record of the workspace; None if there is none. Raises as ``checkpoint``."""
+        with self._lock:
+            return self.healthy_records.version(self._catalog(task).filter(filter_).hash)
+
     def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
         """Name and data set; the task's first for an empty name. Raises BadInput for an unknown name."""
         if name.startswith(LIVE_PREFIX):

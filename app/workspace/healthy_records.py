@@ -23,6 +23,10 @@ class HealthyRecords:
         """JSON of ``beliefscope.inspect.diagnostics.healthy_profile``; None if none was measured."""
         return self._records.get(self._path(checkpoint_hash))
 
+    def version(self, checkpoint_hash: str) -> int | None:
+        """Differs between measurements of a record; None if none was measured."""
+        return self._records.modified(self._path(checkpoint_hash))
+
     def put(self, checkpoint_hash: str, record: dict[str, Any]) -> None:
         """Write a record; replaces an earlier one."""
         self._records.put(self._path(checkpoint_hash), record)

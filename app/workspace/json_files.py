@@ -62,6 +62,10 @@ class RecordCache(Generic[T]):
             return self._records[path][1]
         return None
 
+    def modified(self, path: Path) -> int | None:
+        """Time of the file in ns if its record is valid, else None."""
+        return None if self.get(path) is None else self._records[path][0]
+
     def put(self, path: Path, record: T) -> None:
         """Write a record."""
         write_record(record, path)

@@ -51,3 +51,25 @@ def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: A
             page.until(f"() => document.querySelector('#{tab}').checkVisibility()")
     words = page.page.evaluate("document.body.innerText")
     assert " cm" not in words
+
+
+@pytest.mark.long
+def test_a_healthy_record_is_measured_and_measured_again(open_page: Any, start_server: Any, tmp_path: Path) -> None:
+    tank = runpy.run_path(str(TANK))
+    write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(60)])
+    options = ["--task", f"{TANK}:TASK", "--data", str(tmp_path / "tank.h5"), "--filter", f"{TANK}:build"]
+    page = open_page("?tab=diagnosis", url=start_server(*options).url)
+    page.page.get_by_role("button", name="Measure a healthy record").click()
+    page.until("() => document.querySelector('#diagnosis').dataset.finding === 'healthy'")
+    folder = tmp_path / "workspace" / "healthy"
+    (record,) = folder.iterdir()
+    first = record.stat().st_mtime_ns
+    again = page.page.get_by_role("button", name="Measure again")
+    again.click()
+    page.until("() => document.querySelector('#diagnosis .record progress')")
+    page.screenshot("measuring-again")
+    page.until("() => !document.querySelector('#diagnosis .record progress')")
+    again.wait_for()
+    page.until("() => document.querySelector('#diagnosis').dataset.finding === 'healthy'")
+    assert record.stat().st_mtime_ns > first
+    page.screenshot("measured-again")

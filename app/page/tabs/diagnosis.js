@@ -70,9 +70,7 @@ export class Diagnosis {
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
       finished.includes(this.#key) ? this.load() : this.#draw(),
     );
-    this.#records = new JobResults(jobs, MAX_RESULTS, (finished) =>
-      finished.includes(this.#recordKey) ? this.load() : this.#draw(),
-    );
+    this.#records = new JobResults(jobs, MAX_RESULTS, (finished) => this.#followRecords(finished));
   }
 
   /** Whether the panel is visible; nothing is requested before. */
@@ -108,6 +106,7 @@ export class Diagnosis {
     this.#repair.show(trace);
     if (trace.live) return this.#draw();
     if (trace.header.no_diagnosis) return this.#loadRecord(trace, signal);
+    this.#records.load(this.#recordKey, () => api.healthyRecord(trace.selection, signal), signal);
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
     if (this.#entry.state !== 'absent' || !this.#starts) return;
@@ -127,6 +126,18 @@ export class Diagnosis {
       return;
     this.#announced.add(key);
     this.recorded();
+  }
+
+  /**
+   * Loads the run again, with its diagnosis, after a new measurement of the healthy record of its filter.
+   * @param {string[]} finished keys of measured records
+   */
+  #followRecords(finished) {
+    if (!finished.length) return this.#draw();
+    this.#results.clear(); // diagnoses against earlier records
+    const hasDiagnosis = this.#trace && !this.#trace.header.no_diagnosis;
+    if (hasDiagnosis && finished.includes(this.#recordKey)) this.recorded();
+    else this.load();
   }
 
   get #recordKey() {
@@ -180,6 +191,7 @@ export class Diagnosis {
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
     });
+    this.#drawMeasured(result?.healthy_data);
     if (result === this.#listed) return;
     this.#listed = result;
     html('.causes', this.#host).replaceChildren(
@@ -212,12 +224,38 @@ export class Diagnosis {
     showJobButton(html('.doing', this.#host), entry, {
       action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
       progress: 'Progress of the healthy record',
-      press: () =>
-        this.#records.startOrCancel(this.#recordKey, () =>
-          api.measureHealthyRecord(trace.selection),
-        ),
+      press: () => this.#startOrCancelRecord(trace),
       next: html('.scroll', this.#host),
     });
+  }
+
+  /**
+   * Shows the action that measures a record of the workspace again; none for records stored with the checkpoint.
+   * @param {string | undefined} source episodes of the record in use
+   */
+  #drawMeasured(source) {
+    const host = html('.record', this.#host);
+    const entry = this.#records.get(this.#recordKey);
+    const isInUse = entry.state === 'ready' && entry.result.data === source;
+    const trace = this.#trace;
+    const isShown = isInUse || ['active', 'ended'].includes(entry.state);
+    host.hidden = !this.#starts || !isShown;
+    if (host.hidden || !trace) return;
+    const { data } = trace.selection;
+    const about = `The record was measured in this workspace; another measurement replaces it by the held-out episodes of ${data}, which must be healthy.`;
+    html('.verdict', host).textContent = isInUse ? about : stateOf(entry);
+    showJobButton(html('.doing', host), entry, {
+      action: entry.state === 'active' ? 'Cancel' : 'Measure again',
+      progress: 'Progress of the healthy record',
+      press: () => this.#startOrCancelRecord(trace),
+      next: html('.scroll', this.#host),
+    });
+  }
+
+  /** @param {Trace} trace */
+  #startOrCancelRecord(trace) {
+    const start = () => api.measureHealthyRecord(trace.selection);
+    this.#records.startOrCancel(this.#recordKey, start);
   }
 
   /** @param {string} text */

@@ -51,6 +51,11 @@ export class JobResults {
     this.#results.delete(key);
   }
 
+  /** Forgets all results; their jobs continue. */
+  clear() {
+    this.#results.clear();
+  }
+
   /**
    * Loads a result, unless it is known, or the state of its job.
    * @param {string} key

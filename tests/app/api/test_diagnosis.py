@@ -125,6 +125,15 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
             time.sleep(0.05)
         assert answer.json()["data"].endswith("held-out episodes of sample")
         assert "no_diagnosis" not in client.get(url).text
+        versions, jobs = [record_version(tmp_path)], [start_and_cancel(client, url)]
+        assert client.post(record).json()["job"]["state"] in ("waiting", "running")  # a measured record again
+        while (answer := client.get(record)).status_code == 202:
+            assert time.monotonic() < end + TIMEOUT
+            time.sleep(0.05)
+        versions.append(record_version(tmp_path))
+        assert versions[0] < versions[1]
+        jobs.append(start_and_cancel(client, url))
+        assert jobs[0] != jobs[1]  # the diagnosis is computed again, too
     with open_client(settings) as client:  # the record is kept in the workspace
         while (reply := client.get(url, params={"faults": FAULTS})).status_code == 202 and "progress" in reply.json():
             time.sleep(0.05)
@@ -136,6 +145,19 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
     assert required_profile(checkpoint).episodes == len(indices)
     assert checkpoint.hash == load_external("beliefscope.filters.external.hand_on_arc:build", "door").hash
     store.close()
+
+
+def start_and_cancel(client: TestClient, url: str) -> Any:
+    """Id of the job that a request starts."""
+    id = client.post(url).json()["job"]["id"]
+    client.delete(f"/api/jobs/{id}")
+    return id
+
+
+def record_version(workspace: Path) -> int:
+    """Time of the only measured record of a workspace, in ns."""
+    (record,) = (workspace / "healthy").iterdir()
+    return record.stat().st_mtime_ns
 
 
 def test_a_healthy_record_needs_ten_episodes(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
