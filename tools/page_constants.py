@@ -13,6 +13,7 @@ from typing import get_args, get_type_hints
 
 from beliefscope.app.protocol import map_format, messages
 from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.inspect.diagnosis.cause import SHOWN
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
 
 PATH = Path(__file__).parents[1] / "app" / "page" / "core" / "constants.js"
@@ -35,6 +36,7 @@ def constants() -> dict[str, tuple[str, object]]:
         "MAP_QUANTITIES": ("What likelihood maps can show, the default first.", QUANTITIES),
         "LOG_RANGE": ("Nats below its peak that a map distinguishes.", map_format.LOG_RANGE),
         "CELL_STEPS": ("Largest value of a map's cell.", map_format.LEVELS),
+        "SHOWN": ("Smallest probability of a cause of a fault that is listed.", SHOWN),
         "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),
         "VIEWPOINTS": ("Viewpoints of the 3D scene.", get_args(messages.Viewpoint)),

@@ -74,8 +74,8 @@ class Cause:
         return self.name.rpartition(".")[0]
 
 
-SHOWN = 0.005
-"""Smallest probability of a cause in tables and on the page; it is 0.01 when rounded."""
+SHOWN = 0.05
+"""Smallest probability of a cause in headlines, in tables and on the page."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,7 @@ class Diagnosis:
         masked: whether a sensor is faulty and the filter is unaffected.
         headline: one sentence.
         causes: most probable first; empty if healthy.
+        deviations: largest ones, whatever their cause; empty if healthy.
         provenance: task, filter, hash, episodes, healthy record, and what was compared and what was not.
     """
 
@@ -170,7 +171,13 @@ class Diagnosis:
     masked: bool
     headline: str
     causes: tuple[Candidate, ...]
+    deviations: tuple[Evidence, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def listed(self) -> tuple[Candidate, ...]:
+        """The causes with a probability of at least ``SHOWN``."""
+        return tuple(cause for cause in self.causes if cause.probability >= SHOWN)
 
     def _repr_html_(self) -> str:
         """Headline and tables in a notebook."""
@@ -179,28 +186,36 @@ class Diagnosis:
     def to_json(self) -> dict[str, Any]:
         """JSON values, except that numbers may be NaN."""
         head = {"state": self.state, "masked": self.masked, "headline": self.headline}
-        return head | {"causes": [candidate.to_json() for candidate in self.causes], **self.provenance}
+        causes = [candidate.to_json() for candidate in self.causes]
+        deviations = [vars(deviation) for deviation in self.deviations]
+        return head | {"causes": causes, "deviations": deviations, **self.provenance}
 
     def tables(self) -> list[Table]:
-        """The ranked causes, the evidence and next action of each, and what was not measured."""
-        causes = [cause for cause in self.causes if cause.probability >= SHOWN]
+        """The ranked causes, the evidence and next action of each, and what was not measured.
+
+        The largest deviations take the place of causes if none is listed.
+        """
+        causes = self.listed
         unmeasured = tuple((text,) for text in self.provenance.get("unmeasured", ()))
         missing = [Table("Not measured in these episodes", ("sensor or statistic",), unmeasured)] if unmeasured else []
         if not causes:
-            return missing
-        rows = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
-        tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
-        listed = [(c.cause.name, e) for c in causes for e in c.evidence]
-        timed = any(e.time is not None for _, e in listed)
-        evidence = tuple((name, e.text, e.episode, e.step, *((e.time,) if timed else ())) for name, e in listed)
-        heads = ("cause", "deviation", "episode", "step", *(("time s",) if timed else ()))
+            rows = [((), deviation) for deviation in self.deviations]
+            return [*([_evidence_table("Largest deviations", (), rows)] if rows else []), *missing]
+        ranked = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
         actions = tuple((c.cause.name, c.next) for c in causes)
         return [
-            *tables,
-            Table("Evidence", heads, evidence),
+            Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), ranked),
+            _evidence_table("Evidence", ("cause",), [((c.cause.name,), e) for c in causes for e in c.evidence]),
             Table("Next", ("cause", "action"), actions),
             *missing,
         ]
+
+
+def _evidence_table(title: str, heads: tuple[str, ...], rows: Sequence[tuple[tuple[str, ...], Evidence]]) -> Table:
+    """A table of deviations, with their times where the data have timestamps. rows: first columns, and deviation."""
+    timed = any(e.time is not None for _, e in rows)
+    values = tuple((*first, e.text, e.episode, e.step, *((e.time,) if timed else ())) for first, e in rows)
+    return Table(title, (*heads, "deviation", "episode", "step", *(("time s",) if timed else ())), values)
 
 
 def index_ranges(indices: Sequence[int]) -> str:

@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from beliefscope.datasets.task import display_name
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence
+from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
@@ -39,7 +40,7 @@ def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
     text = f"all {count} statistics are within the record of {record} healthy episodes."
-    return Diagnosis("healthy", False, f"Healthy{_miscalibration(case.profile)}: {text}", (), _provenance(case))
+    return Diagnosis("healthy", False, f"Healthy{_miscalibration(case.profile)}: {text}", (), (), _provenance(case))
 
 
 def _miscalibration(profile: HealthyProfile) -> str:
@@ -107,7 +108,8 @@ def conclude(
         case.by_statistic, effects.get(candidates[0].cause.name) if sure else None
     )
     headline = _headline(affected, candidates, masked, len(case.rows))
-    return Diagnosis(state, masked, headline, candidates, _provenance(case))
+    deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
+    return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case))
 
 
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:
@@ -138,13 +140,18 @@ def _evidence(case: Case, deviation: Deviation) -> Evidence:
 def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int) -> str:
     """The first cause, or two, with their probability; two that cannot be separated; or the largest deviation.
 
-    count: number of all episodes.
+    It names the next action unless the first cause is sure. count: number of all episodes.
     """
-    if not candidates or not candidates[0].evidence:
-        return f"Fault of unknown cause: {case.alarms[0].text}."
+    if not candidates or not candidates[0].evidence or candidates[0].probability < SHOWN:
+        sure = bool(candidates) and candidates[0].probability >= SURE
+        return (
+            f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {case.alarms[0].text}; "
+            f"try: {_search(case, count)}"
+        )
     first = candidates[0]
-    if first.probability < SURE and len(candidates) > 1 and candidates[1].probability > COMPARABLE * first.probability:
-        return f"{first.cause.title} or {_lower(candidates[1].cause.title)}, not separable; try: {first.next}"
+    similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
+    if first.probability < SURE and similar:
+        return f"{first.cause.title} or {_lower(similar[0].cause.title)}, not separable; try: {first.next}"
     since = _since(case, first)
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
@@ -152,7 +159,21 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     text = f"{title}{since}{where}, probability {first.probability:.2f}"
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
         text += f"; and {_lower(second.cause.title)}, probability {second.probability:.2f}"
-    return f"{text}; the filter is unaffected" if masked else text
+    if masked:
+        text += "; the filter is unaffected"
+    return text if first.probability >= SURE else f"{text}; try: {first.next}"
+
+
+def _search(case: Case, count: int) -> str:
+    """The next action without a probable cause. count: number of all episodes."""
+    checkpoint = case.setting.checkpoint
+    if count == 1:
+        return "Diagnose more episodes, such as all held-out ones."
+    source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
+    return (
+        "Search the data slices with large errors, in the tab Failures or by "
+        f"`beliefscope slices {checkpoint.task.name} --filter {source}`."
+    )
 
 
 def _lower(title: str) -> str:

@@ -259,7 +259,7 @@ def _diagnosis(trace: Trace, checkpoint: Checkpoint | None) -> dict[str, Any]:
             "probability": f"{candidate.probability:.2f}",
             "evidence": [{"text": e.text, "step": e.step} for e in candidate.evidence],
         }
-        for candidate in result.causes[:MOMENTS]
+        for candidate in result.listed[:MOMENTS]
     ]
     return {"headline": result.headline, "causes": causes}
 

@@ -49,6 +49,6 @@ def report_diagnosis(
         result = diagnose_traces(checkpoint, traces, seed=first.seed, particles=particles, progress=progress)
     except BadInput as error:
         return ReportedDiagnosis(None, str(error))
-    evidence = result.causes[0].evidence if result.causes else ()
+    evidence = result.listed[0].evidence if result.listed else result.deviations
     moments = [(indices.index(e.episode), e.step or 0) for e in evidence if e.episode is not None]
     return ReportedDiagnosis(result, link=link(*moments[0]) if moments else "")

@@ -42,7 +42,13 @@ const FAULT = {
   state: 'fault',
   masked: false,
   headline: 'Image frozen from step 31',
-  causes: [{ steps: [31, 100], evidence: [{ text: 'share of repeated images is 0.7', step: 33 }] }],
+  causes: [
+    {
+      probability: 0.9,
+      steps: [31, 100],
+      evidence: [{ text: 'share of repeated images is 0.7', step: 33 }],
+    },
+  ],
 };
 
 test('the finding describes the outage in contact, with weights, error and its end', () => {
@@ -123,6 +129,12 @@ test('a fault comes first, then the outage, then the largest error', () => {
   const unknown = finding(run(14), 0, { ...FAULT, state: 'unsure', causes: [] });
   assert.deepEqual([unknown.tone, unknown.step], ['warn', 10]);
   assert.match(unknown.evidence, /^Largest error at step 10\. /, 'no cause has evidence');
+  const diffuse = {
+    ...FAULT,
+    state: 'unsure',
+    causes: [{ ...FAULT.causes[0], probability: 0.03 }],
+  };
+  assert.deepEqual(finding(run(14), 0, diffuse), unknown, 'no cause stands out');
   const accurate = { ...run(14), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
   assert.equal(finding(accurate, 0, HEALTHY).tone, 'good');
   assert.equal(finding(run(14), 0, HEALTHY).tone, 'warn', 'overconfident, as its healthy record');

@@ -36,6 +36,7 @@ class DiagnosisCause(Reply):
 class Diagnosis(Reply):
     """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
 
+    deviations: largest ones, whatever their cause.
     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
     unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
     """
@@ -44,6 +45,7 @@ class Diagnosis(Reply):
     masked: bool
     headline: str
     causes: list[DiagnosisCause]
+    deviations: list[DiagnosisEvidence]
     task: str
     filter: str
     checkpoint_hash: str

@@ -14,6 +14,9 @@ export const LOG_RANGE = /** @type {const} */ (64.0);
 /** Largest value of a map's cell. */
 export const CELL_STEPS = /** @type {const} */ (65535);
 
+/** Smallest probability of a cause of a fault that is listed. */
+export const SHOWN = /** @type {const} */ (0.05);
+
 /** Weight of clean data in the loss of a fine-tuning. */
 export const CLEAN_WEIGHT = /** @type {const} */ (0.5);
 

@@ -3,6 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Diagnosis } from '../types/server.js' */
 
+import { SHOWN } from '../core/constants.js';
 import { fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { stepSummary, weightScope } from './step_summary.js';
@@ -50,12 +51,12 @@ export function finding(trace, component, diagnosis) {
  * @returns {Finding}
  */
 function faultFinding({ state, masked, headline, causes }) {
-  const [cause] = causes;
+  const [cause] = causes.filter(({ probability }) => probability >= SHOWN);
   const evidence = (cause?.evidence ?? []).slice(0, 1);
   const step = evidence[0]?.step ?? cause?.steps?.[0] ?? null;
   return {
     tone: state === 'fault' && !masked ? 'bad' : 'warn',
-    headline: sentence(headline),
+    headline: sentence(headline.replaceAll('`', '')),
     evidence: typeset(evidence.map(({ text }) => sentence(text)).join(' ')),
     step,
   };

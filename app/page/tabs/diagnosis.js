@@ -7,6 +7,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
+import { SHOWN } from '../core/constants.js';
 import { create, html } from '../core/dom.js';
 import { displayName, fixed, percent, sentence, stepLabel, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -27,7 +28,6 @@ const OVER = [
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MEASURE = 'Measure a healthy record';
 const MAX_RESULTS = 24; // in the cache
-const SHOWN = 0.005; // smallest probability of a listed cause
 const PRESENT = 'Probability that this cause is present, alone or together with another one';
 const LISTED = 3; // statistics that were not measured
 const SETTLING = 500; // ms until the job of a selection starts
@@ -194,11 +194,13 @@ export class Diagnosis {
     this.#drawMeasured(result?.healthy_data);
     if (result === this.#listed) return;
     this.#listed = result;
-    html('.causes', this.#host).replaceChildren(
-      ...(result?.causes ?? [])
-        .filter((cause) => cause.probability >= SHOWN)
-        .map((cause, i) => this.#row(cause, !i)),
-    );
+    const causes = (result?.causes ?? []).filter(({ probability }) => probability >= SHOWN);
+    const rows = causes.map((cause, i) => this.#row(cause, !i));
+    html('.causes', this.#host).replaceChildren(...rows);
+    const deviations = causes.length ? [] : (result?.deviations ?? []);
+    html('.deviations', this.#host).hidden = !deviations.length;
+    const items = deviations.map((deviation) => this.#evidence(deviation));
+    html('.deviations ul', this.#host).replaceChildren(...items);
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
   }
 

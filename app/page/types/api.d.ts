@@ -145,6 +145,7 @@ export interface components {
          * Diagnosis
          * @description The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
          *
+         *     deviations: largest ones, whatever their cause.
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
          *     unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
          */
@@ -160,6 +161,8 @@ export interface components {
             headline: string;
             /** Causes */
             causes: components["schemas"]["DiagnosisCause"][];
+            /** Deviations */
+            deviations: components["schemas"]["DiagnosisEvidence"][];
             /** Task */
             task: string;
             /** Filter */

@@ -22,8 +22,9 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import open_filter
-from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, focus, observe
-from beliefscope.inspect.diagnosis.conclusion import healthy
+from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, explain_all, focus, observe
+from beliefscope.inspect.diagnosis.cause import SHOWN
+from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
@@ -146,6 +147,25 @@ def test_focused_episodes_are_compared_with_each_other() -> None:
     alone = compared(part.setting, part.traces, [rows[i] for i in chosen], part.sensors, profile(), 0.05)
     assert part.grouped == alone.grouped
     assert part.grouped != [case.grouped[i] for i in chosen]
+
+
+@pytest.mark.parametrize(
+    ("count", "action"), [(1, "held-out"), (3, "`beliefscope slices push --filter crossmodal-ekf`")]
+)
+def test_a_fault_without_a_probable_cause_has_deviations_and_a_next_action(count: int, action: str) -> None:
+    episodes = {i: faulty("image_frozen:from=10")[i] for i in range(count)}
+    traces = list(trace_all(checkpoint(), episodes, episodes, 0, 300))
+    rows, sensors = zip(*(observe(trace, checkpoint(), profile()) for trace in traces), strict=True)
+    setting = Setting(checkpoint(), episodes, 300, frozenset(episodes), healthy=profile())
+    case = compared(setting, traces, rows, sensors, profile(), 0.05)
+    unlikely = {name: replace(explanation, support=-3.0) for name, explanation in explain_all(case).items()}
+    result = conclude(case, case, unlikely, {})
+    assert (result.state, result.listed) == ("unsure", ())
+    assert max(cause["probability"] for cause in result.to_json()["causes"]) < SHOWN
+    assert result.headline.startswith(f"No cause stands out: {case.alarms[0].text}; try: ")
+    assert action in result.headline
+    assert result.tables()[0].title == "Largest deviations"
+    assert result.tables()[0].rows[0][0] == result.deviations[0].text == case.alarms[0].text
 
 
 def test_episodes_are_affected_unless_they_are_healthy() -> None:
