@@ -9,10 +9,12 @@ from typing import Any, Literal
 import numpy as np
 
 from beliefscope.datasets.task import display_name
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence
+from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
@@ -115,7 +117,6 @@ def conclude(
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:
     alarms = symptoms_of(cause, case.alarms)
     affected = affected_episodes(case, alarms)
-    task, name = case.setting.checkpoint.task.name, case.setting.checkpoint.name
     return Candidate(
         cause=cause,
         probability=probability,
@@ -123,8 +124,23 @@ def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | No
         steps=affected_steps(case, alarms[0], affected) if alarms else None,
         evidence=tuple(_evidence(case, alarm) for alarm in alarms[:EVIDENCE]),
         recovered=None if effect is None else effect.recovery,
-        next=cause.next.format(task=task, filter=name),
+        next=next_action(cause, case.setting.checkpoint),
     )
+
+
+def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
+    """The next action of a cause; none for the filter if the cause is in a sensor that it does not use."""
+    if is_unused(cause, checkpoint):
+        sensor = display_name(cause.component)
+        return f"This filter does not use the {sensor} sensor, so it is unaffected; repair it for filters that do."
+    return cause.next.format(task=checkpoint.task.name, filter=checkpoint.name)
+
+
+def is_unused(cause: Cause, checkpoint: Checkpoint) -> bool:
+    """Whether a cause is in a sensor that a filter does not use, neither as a modality nor in the controls."""
+    modality = next((m for m, keys in checkpoint.task.modalities.items() if cause.component in (m, *keys)), None)
+    changes_controls = matches(cause.consequences, "dynamics error//all")
+    return modality is not None and not changes_controls and modality not in modalities_of(checkpoint)
 
 
 def _evidence(case: Case, deviation: Deviation) -> Evidence:

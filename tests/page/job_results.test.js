@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { recoveredText } from '../../app/page/tabs/diagnosis.js';
+import { isTrainable, recoveredText } from '../../app/page/tabs/diagnosis.js';
 import { JobResults } from '../../app/page/widgets/job_results.js';
 
 const { signal } = new AbortController();
@@ -79,4 +79,11 @@ test('the effect of undoing a cause has a direction and no sign', () => {
     recoveredText({ ...angle, error: -0.2 }),
     /^Undoing it increases the angle error by 20 %;/,
   );
+});
+
+test('only a cause whose next action is a fine-tuning offers one', () => {
+  assert.ok(
+    isTrainable({ next: 'Fine-tune it: `beliefscope finetune door --filter crossmodal-ekf`.' }),
+  );
+  assert.ok(!isTrainable({ next: 'Check the camera and its driver.' }));
 });

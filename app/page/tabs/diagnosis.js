@@ -292,7 +292,7 @@ export class Diagnosis {
     ];
     if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
     lines.push(nextAction(cause.next));
-    if (this.#starts && isFirst) lines.push(this.#finetuneButton());
+    if (this.#starts && isFirst && isTrainable(cause)) lines.push(this.#finetuneButton());
     return create(
       'li',
       {},
@@ -317,6 +317,12 @@ export class Diagnosis {
     return item;
   }
 }
+
+/**
+ * Whether the next action of a cause is a fine-tuning, unlike that of a sensor that must be repaired.
+ * @param {Pick<DiagnosisCause, 'next'>} cause
+ */
+export const isTrainable = ({ next }) => next.includes('`beliefscope finetune ');
 
 /**
  * The state of a diagnosis that is not ready.

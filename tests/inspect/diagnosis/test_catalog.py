@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges
+from beliefscope.inspect.diagnosis.conclusion import is_unused, next_action
 from beliefscope.inspect.diagnosis.scoring import (
     Explanation,
     applicable,
@@ -232,3 +234,16 @@ def test_a_cause_may_lower_statistics_without_raising_them() -> None:
 def test_consecutive_episodes_are_ranges() -> None:
     assert index_ranges([3, 4, 9, 10, 11, 12, 20]) == "3, 4, 9 to 12, 20"
     assert index_ranges([]) == ""
+
+
+def test_a_fault_of_an_unused_sensor_has_no_action_for_the_filter() -> None:
+    """Unless the controls contain its readings: the dynamics of every filter use them."""
+    checkpoints = {name: load_checkpoint(shipped("door", f"{name}-ekf")) for name in ("haptics", "image", "crossmodal")}
+    unused = {name: {c.name for c in CAUSES if is_unused(c, checkpoint)} for name, checkpoint in checkpoints.items()}
+    assert unused["haptics"] == {f"image.{mechanism}" for mechanism in REQUIRED["image"]}
+    sensors = ("force", "torque")
+    assert unused["image"] == {f"{sensor}.{mechanism}" for sensor in sensors for mechanism in REQUIRED[sensor]}
+    assert not unused["crossmodal"]
+    frozen = next(cause for cause in CAUSES if cause.name == "image.frozen")
+    assert next_action(frozen, checkpoints["haptics"]).startswith("This filter does not use the image sensor, so")
+    assert next_action(frozen, checkpoints["image"]) == frozen.next
