@@ -61,11 +61,11 @@ class Result:
         print(text if json_destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
 
 
-def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]]) -> str:
-    """Format a table with a title."""
+def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]], note: str = "") -> str:
+    """Format a table with a title and a note."""
     from beliefscope.inspect.diagnostics.views import format_table
 
-    return format_table(title, columns, rows)
+    return format_table(title, columns, rows, note)
 
 
 def arrow(title: str, rows: Any) -> str:
@@ -79,7 +79,7 @@ def arrow(title: str, rows: Any) -> str:
 
 def grids(tables: Iterable[Table]) -> list[str]:
     """Format several tables."""
-    return [grid(table.title, table.columns, table.rows) for table in tables]
+    return [grid(table.title, table.columns, table.rows, table.note) for table in tables]
 
 
 @contextmanager

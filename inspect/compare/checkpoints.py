@@ -20,7 +20,15 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.finetuning.slices import Slice, standard_slices
-from beliefscope.inspect.compare.effects import LEVEL, Difference, Regression, differences, find_regressions
+from beliefscope.inspect.compare.effects import (
+    CHANGE_NOTE,
+    EFFECT_NOTE,
+    LEVEL,
+    Difference,
+    Regression,
+    differences,
+    find_regressions,
+)
 from beliefscope.inspect.compare.lineage import base_of
 from beliefscope.inspect.compare.modules import ModuleChange, module_changes
 from beliefscope.inspect.diagnostics.base import Diagnostic
@@ -113,6 +121,7 @@ class CheckpointComparison(Diagnostic):
     def tables(self) -> list[Table]:
         errors, beliefs = ([d for d in self.differences if d.is_error is kind] for kind in (True, False))
         by_slice = ("slice", "measure", "unit", "before", "after")
+        by_change = ("slice", "measure", "before -> after", "change", "95 % interval")
         slices = Table(
             "Slices",
             ("slice", "faults", "phase", "only", "episodes", "steps"),
@@ -120,19 +129,20 @@ class CheckpointComparison(Diagnostic):
         )
         return [
             *(
-                Table(title, ("slice", "measure", "before -> after", "change", "95 % interval"), tuple(rows[:MAX_ROWS]))
+                Table(title, by_change, tuple(rows[:MAX_ROWS]), CHANGE_NOTE)
                 for title, changes in (("Improvements", self.improvements()), ("Regressions", self.regressions()))
                 if (rows := [(d.slice, _title(d), *_change_texts(d)) for d in changes])
             ),
             Table(
                 "Errors by slice (RMSE)",
                 (*by_slice, "change %", "low %", "high %", "result"),
-                tuple((*_numbers(d), *(_percent(x) for x in (d.effect, d.low, d.high)), _outcome(d)) for d in errors),
+                tuple((*_numbers(d), *(_percent(x) for x in (d.effect, d.low, d.high)), d.outcome) for d in errors),
             ),
             Table(
                 "Beliefs by slice",
                 (*by_slice, "effect", "low", "high", "result"),
-                tuple((*_numbers(d), *(_rounded(x) for x in (d.effect, d.low, d.high)), _outcome(d)) for d in beliefs),
+                tuple((*_numbers(d), *(_rounded(x) for x in (d.effect, d.low, d.high)), d.outcome) for d in beliefs),
+                EFFECT_NOTE,
             ),
             self.event_table(),
             *([self.module_table()] if self.modules else []),
@@ -365,10 +375,6 @@ def _percent(effect: float) -> float | None:
 
 def _rounded(effect: float) -> float | None:
     return round(effect, 4) if math.isfinite(effect) else None
-
-
-def _outcome(d: Difference) -> str:
-    return "improved" if d.improved else "regressed" if d.regressed else ""
 
 
 def _slice_row(size: SliceSize) -> tuple[Value, ...]:

@@ -31,6 +31,23 @@ LEVEL = 0.02
 """Minimum relative change that counts as improved or regressed."""
 
 
+CHANGE_NOTE = (
+    "change: negative is better. Errors: relative change of the RMSE. NLL: e^(difference / number of state components) "
+    "- 1, the relative change of errors and standard deviations that has the same difference. NEES: relative change of "
+    "the factor by which standard deviations are wrong. Coverage and miscalibration: change of the distance from the "
+    "ideal, in percentage points."
+)
+"""Explains changes in percent and in points."""
+
+EFFECT_NOTE = (
+    "effect (95 % interval: low to high): negative is better. NLL: difference / number of state components. NEES: "
+    "difference of |ln NEES| / 2, the logarithm of the factor by which standard deviations are wrong. Both are changes "
+    "of e^effect - 1, as in Improvements and Regressions. Coverage and miscalibration: change of the distance from the "
+    "ideal, a share."
+)
+"""Explains ``Difference.effect`` of measures of beliefs."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """A measure of one slice, before and after.
@@ -64,6 +81,11 @@ class Difference:
     def regressed(self) -> bool:
         """Whether it is worse by at least ``LEVEL`` and the interval excludes zero."""
         return self.low > 0.0 and self.effect >= math.log1p(LEVEL)
+
+    @property
+    def outcome(self) -> str:
+        """``improved``, ``regressed`` or empty."""
+        return "improved" if self.improved else "regressed" if self.regressed else ""
 
     @property
     def is_error(self) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,16 +21,21 @@ from beliefscope.datasets.task import Task
 
 Array = NDArray[np.float64]
 Value = str | int | float | None
+NOTE_WIDTH = 110  # characters
 VIEWS = ("tables", "curves", "bands", "plots", "images")
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values, None where a value is not available. Column names include the unit."""
+    """Rows of values, None where a value is not available. Column names include the unit.
+
+    note: explains columns, below the table.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Value, ...], ...]
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,12 +148,15 @@ class Views(ABC):
 
 def html_result(headline: str, tables: Sequence[Table]) -> str:
     """A sentence and tables as HTML for notebooks."""
-    parts = (html_table(table.title, table.columns, table.rows) for table in tables)
-    return "".join([html_paragraph(headline, strong=True), *parts])
+    parts = [html_paragraph(headline, strong=True)]
+    for table in tables:
+        parts.append(html_table(table.title, table.columns, table.rows))
+        parts += [html_paragraph(table.note)] if table.note else []
+    return "".join(parts)
 
 
-def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> str:
-    """A table with a title as text; numbers are right-aligned with three digits, None is ``-``."""
+def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Value]], note: str = "") -> str:
+    """A table with a title and a note as text; numbers are right-aligned with three digits, None is ``-``."""
 
     def text(value: Value) -> str:
         return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
@@ -161,7 +170,7 @@ def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Val
         "  ".join(f"{cell:{align}{width}}" for cell, width, align in zip(row, widths, alignments, strict=True))
         for row in cells
     ]
-    return "\n".join([title, *(f"  {line.rstrip()}" for line in lines)])
+    return "\n".join([title, *(f"  {line.rstrip()}" for line in (*lines, *textwrap.wrap(note, NOTE_WIDTH)))])
 
 
 def as_json(value: Any) -> Any:

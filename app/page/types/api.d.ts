@@ -1860,6 +1860,8 @@ export interface components {
         /**
          * Table
          * @description Rows of values, None where a value is not available. Column names include the unit.
+         *
+         *     note: explains columns, below the table.
          */
         Table: {
             /** Title */
@@ -1868,6 +1870,11 @@ export interface components {
             columns: string[];
             /** Rows */
             rows: (string | number | null)[][];
+            /**
+             * Note
+             * @default
+             */
+            note: string;
         };
         /**
          * TaskInfo

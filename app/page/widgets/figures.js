@@ -6,7 +6,7 @@
 
 import { create } from '../core/dom.js';
 import { scaled, swatch } from '../core/palette.js';
-import { significant } from '../core/units.js';
+import { sentence, significant, typeset } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { GUTTER, LABEL, shadeBounds, shadeIntervals } from '../timeline/chart.js';
 import { copyButton } from './copy_button.js';
@@ -189,7 +189,7 @@ export class Figures {
   }
 
   /** @param {Table} table */
-  #table({ title, columns, rows }) {
+  #table({ title, columns, rows, note = '' }) {
     const head = heading(title);
     const copied = () => csv([columns, ...rows]);
     head.append(copyButton('Copy CSV', `Copy ${title} as CSV`, copied));
@@ -222,7 +222,8 @@ export class Figures {
     });
     const scroll = create('div', { className: 'scroll', tabIndex: 0 }, table);
     scroll.ariaLabel = `${title}, table`;
-    return create('div', { className: 'table' }, head, scroll);
+    const explanation = note ? [create('p', { textContent: typeset(sentence(note)) })] : [];
+    return create('div', { className: 'table' }, head, scroll, ...explanation);
   }
 }
 
