@@ -99,16 +99,17 @@ def conclude(
 
     Args:
         affected: the episodes that the largest alarm concerns.
-        effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown.
+        effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown
+            unless it does not use the sensor.
     """
     by_name = {cause.name: cause for cause in CAUSES}
     ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    masked = effects is not None and not is_visible(
-        case.by_statistic, effects.get(candidates[0].cause.name) if sure else None
-    )
+    known = effects is not None or (sure and is_unused(candidates[0].cause, case.setting.checkpoint))
+    effect = (effects or {}).get(candidates[0].cause.name) if sure else None
+    masked = known and not is_visible(case.by_statistic, effect)
     headline = _headline(affected, candidates, masked, len(case.rows))
     deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
     return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case))

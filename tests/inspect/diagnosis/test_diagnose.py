@@ -25,7 +25,7 @@ from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, explain_all, focus, observe
 from beliefscope.inspect.diagnosis.cause import SHOWN
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis
+from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis, preliminary
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
@@ -273,3 +273,12 @@ def test_external_filters_are_compared_with_a_measured_profile() -> None:
     result = diagnose(external, frozen, profile=profile_of(external, healthy, "test"))
     assert result.state == "fault"
     assert "image.frozen" in [candidate.cause.name for candidate in result.causes]
+
+
+def test_a_fault_of_an_unused_sensor_is_masked_before_it_is_undone() -> None:
+    filter_ = load_checkpoint(shipped("door", "haptics-ekf"))
+    with open_dataset(sample_path("door")) as data:
+        run = next(iter(trace_all(filter_, {9: Faults.parse("image_frozen:from=10").apply(data[9])}, [9])))
+    result = preliminary(filter_, run)
+    assert (result.state, result.masked, result.causes[0].cause.name) == ("fault", True, "image.frozen")
+    assert result.headline.endswith("; the filter is unaffected")
