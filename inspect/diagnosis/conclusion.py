@@ -216,6 +216,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
         "healthy_data": case.profile.data,
+        "miscalibrated": bool(_miscalibration(case.profile)),
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers),
         "alarm_rate": case.alarm_rate,

@@ -137,6 +137,7 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.deepEqual(finding(run(14), 0, diffuse), unknown, 'no cause stands out');
   const accurate = { ...run(14), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
   assert.equal(finding(accurate, 0, HEALTHY).tone, 'good');
+  assert.equal(finding(accurate, 0, { ...HEALTHY, miscalibrated: true }).tone, 'warn');
   assert.equal(finding(run(14), 0, HEALTHY).tone, 'warn', 'overconfident, as its healthy record');
   assert.equal(finding(run(14), 0, HEALTHY).step, 8);
   const plain = finding(run(11), 0, null);

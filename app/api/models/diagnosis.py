@@ -37,6 +37,7 @@ class Diagnosis(Reply):
     """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
 
     deviations: largest ones, whatever their cause.
+    miscalibrated: whether the healthy record itself is over- or underconfident.
     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
     unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
     """
@@ -52,6 +53,7 @@ class Diagnosis(Reply):
     episodes: int
     healthy_episodes: int
     healthy_data: str = ""
+    miscalibrated: bool
     statistics: dict[str, int]
     unmeasured: list[str]
     alarm_rate: float

@@ -37,7 +37,8 @@ export function finding(trace, component, diagnosis) {
     return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
   }
   const worst = worstFinding(trace, component);
-  const healthy = worst.tone === 'bad' ? 'warn' : 'good'; // as its record, which may be poor
+  // As its record, which may be poor.
+  const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
   const outage = fault ? null : outageFinding(trace, component);
   if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
   if (!diagnosis) return worst;

@@ -177,7 +177,7 @@ export class Diagnosis {
     if (this.#trace && entry.state === 'ready' && over === 'episode')
       this.confirmed(this.#trace, entry.result);
     this.#host.dataset.state = entry.state;
-    this.#host.dataset.finding = result ? (result.masked ? 'masked' : result.state) : '';
+    this.#host.dataset.finding = result ? findingOf(result) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
     const state = stateOf(entry);
     this.#writeHeadline(result?.headline ?? state);
@@ -316,6 +316,15 @@ export class Diagnosis {
     item.append(' ', link);
     return item;
   }
+}
+
+/**
+ * The state of a finished diagnosis for its colour.
+ * @param {Result} result
+ */
+function findingOf({ state, masked, miscalibrated }) {
+  if (state === 'healthy') return miscalibrated ? 'miscalibrated' : state;
+  return masked ? 'masked' : state;
 }
 
 /**

@@ -146,6 +146,7 @@ export interface components {
          * @description The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
          *
          *     deviations: largest ones, whatever their cause.
+         *     miscalibrated: whether the healthy record itself is over- or underconfident.
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
          *     unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
          */
@@ -178,6 +179,8 @@ export interface components {
              * @default
              */
             healthy_data: string;
+            /** Miscalibrated */
+            miscalibrated: boolean;
             /** Statistics */
             statistics: {
                 [key: string]: number;

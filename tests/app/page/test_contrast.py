@@ -39,4 +39,5 @@ def test_contrast_meets_level_aa(theme: int) -> None:
     text = {(t, b): contrast(COLOURS[t][theme], COLOURS[b][theme]) for t in TEXTS for b in BACKGROUNDS}
     assert {pair: ratio for pair, ratio in text.items() if ratio < 4.5} == {}  # text
     lines = {line: contrast(COLOURS[line][theme], COLOURS["surface"][theme]) for line in LINES}
+    lines |= {f"warn on {b}": contrast(COLOURS["warn"][theme], COLOURS[b][theme]) for b in BACKGROUNDS}
     assert {line: ratio for line, ratio in lines.items() if ratio < 3.0} == {}  # graphics

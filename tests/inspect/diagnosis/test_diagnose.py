@@ -72,7 +72,9 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     name = "nees/fused/all"
     record = HealthyProfile("test", 44, None, {name: np.append(nees * np.linspace(0.9, 1.1, 43), 500.0)})
     case = compared(Setting(checkpoint(), {}, 300, frozenset()), [], [{name: nees}] * 2, [{}] * 2, record, 0.05)
-    assert healthy(case).headline.startswith(start)
+    result = healthy(case)
+    assert result.headline.startswith(start)
+    assert result.to_json()["miscalibrated"] == ("confident" in start)
 
 
 @pytest.mark.parametrize(
