@@ -9,13 +9,16 @@ const CONDITION = { covariate: 'true angle', unit: 'rad', low: null, high: null,
 
 test('conditions have the units of the page', () => {
   const text = (change) => conditionText({ ...CONDITION, ...change });
-  assert.equal(text({ low: Math.PI / 8 }), 'true angle > 22.5 °');
-  assert.equal(text({ high: -0.5, covariate: 'true hinge x', unit: 'm' }), 'true hinge x ≤ −50 cm');
+  assert.equal(text({ low: Math.PI / 8 }), 'true angle > 22.5\u00a0°');
+  assert.equal(
+    text({ high: -0.5, covariate: 'true hinge x', unit: 'm' }),
+    'true hinge x ≤ −50\u00a0cm',
+  );
   assert.equal(
     text({ low: 1, high: 2, covariate: 'outage length', unit: 's' }),
-    '1 s < outage length ≤ 2 s',
+    '1\u00a0s < outage length ≤ 2\u00a0s',
   );
-  assert.equal(text({ low: 3.9, covariate: 'time', unit: 's' }), 'time > 3.9 s');
+  assert.equal(text({ low: 3.9, covariate: 'time', unit: 's' }), 'time > 3.9\u00a0s');
   assert.equal(text({ low: 0.6234, covariate: 'friction', unit: '' }), 'friction > 0.623');
   assert.equal(text({ category: 'no', covariate: 'contact' }), 'no contact');
   assert.equal(text({ category: 'yes', covariate: 'contact' }), 'contact');

@@ -16,6 +16,8 @@ const UNITS = {
   'rad/s': { unit: '°/s', scale: 180 / Math.PI },
 };
 
+const NO_BREAK = '\u00a0'; // space that keeps a unit on the line of its number
+
 /** @typedef {{slice: FailureSlice, row: HTMLTableRowElement, button: HTMLButtonElement}} SliceRow */
 
 export class SliceTable {
@@ -159,7 +161,10 @@ export function conditionText({ covariate, unit: siUnit, low, high, category }) 
   if (category !== null) return `${covariate} is ${category}`;
   const { unit, scale } = UNITS[siUnit] ?? { unit: siUnit, scale: 1 };
   const end = (/** @type {number | null} */ value) =>
-    withUnit(short(significant(value === null ? null : scale * value)), unit);
+    withUnit(short(significant(value === null ? null : scale * value)), unit).replace(
+      ' ',
+      NO_BREAK,
+    );
   if (low === null) return `${covariate} ≤ ${end(high)}`;
   return high === null ? `${covariate} > ${end(low)}` : `${end(low)} < ${covariate} ≤ ${end(high)}`;
 }
