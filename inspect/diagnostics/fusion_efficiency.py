@@ -28,6 +28,9 @@ from beliefscope.inspect.statistics.measures import GROUPS, Mask
 from beliefscope.inspect.statistics.oracle import squared_error, unbiased_weights
 from beliefscope.inspect.trace import Trace
 
+GAIN = 0.95
+"""Ratio of the fused error to that of the best standalone filter from which fusion gains little."""
+
 
 @dataclass(frozen=True)
 class PhaseEfficiency:
@@ -90,9 +93,10 @@ class FusionEfficiency(Diagnostic):
         total = self.phases[0]
         main = self.task.main_error
         alone = [f"{name} {main.text(x)}" for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)]
+        errors = f"{', '.join(alone)}; correlation {total.correlation[0]:.2f}"
         sentence = (
-            f"{main.title} RMSE {main.text(total.fused[0])}; the standalone errors ({', '.join(alone)}; correlation "
-            f"{total.correlation[0]:.2f}) allow {main.text(total.best[0])}: efficiency {total.efficiency[0]:.2f}"
+            f"{main.title} RMSE {main.text(total.fused[0])}{self._gain()}; the standalone errors ({errors}) allow "
+            f"{main.text(total.best[0])}: efficiency {total.efficiency[0]:.2f}"
         )
         if math.isnan(total.low[0]):
             return f"{sentence}. No interval and no reasons: {too_few(self.trajectories)}."
@@ -103,6 +107,16 @@ class FusionEfficiency(Diagnostic):
         if not texts:
             return f"{sentence} None of the {len(self.reasons)} measured reasons is significant."
         return f"{sentence} Reasons: {'; '.join(texts)}."
+
+    def _gain(self) -> str:
+        """That the fused error is hardly below that of the best standalone filter; empty if it is well below."""
+        total = self.phases[0]
+        best = int(np.argmin(total.standalone[:, 0]))
+        ratio = float(total.fused[0] / total.standalone[best, 0])
+        if not ratio > GAIN:
+            return ""
+        gain = "little" if ratio < 1.0 else "nothing"
+        return f", {ratio:.2f} times that of the {self.modalities[best]}-only filter: fusion gains {gain}"
 
     def tables(self) -> list[Table]:
         rows: list[tuple[Value, ...]] = []

@@ -220,3 +220,13 @@ def test_filter_of_one_modality_is_refused(doors: tuple[Checkpoint, list[Trace]]
     )
     run = plant.real("crossmodal-ekf")
     assert entry.refusal(run, single) == "crossmodal-ekf has one modality: it is the standalone filter"
+
+
+def test_the_verdict_states_that_fusion_gains_little() -> None:
+    def verdict(correlation: float, weight: float) -> str:
+        traces, alone = with_errors(correlation, weight, 2)
+        return efficiency_of(traces, checkpoint("crossmodal-ekf"), alone).verdict
+
+    assert "4.00 cm, 1.33 times that of the image-only filter: fusion gains nothing; the" in verdict(1.0 - 1e-9, 0.5)
+    assert "1.00 times that of the image-only filter: fusion gains little; the" in verdict(0.5, 0.99)
+    assert "fusion gains" not in verdict(0.0, 0.7)
