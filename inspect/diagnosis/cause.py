@@ -163,7 +163,7 @@ class Diagnosis:
         masked: whether a sensor is faulty and the filter is unaffected.
         headline: one sentence.
         causes: most probable first; empty if healthy.
-        deviations: largest ones, whatever their cause; empty if healthy.
+        deviations: largest ones, whatever their cause, also if healthy.
         provenance: task, filter, hash, episodes, healthy record, and what was compared and what was not.
     """
 

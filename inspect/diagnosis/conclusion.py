@@ -34,6 +34,9 @@ LISTED = 5
 EVIDENCE = 5
 """Maximum number of listed deviations by cause."""
 
+LARGEST = 3
+"""Maximum number of listed deviations without an alarm."""
+
 MAX_NEES = 2.0
 """Largest ratio of a healthy record's NEES to 1, and of 1 to it, that the headline does not mention."""
 
@@ -42,7 +45,9 @@ def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
     text = f"all {count} statistics are within the record of {record} healthy episodes."
-    return Diagnosis("healthy", False, f"Healthy{_miscalibration(case.profile)}: {text}", (), (), _provenance(case))
+    largest = tuple(_evidence(case, deviation) for deviation in case.deviations[:LARGEST])
+    headline = f"Healthy{_miscalibration(case.profile)}: {text}"
+    return Diagnosis("healthy", False, headline, (), largest, _provenance(case))
 
 
 def _miscalibration(profile: HealthyProfile) -> str:

@@ -43,11 +43,11 @@ KINDS = {
     "sharpness": ("sharpness", True, 0.05),
     "brightness": ("exposure{of} relative to healthy images", True, 0.03),
     "occlusion": ("share of occluded pixels", False, 0.01),
-    "shift": ("shift in pixels", False, 0.2),
+    "shift": ("shift", False, 0.2),
     "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
-    "hand offset": ("distance in pixels of the hand in the image from its measured position{axis}", False, 0.1),
+    "hand offset": ("distance of the hand in the image from its measured position{axis}", False, 0.1),
     "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
-    "object offset": ("distance in pixels of the object in the image from its labelled position{axis}", False, 0.1),
+    "object offset": ("distance of the object in the image from its labelled position{axis}", False, 0.1),
     "object match": ("similarity of the object in the image to healthy images{axis}", True, 0.05),
     "contact distance": (
         "distance of the hand from the labelled object beyond healthy ones{axis}",
@@ -60,7 +60,7 @@ KINDS = {
         False,
         5e-4,
     ),
-    "offset": ("offset{of} from the measured hand or the estimates (m, rad)", False, 0.002),
+    "offset": ("offset{of} from the measured hand or the estimates", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
     "change": ("second difference", False, 0.05),
@@ -72,7 +72,7 @@ KINDS = {
     "toggles": ("share of steps at which the flag{of} changes", False, 0.01),
     "agreement": ("correlation{of} with the force", False, 0.05),
     "opposition": ("negative correlation{of} with the force", False, 0.05),
-    "unflagged force": ("force in N without the flag{of}", True, 0.2),
+    "unflagged force": ("force without the flag{of}", True, 0.2),
     "size": ("standard deviation", True, 0.1),
     "lever": ("lever of the torque{axis}", False, 0.01),
     "axes": ("evidence for the order of the axes", False, 0.3),
@@ -86,8 +86,8 @@ the statistic's subject, or ``{axis}`` for its axis only, if they are not at its
 UNITS = {"force": "N", "torque": "N m", "image": "gray levels"}
 """Units of the readings of sensors that all simulated tasks have."""
 
-IN_UNITS = {"level": "", "drift": "/s", "change": "", "noise": "", "size": ""}
-"""Kinds of statistics in the units of the readings -> what follows these."""
+OF_READINGS = {"level": "", "drift": "/s", "change": "", "noise": "", "size": ""}
+"""Kinds of statistics in the unit of the readings -> what follows it."""
 
 LEVER = 0.1
 """m: smallest standard deviation of a torque (N m) relative to that of a force (N)."""
@@ -112,25 +112,31 @@ RISING = frozenset(
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 
-LENGTHS = frozenset(
-    {"contact distance", "contact distance error", "contact distance scatter", "position noise", "lever"}
-)
-"""Kinds of statistics in m."""
+OF_KINDS = {
+    "angle error": display_unit("rad"),
+    **dict.fromkeys(("shift", "hand offset", "object offset"), ("px", 1.0)),
+    "unflagged force": ("N", 1.0),
+    "lever": display_unit("m"),
+    "position noise": display_unit("m"),
+    **dict.fromkeys(
+        ("contact distance", "contact distance error", "contact distance scatter"),
+        display_unit("m"),
+    ),
+}
+"""Kind of statistic -> its unit for display, and the factor from its own."""
 
 OF_COMPONENTS = frozenset(
     {f"module {value}" for value in ("bias", "error", "std", "spread", "scatter")}
     | {f"dynamics {value}" for value in ("bias", "error", "spread")}
-    | {"process noise"}
+    | {"process noise", "offset"}
 )
-"""Kinds of statistics in the unit of the state component that their subject ends with."""
+"""Kinds of statistics in the unit of the state component that their subject ends with; else m, of the controls."""
 
 
 def label_of(statistic: str) -> str:
     """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``."""
     kind, subject, phase = statistic.split("/")
     title = KINDS[kind][0] if kind in KINDS else kind
-    if kind in IN_UNITS and (unit := UNITS.get(subject.partition(" ")[0])):
-        title += f" in {unit}{IN_UNITS[kind]}"
     name, _, axis = subject.partition(" ")
     of, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
     title = title.format(of=of + axis, axis=axis) if "{" in title else title + of + axis
@@ -143,9 +149,9 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
     kind, subject, _ = statistic.split("/")
     if kind == "error":
         return task.main_error.shown
-    if kind == "angle error" or kind in LENGTHS:
-        return display_unit("rad" if kind == "angle error" else "m")
     if kind in OF_COMPONENTS:
         name = subject.rpartition(" ")[2]
-        return next((c.shown for c in task.components if c.name == name), ("", 1.0))
-    return "", 1.0
+        return next((c.shown for c in task.components if c.name == name), display_unit("m"))
+    if kind in OF_READINGS and (unit := UNITS.get(subject.partition(" ")[0])):
+        return f"{unit}{OF_READINGS[kind]}", 1.0
+    return OF_KINDS.get(kind, ("", 1.0))

@@ -49,6 +49,7 @@ def report_diagnosis(
         result = diagnose_traces(checkpoint, traces, seed=first.seed, particles=particles, progress=progress)
     except BadInput as error:
         return ReportedDiagnosis(None, str(error))
-    evidence = result.listed[0].evidence if result.listed else result.deviations
+    deviations = () if result.state == "healthy" else result.deviations
+    evidence = result.listed[0].evidence if result.listed else deviations
     moments = [(indices.index(e.episode), e.step or 0) for e in evidence if e.episode is not None]
     return ReportedDiagnosis(result, link=link(*moments[0]) if moments else "")

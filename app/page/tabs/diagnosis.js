@@ -24,6 +24,7 @@ const OVER = [
   ['episode', 'this episode'],
   ['held-out', 'held-out episodes'],
 ];
+const WITHIN = 'The largest of all statistics; healthy episodes have some of this size as well.';
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MEASURE = 'Measure a healthy record';
@@ -201,6 +202,10 @@ export class Diagnosis {
     html('.deviations', this.#host).hidden = !deviations.length;
     const items = deviations.map((deviation) => this.#evidence(deviation));
     html('.deviations ul', this.#host).replaceChildren(...items);
+    html('.deviations p', this.#host).textContent =
+      result?.state === 'healthy'
+        ? WITHIN
+        : 'Every cause of the catalog has a probability below 0.05.';
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
   }
 

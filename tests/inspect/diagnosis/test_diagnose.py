@@ -29,6 +29,7 @@ from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis, preli
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
 
@@ -47,6 +48,11 @@ def simulated(first: int, count: int) -> dict[int, Episode]:
 @cache
 def profile() -> HealthyProfile:
     return profile_of(checkpoint(), list(simulated(0, 20).values()), "seed 77")
+
+
+@cache
+def runs() -> list[Trace]:
+    return list(trace_all(checkpoint(), simulated(0, 3), simulated(0, 3)))
 
 
 def faulty(faults: str) -> Mapping[int, Episode]:
@@ -71,9 +77,10 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     """A filter whose covariance has always been too small does not deviate from its own record."""
     name = "nees/fused/all"
     record = HealthyProfile("test", 44, None, {name: np.append(nees * np.linspace(0.9, 1.1, 43), 500.0)})
-    case = compared(Setting(checkpoint(), {}, 300, frozenset()), [], [{name: nees}] * 2, [{}] * 2, record, 0.05)
+    case = compared(Setting(checkpoint(), {}, 300, frozenset()), runs()[:2], [{name: nees}] * 2, [{}] * 2, record, 0.05)
     result = healthy(case)
     assert result.headline.startswith(start)
+    assert [deviation.value for deviation in result.deviations] == [nees]
     assert result.to_json()["miscalibrated"] == ("confident" in start)
 
 
@@ -123,11 +130,11 @@ def test_sensors_without_statistics_are_named() -> None:
     rows = [{"noise/force x/all": 1.5 + 0.1 * i} for i in range(3)]
     setting = Setting(checkpoint(), {}, 300, frozenset())
     sensed = [{**row, "level/force x/free motion": np.nan} for row in rows]
-    result = healthy(compared(setting, [], rows, sensed, record, 0.05))
+    result = healthy(compared(setting, runs(), rows, sensed, record, 0.05))
     *sensors_, statistic = result.to_json()["unmeasured"]
     assert sensors_ == [name.replace("_", " ") for name in checkpoint().task.observations if name != "force"]
-    assert statistic == "level in N of force (x) in free motion"
-    assert result.tables()[0].rows[-1] == (statistic,)
+    assert statistic == "level of force (x) in free motion"
+    assert result.tables()[-1].rows[-1] == (statistic,)
 
 
 def test_faults_after_all_steps_are_refused() -> None:

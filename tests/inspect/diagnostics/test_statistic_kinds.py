@@ -8,7 +8,7 @@ from beliefscope.datasets.catalog import TASKS
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
-from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LENGTHS, OF_COMPONENTS, unit_of
+from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, OF_COMPONENTS, OF_KINDS, OF_READINGS, unit_of
 
 
 @pytest.mark.parametrize(
@@ -20,6 +20,12 @@ from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LENGTHS, OF_C
         ("module error/haptics hinge_x/all", "cm", 100.0),
         ("dynamics bias/hinge_y/contact", "cm", 100.0),
         ("contact distance/labels x/all", "cm", 100.0),
+        ("offset/labels angle/all", "deg", 57.29577951308232),
+        ("offset/control z/all", "cm", 100.0),
+        ("level/force y/free motion", "N", 1.0),
+        ("drift/torque x/all", "N m/s", 1.0),
+        ("level/pressure/all", "", 1.0),
+        ("hand offset/image x/all", "px", 1.0),
         ("nees/fused/all", "", 1.0),
         ("dynamics slope/hinge_x/all", "", 1.0),
     ],
@@ -29,7 +35,7 @@ def test_unit(statistic: str, unit: str, factor: float) -> None:
 
 
 def test_kinds_with_units_exist_and_each_component_of_a_profile_has_a_unit() -> None:
-    assert set(KINDS) >= LENGTHS | OF_COMPONENTS
+    assert set(KINDS) >= OF_COMPONENTS | set(OF_KINDS) | set(OF_READINGS)
     checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
     profile = required_profile(checkpoint)
     names = [name for name in profile.statistics if name.split("/")[0] in OF_COMPONENTS]
