@@ -366,7 +366,7 @@ CUT = """(selects) => selects.filter((select) => {
 """Returns the names of the select elements that are narrower than their selected names."""
 
 
-def test_a_failed_run_is_reported_in_every_panel_and_names_are_whole(open_page: Any) -> None:
+def test_a_failed_run_is_reported_and_tried_again_and_names_are_whole(open_page: Any) -> None:
     page = open_page(size=(1280, 720))
     names = page.page.locator(".pickers select:visible")
     assert [name.input_value() for name in names.all()][:2] == ["door", "crossmodal-pf"]
@@ -379,9 +379,10 @@ def test_a_failed_run_is_reported_in_every_panel_and_names_are_whole(open_page: 
     page.page.route("**/api/trace/**", lambda route: route.fulfill(**answer))
     page.page.locator("#filter").select_option("crossmodal-ekf")
     page.until("() => document.querySelector('#scene').dataset.state === 'error'")
-    for panel in ("#scene", "#heatmaps", "#timeline .body"):
-        assert page.page.locator(f"{panel} > .note").first.inner_text() == "The filter failed."
+    notes = [page.page.locator(f"{panel} > .note").first for panel in ("#scene", "#heatmaps", "#timeline .body")]
+    assert [note.inner_text() for note in notes] == ["The filter failed.", *2 * ["No run to display."]]
+    assert page.page.locator("#finding .sentence").inner_text().startswith("This run cannot be displayed.")
     page.errors[:] = [line for line in page.errors if "status of 500" not in line]
     page.page.unroute("**/api/trace/**")
-    page.page.locator("#filter").select_option("crossmodal-pf")
+    page.page.get_by_role("button", name="Try again").first.click()
     page.until("() => document.querySelector('#scene').dataset.state !== 'error'")

@@ -46,7 +46,7 @@ export function startLoading() {
 }
 
 /**
- * Shows an error in all panels that display the trace.
+ * Empties all panels that display the trace after an error, which the finding and the scene show.
  * @param {unknown} error
  * @returns {string} its text
  */
@@ -57,7 +57,7 @@ export function showError(error) {
   html('#step-summary').textContent = '';
   [html('#readout b').textContent, html('#readout span').textContent] = ['–', ''];
   showDataWarning(null);
-  for (const body of bodies) setPanelState(body, 'error', text);
+  for (const body of bodies) setPanelState(body, 'empty', 'No run to display');
   return text;
 }
 

@@ -304,7 +304,7 @@ export class Page {
       document.documentElement.classList.add('started');
       const text = showError(error);
       this.scene.failure = text;
-      this.finding.fail(text);
+      this.finding.fail(text, () => this.#load());
       this.diagnosis.fail(text);
     }
   }

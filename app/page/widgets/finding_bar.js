@@ -16,6 +16,8 @@ export class FindingBar {
   #loading = new AbortController();
   /** @type {number | null} */
   #step = null;
+  /** Loads the run again, if that failed. @type {(() => void) | null} */
+  #retry = null;
   /** @type {Trace | null} */
   #trace = null;
 
@@ -26,7 +28,9 @@ export class FindingBar {
   constructor(host, store) {
     this.#host = host;
     this.#store = store;
-    html('.moment', host).addEventListener('click', ({ timeStamp }) => this.goToMoment(timeStamp));
+    html('.moment', host).addEventListener('click', ({ timeStamp }) =>
+      this.#retry ? this.#retry() : this.goToMoment(timeStamp),
+    );
     html('.why', host).addEventListener('click', () => store.set({ tab: 'diagnosis' }));
   }
 
@@ -63,10 +67,11 @@ export class FindingBar {
   /**
    * Shows why there is no run.
    * @param {string} reason
+   * @param {() => void} retry loads the run again
    */
-  fail(reason) {
+  fail(reason, retry) {
     const headline = 'This run cannot be displayed.';
-    this.#write({ tone: 'bad', headline, evidence: reason, step: null }, 'error');
+    this.#write({ tone: 'bad', headline, evidence: reason, step: null }, 'error', retry);
   }
 
   /** @param {number} inputTime */
@@ -87,17 +92,18 @@ export class FindingBar {
   /**
    * @param {Finding} finding
    * @param {string} source
+   * @param {(() => void) | null} [retry]
    */
-  #write({ tone, headline, evidence, step }, source) {
+  #write({ tone, headline, evidence, step }, source, retry = null) {
     this.#host.classList.remove('stale');
     [this.#host.dataset.tone, this.#host.dataset.source] = [tone, source];
     const line = html('.sentence', this.#host);
     html('strong', line).textContent = headline;
     html('span', line).textContent = evidence;
     line.title = `${headline} ${evidence}`;
-    this.#step = step;
+    [this.#step, this.#retry] = [step, retry];
     const moment = html('.moment', this.#host);
-    moment.classList.toggle('none', step === null);
-    moment.textContent = `Go to step ${step ?? ''}`;
+    moment.classList.toggle('none', step === null && !retry);
+    moment.textContent = retry ? 'Try again' : `Go to step ${step ?? ''}`;
   }
 }
