@@ -33,6 +33,12 @@ def test_diagnosis_names_causes_and_opens_their_moments(open_page: Any) -> None:
     again.until(READY)
     assert again.page.locator("#diagnosis .headline").text_content() == headline
 
+    page.page.locator("#faults").select_option(index=0)
+    page.until("() => document.querySelector('#diagnosis').dataset.finding === 'healthy'")
+    assert tab.locator(".deviations li").count() == 3
+    tab.get_by_role("button", name="Fusion efficiency").click()
+    assert (page.state["tab"], page.state["diagnostic"]) == ("diagnostics", "efficiency")
+
 
 @pytest.mark.long  # tests/app/api/test_diagnosis.py has the same search
 def test_the_smallest_repair_is_drawn_in_the_timeline(open_page: Any) -> None:

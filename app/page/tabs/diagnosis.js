@@ -24,6 +24,7 @@ const OVER = [
   ['episode', 'this episode'],
   ['held-out', 'held-out episodes'],
 ];
+const UNLIKELY = 'Every cause of the catalog has a probability below 0.05.';
 const WITHIN = 'The largest of all statistics; healthy episodes have some of this size as well.';
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
@@ -72,6 +73,9 @@ export class Diagnosis {
       finished.includes(this.#key) ? this.load() : this.#draw(),
     );
     this.#records = new JobResults(jobs, MAX_RESULTS, (finished) => this.#followRecords(finished));
+    html('.gain button', host).addEventListener('click', () =>
+      store.set({ tab: 'diagnostics', diagnostic: 'efficiency', options: '' }),
+    );
   }
 
   /** Whether the panel is visible; nothing is requested before. */
@@ -202,10 +206,9 @@ export class Diagnosis {
     html('.deviations', this.#host).hidden = !deviations.length;
     const items = deviations.map((deviation) => this.#evidence(deviation));
     html('.deviations ul', this.#host).replaceChildren(...items);
-    html('.deviations p', this.#host).textContent =
-      result?.state === 'healthy'
-        ? WITHIN
-        : 'Every cause of the catalog has a probability below 0.05.';
+    const isHealthy = result?.state === 'healthy';
+    html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;
+    html('.gain', this.#host).hidden = !isHealthy || !this.#trace?.fuses;
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
   }
 
