@@ -9,6 +9,7 @@ from itertools import compress
 import numpy as np
 
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
@@ -33,8 +34,8 @@ class Case:
     """Episodes of a filter and their deviations from the healthy profile.
 
     Attributes:
-        rows: statistics by episode. sensors: those of sensors only. grouped: all of them, and statistics
-            relative to the other episodes (``with_scatter``).
+        rows: statistics by episode. sensors: those of sensors only. grouped: all of them, statistics adjusted for
+            the readings (``with_adjusted``), and statistics relative to the other episodes (``with_scatter``).
         deviations: with t-values relative to their critical values, largest first.
         p_value: probability of deviations of this size in a healthy filter.
     """
@@ -81,7 +82,7 @@ def compared(
     setting: Setting, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
-    scattered, grouped = with_scatter(profile, rows)
+    scattered, grouped = with_scatter(*with_adjusted(profile, rows, sensors))
     comparison = compare(scattered, grouped, task=setting.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
     return Case(setting, traces, rows, sensors, grouped, profile, deviations, comparison.p_value, alarm_rate)

@@ -17,6 +17,7 @@ import numpy as np
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom, matches
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.diagnostics.statistic_kinds import ADJUSTED
 
 NOISE, GROWTH = 0.7, 1.0
 """Ratio of a t-value to its critical value up to which a deviation does not count, and scale of its growth."""
@@ -53,7 +54,10 @@ def support(symptom: Symptom, deviations: Sequence[Deviation]) -> float:
 
 
 def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
-    """How well values agree with a target, -1 to 1; 0 if they cannot tell."""
+    """How well values agree with a target, -1 to 1; 0 if they cannot tell. Adjusted values do not count."""
+    deviations = [d for d in deviations if not d.statistic.endswith(f"/{ADJUSTED}")]
+    if not deviations:
+        return 0.0
     value, healthy, low, high = np.array([(d.value, d.healthy, d.low, d.high) for d in deviations]).T
     shift, width = value - healthy, np.maximum(high - low, 1e-9)
     if target == "shifted":  # a single statistic cannot contradict it

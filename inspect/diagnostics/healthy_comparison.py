@@ -160,7 +160,7 @@ def compare(
     names, values = [name for name, kept in zip(names, keep, strict=True) if kept], values[:, keep]
     if not names:
         return Comparison(count, profile.episodes, profile.data, ())
-    scaled, floor, rising = _scaled(names, values)
+    scaled, floor, rising = scaled_values(names, values)
     divisions = np.concatenate([np.arange(len(values))[None] < count, _divisions(len(values), count, seed)])
     t, effect = _t_values(scaled, divisions, floor, rising)
     # Rounding must not distinguish a division from itself.
@@ -207,7 +207,7 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_
             f"the healthy record of {profile.episodes} episodes has no statistic in common with the "
             f"{comparison.trajectories} diagnosed ones; measure it from at least {MIN_HEALTHY} healthy episodes"
         )
-    values, floor, rising = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
+    values, floor, rising = scaled_values(names, np.stack([profile.statistics[name] for name in names], axis=1))
     count = min(comparison.trajectories, profile.episodes // 2)
     t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor, rising)[0])
     own = _own_scale(t, t, count == 1)
@@ -221,7 +221,7 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_
     return tuple(sorted(result, key=lambda deviation: -abs(deviation.t)))
 
 
-def _scaled(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
+def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
     """Values (N, S) on the scale of their kind, smallest standard deviations (S,), and whether ``RISING`` (S,)."""
     settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
     logarithmic = np.array([s[1] for s in settings])

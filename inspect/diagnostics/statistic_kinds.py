@@ -92,8 +92,12 @@ OF_READINGS = {"level": "", "drift": "/s", "change": "", "noise": "", "size": ""
 LEVER = 0.1
 """m: smallest standard deviation of a torque (N m) relative to that of a force (N)."""
 
+ADJUSTED = "adjusted"
+"""Phase of statistics of modules that are adjusted for the readings of the episode."""
+
 PHASES = {
     "all": ("", ""),
+    ADJUSTED: ("", ", given the readings"),
     "extreme": ("most extreme ", " over 20 steps"),
     "range": ("range of the ", " over windows of 20 steps"),
 }
