@@ -35,9 +35,9 @@ Rows = Sequence[Mapping[str, float]]
 def with_adjusted(profile: HealthyProfile, rows: Rows, sensors: Rows) -> tuple[HealthyProfile, list[dict[str, float]]]:
     """The profile and the episodes' statistics with those of modules adjusted for the readings.
 
-    ``KIND/SUBJECT/adjusted``: the statistic without what the readings predict, for those that they do predict. Values
-    of the record are predicted from its other episodes (leave-one-out), so those of new healthy episodes have the same
-    distribution. A reading far from healthy ones predicts nothing, so a faulty sensor does not change the adjusted
+    ``KIND/SUBJECT/adjusted``: the statistic without what the readings predict, if they predict it. Values of the record
+    are predicted from its other episodes (leave-one-out), so values of new healthy episodes have the same distribution.
+    A reading far from healthy ones predicts nothing, so a faulty sensor does not change the adjusted
     statistics of healthy modules.
     """
     known = {name: np.isfinite(values) for name, values in profile.statistics.items()}
@@ -72,7 +72,7 @@ def _scaled(profile: HealthyProfile, rows: Rows, names: Sequence[str]) -> tuple[
 def _influence(readings: Array, floor: Array, count: int) -> Array:
     """(E, N): by how much a value of each of the N healthy episodes changes the prediction for each episode.
 
-    Ridge regression on the readings (E, S), of which the first N are healthy.
+    Ridge regression on the readings (E, S); the first N episodes are healthy.
     """
     healthy = readings[:count]
     deviation = np.maximum(np.nanstd(healthy, axis=0), floor)
