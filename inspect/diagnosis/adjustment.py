@@ -37,8 +37,8 @@ def with_adjusted(profile: HealthyProfile, rows: Rows, sensors: Rows) -> tuple[H
 
     ``KIND/SUBJECT/adjusted``: the statistic without what the readings predict, if they predict it. Values of the record
     are predicted from its other episodes (leave-one-out), so values of new healthy episodes have the same distribution.
-    A reading far from healthy ones predicts nothing, so a faulty sensor does not change the adjusted
-    statistics of healthy modules.
+    A reading far from healthy ones predicts nothing, so a faulty sensor does not change the adjusted statistics of
+    healthy modules.
     """
     known = {name: np.isfinite(values) for name, values in profile.statistics.items()}
     readings = [n for n, at in known.items() if at.sum() >= MIN_HEALTHY and any(n in row for row in sensors)]
