@@ -26,7 +26,7 @@ from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
 
 from beliefscope import __version__
 from beliefscope.app.protocol.errors import NotFound, QueueFull
-from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess, peak_memory, redirect_output
+from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess, memory_in_use, redirect_output
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput, check_name
@@ -327,7 +327,7 @@ def run_job(arguments: Mapping[str, Any], report: Report) -> bool:
     redirect_output(folder / "log.txt")
     result = resolve_name(arguments["function"])(arguments["arguments"], report)
     write_atomically(folder / "result.json", json.dumps(result, allow_nan=False).encode())
-    return not user_code.has_run() and peak_memory() < REUSED_BELOW
+    return not user_code.has_run() and memory_in_use() < REUSED_BELOW
 
 
 def _id(kind: str, key: object) -> str:

@@ -110,9 +110,11 @@ def redirect_output(path: Path) -> None:
             os.dup2(file.fileno(), stream.fileno())
 
 
-def peak_memory() -> int:
-    """The most memory that this process has held, bytes. macOS counts in bytes, Linux in KiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+def memory_in_use() -> int:
+    """Resident memory of this process, bytes; where Linux does not tell, the most that it has had."""
+    with suppress(OSError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _read_calls(calls: SimpleQueue[str]) -> None:

@@ -54,11 +54,17 @@ def with_adjusted(profile: HealthyProfile, rows: Rows, sensors: Rows) -> tuple[H
     predicted = residual[:count].std(0) < PREDICTED * values[:count].std(0)
     names = [name for name, kept in zip(names, predicted, strict=True) if kept]
     adjusted = (mean + residual)[:, predicted]
-    adjusted = np.where([KINDS[name.split("/")[0]][1] for name in names], np.exp(adjusted), adjusted)
+    adjusted = _rounded(np.where([KINDS[name.split("/")[0]][1] for name in names], np.exp(adjusted), adjusted))
     columns = [f"{name.rpartition('/')[0]}/{ADJUSTED}" for name in names]
     added = [dict(zip(columns, row, strict=True)) for row in adjusted[count:].tolist()]
     statistics = {**profile.statistics, **dict(zip(columns, adjusted[:count].T, strict=True))}
     return replace(profile, statistics=statistics), [{**row, **more} for row, more in zip(rows, added, strict=True)]
+
+
+def _rounded(values: Array) -> Array:
+    """Nine significant digits: the last ones depend on the number of threads of the linear algebra."""
+    scale = 10.0 ** (8.0 - np.floor(np.log10(np.maximum(np.abs(values), 1e-300))))
+    return np.asarray(np.round(values * scale) / scale)
 
 
 def _scaled(profile: HealthyProfile, rows: Rows, names: Sequence[str]) -> tuple[Array, Array]:
