@@ -111,7 +111,7 @@ def redirect_output(path: Path) -> None:
 
 
 def memory_in_use() -> int:
-    """Resident memory of this process, bytes; where Linux does not tell, the most that it has had."""
+    """Resident memory of this process, bytes; on other systems than Linux its peak."""
     with suppress(OSError):
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
