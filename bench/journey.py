@@ -94,13 +94,13 @@ def main() -> None:
     for run in args.runs:
         with browsing() as page, serving() as served:  # without simulated episodes of a previous run
             journey = travel(page, served.url, run, args.screens)
-            cpu = served.jobs_cpu
+            cpu = served.children_cpu
         seconds = journey.stages[-1][1]
         print(f"  {', '.join(f'{stage} {time:.0f} s' for stage, time in journey.stages)}")
         print(f"  clicks: {journey.clicks} (bar: <= {CLICKS}); scrolled to: {', '.join(journey.scrolled) or 'none'}")
         print(
             f"  time to the promoted checkpoint: {seconds:.0f} s (bar: <= {SECONDS:.0f} s), "
-            f"{cpu:.0f} s of CPU time in jobs, load {os.getloadavg()[0]:.1f}",
+            f"{cpu:.0f} s of CPU time of jobs and filters, load {os.getloadavg()[0]:.1f}",
             flush=True,
         )
 

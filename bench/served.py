@@ -35,22 +35,28 @@ class Served:
 
     @property
     def cpu(self) -> float:
-        """CPU time of the server without its jobs, s."""
-        return self._seconds(11)
+        """CPU time of the server without its other processes, s."""
+        return _seconds(self.process.pid, 11)
 
     @property
-    def jobs_cpu(self) -> float:
-        """CPU time of ended jobs and their processes, s."""
-        return self._seconds(13)
-
-    def _seconds(self, field: int) -> float:
-        """User and system time from two fields of ``stat``, counted after the name of the process."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[field]) + int(fields[field + 1])) / os.sysconf("SC_CLK_TCK")
+    def children_cpu(self) -> float:
+        """CPU time of the server's other processes, which run jobs and filters, s."""
+        running = [
+            pid
+            for path in Path(f"/proc/{self.process.pid}/task").glob("*/children")
+            for pid in path.read_text().split()
+        ]
+        return _seconds(self.process.pid, 13) + sum(_seconds(pid, field) for pid in running for field in (11, 13))
 
     def _status(self, key: str) -> int:
         lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
         return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:"))
+
+
+def _seconds(pid: int | str, field: int) -> float:
+    """User and system time from two fields of ``stat``, counted after the name of the process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[field]) + int(fields[field + 1])) / os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager
