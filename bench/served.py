@@ -41,11 +41,8 @@ class Served:
     @property
     def children_cpu(self) -> float:
         """CPU time of the server's other processes, which run jobs and filters, s."""
-        running = [
-            pid
-            for path in Path(f"/proc/{self.process.pid}/task").glob("*/children")
-            for pid in path.read_text().split()
-        ]
+        tasks = Path(f"/proc/{self.process.pid}/task").glob("*/children")
+        running = [pid for path in tasks for pid in path.read_text().split()]
         return _seconds(self.process.pid, 13) + sum(_seconds(pid, field) for pid in running for field in (11, 13))
 
     def _status(self, key: str) -> int:
