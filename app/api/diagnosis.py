@@ -63,14 +63,14 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         "/api/repair/{task}/{filter}/{episode}", response_model=SmallestRepair, responses={202: {"model": JobReply}}
     )
     def get_repair(selection: RequestedRun) -> Response:
-        return result_or_job(jobs, "repair", store.key(selection))
+        return result_or_job(jobs, "repair", _repair_key(store, selection))
 
     @router.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
     def search_repair(selection: RequestedRun) -> JobReply:
         arguments = {"settings": store.settings.to_json(), "selection": selection.to_json()}
         link = _link(selection, store.dataset(selection.task, selection.data)[0], "episode")
         title = f"Smallest repair of {selection.describe()}"
-        return JobReply(job=jobs.submit("repair", title, arguments, store.key(selection), link))
+        return JobReply(job=jobs.submit("repair", title, arguments, _repair_key(store, selection), link))
 
     @router.get(
         "/api/healthy-record/{task}/{filter}", response_model=HealthyRecord, responses={202: {"model": JobReply}}
@@ -142,6 +142,11 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
 def _key(store: TraceStore, arguments: Mapping[str, Any]) -> object:
     """Everything that a diagnosis depends on, given the arguments of its job."""
     return key_over_episodes(store, arguments), store.record_version(arguments["task"], arguments["filter"])
+
+
+def _repair_key(store: TraceStore, selection: Selection) -> object:
+    """Everything that a repair depends on: the bound of its error is that of the healthy record."""
+    return store.key(selection), store.record_version(selection.task, selection.filter)
 
 
 def _record_arguments(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:

@@ -126,13 +126,15 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
             time.sleep(0.05)
         assert answer.json()["data"].endswith("held-out episodes of sample")
         assert "no_diagnosis" not in client.get(url).text
-        first = start_and_cancel(client, url)
+        repair = url.replace("diagnosis", "repair")
+        first = [start_and_cancel(client, url), start_and_cancel(client, repair)]
         again = client.post(record).json()["job"]  # a measured record again
         assert again["state"] in ("waiting", "running")
         client.delete(f"/api/jobs/{again['id']}")
         (path,) = (tmp_path / "healthy").iterdir()
         os.utime(path)  # as if it had been measured again
-        assert start_and_cancel(client, url) != first  # the diagnosis is computed again, too
+        assert start_and_cancel(client, url) != first[0]  # the diagnosis is computed again, too
+        assert start_and_cancel(client, repair) != first[1]  # and the repair, whose bound is from the record
     with open_client(settings) as client:  # the record is kept in the workspace
         while (reply := client.get(url, params={"faults": FAULTS})).status_code == 202 and "progress" in reply.json():
             time.sleep(0.05)
