@@ -49,17 +49,9 @@ KINDS = {
     "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
     "object offset": ("distance of the object in the image from its labelled position{axis}", False, 0.1),
     "object match": ("similarity of the object in the image to healthy images{axis}", True, 0.05),
-    "contact distance": (
-        "distance of the hand from the labelled object beyond healthy ones{axis}",
-        False,
-        5e-4,
-    ),
+    "contact distance": ("distance of the hand from the labelled object beyond healthy ones{axis}", False, 5e-4),
     "contact distance error": ("deviation of the hand from the labelled object{axis}", False, 5e-4),
-    "contact distance scatter": (
-        "variation of the hand's deviation between episodes{axis}",
-        False,
-        5e-4,
-    ),
+    "contact distance scatter": ("variation of the hand's deviation between episodes{axis}", False, 5e-4),
     "offset": ("offset{of} from the measured hand or the estimates", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
@@ -116,16 +108,14 @@ RISING = frozenset(
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 
+LENGTHS = ("contact distance", "contact distance error", "contact distance scatter", "lever", "position noise")
+"""Kinds of statistics in m."""
+
 OF_KINDS = {
     "angle error": display_unit("rad"),
     **dict.fromkeys(("shift", "hand offset", "object offset"), ("px", 1.0)),
     "unflagged force": ("N", 1.0),
-    "lever": display_unit("m"),
-    "position noise": display_unit("m"),
-    **dict.fromkeys(
-        ("contact distance", "contact distance error", "contact distance scatter"),
-        display_unit("m"),
-    ),
+    **dict.fromkeys(LENGTHS, display_unit("m")),
 }
 """Kind of statistic -> its unit for display, and the factor from its own."""
 

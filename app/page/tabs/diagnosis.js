@@ -373,7 +373,7 @@ function aboutOf({
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */
-export function recoveredText({ error, low, high, nll, measure = 'position' }) {
+export function recoveredText({ error, low, high, nll, measure }) {
   const change = (nll ?? 0) < 0 ? 'increases' : 'decreases';
   const size = nll === null ? '?' : fixed(Math.abs(nll), 2);
   const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
