@@ -14,10 +14,13 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.door_field import DOOR_FIELD
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.simulation.push_field import PUSH_FIELD
+from beliefscope.datasets.simulation.push_field_yaw import PUSH_FIELD_YAW
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import check_definition, difference, task_from_json, task_to_json, with_functions
 
-TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, DOOR_FIELD, PUSH_FIELD, *PUSH_REAL_TASKS)}
+TASKS: dict[str, Task] = {
+    task.name: task for task in (DOOR, PUSH, DOOR_FIELD, PUSH_FIELD, PUSH_FIELD_YAW, *PUSH_REAL_TASKS)
+}
 """Shipped tasks by name."""
 
 

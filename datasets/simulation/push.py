@@ -5,6 +5,7 @@ World frame: the robot's base, x forward, y left, z up; m.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -35,6 +36,7 @@ from beliefscope.datasets.simulation.simulate import (
 from beliefscope.datasets.task import Component, Outline, Task
 
 Vector = NDArray[np.float64]
+Size = tuple[float, float, float]
 
 RADIUS, HEIGHT = 0.05, 0.06  # m
 FRICTION = 0.45
@@ -67,6 +69,31 @@ class PuckPhysics:
     mass: float = 0.6
     friction: float = FRICTION
 
+    @property
+    def geom(self) -> tuple[mujoco.mjtGeom, Size]:
+        """Type and size of its geom."""
+        return mujoco.mjtGeom.mjGEOM_CYLINDER, (self.radius, HEIGHT / 2, 0.0)
+
+
+@dataclass(frozen=True)
+class BlockPhysics:
+    """Parameters of a rectangular block in place of the puck: length and width, m; mass, kg; friction coefficient."""
+
+    length: float = 0.12
+    width: float = 0.075
+    mass: float = 0.6
+    friction: float = FRICTION
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal, m."""
+        return math.hypot(self.length, self.width) / 2
+
+    @property
+    def geom(self) -> tuple[mujoco.mjtGeom, Size]:
+        """Type and size of its geom."""
+        return mujoco.mjtGeom.mjGEOM_BOX, (self.length / 2, self.width / 2, HEIGHT / 2)
+
 
 class PushPuck(Policy):
     """Repeatedly descends behind the puck, pushes it to a random target, retracts and rises.
@@ -78,7 +105,7 @@ class PushPuck(Policy):
     squeeze = False
     clearance = (0.01, 0.03)  # range of the distance between fingers and puck before a push, m
 
-    def __init__(self, rng: Generator, puck: PuckPhysics = PuckPhysics()) -> None:
+    def __init__(self, rng: Generator, puck: PuckPhysics | BlockPhysics = PuckPhysics()) -> None:
         self._rng, self._radius = rng, puck.radius
         start = quantise(self._around(HALF_RANGE), POSITION_BITS)
         self.object_start = np.array([*start, HEIGHT / 2, 1.0, 0.0, 0.0, 0.0])
@@ -159,7 +186,7 @@ def puck_outline(states: ArrayLike) -> Outline:
 
 def push_model(
     visual: bool = False,
-    puck: PuckPhysics = PuckPhysics(),
+    puck: PuckPhysics | BlockPhysics = PuckPhysics(),
     sleeve: Sleeve | None = None,
 ) -> mujoco.MjModel:
     """Model of robot, puck and ground. The puck's free joint is last in qpos.
@@ -183,10 +210,11 @@ def push_model(
     )
     body = world.add_body(name="puck", pos=(*CENTRE, HEIGHT / 2))
     body.add_freejoint(name="puck")
+    kind, size = puck.geom
     body.add_geom(
         name="puck",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=(puck.radius, HEIGHT / 2, 0),
+        type=kind,
+        size=size,
         rgba=(0.9, 0.75, 0.3, 1),
         mass=puck.mass,
         friction=(puck.friction, 5e-3, 1e-4),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import mujoco
@@ -24,13 +24,32 @@ from beliefscope.datasets.simulation.ingredients import (
     start_ingredient,
     wrist,
 )
-from beliefscope.datasets.simulation.push import CAMERA, CENTRE, IMPEDANCE, PUSH, PuckPhysics, PushPuck, push_model
-from beliefscope.datasets.simulation.simulate import DT, ROBOT_JOINTS, Scene, Waypoint, first_free_start, simulate
-from beliefscope.datasets.task import Ingredient
+from beliefscope.datasets.simulation.push import (
+    CAMERA,
+    CENTRE,
+    IMPEDANCE,
+    PUSH,
+    BlockPhysics,
+    PuckPhysics,
+    PushPuck,
+    push_model,
+)
+from beliefscope.datasets.simulation.simulate import (
+    DT,
+    ROBOT_JOINTS,
+    Policy,
+    Scene,
+    Waypoint,
+    first_free_start,
+    simulate,
+)
+from beliefscope.datasets.task import Ingredient, Task
 
 Vector = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2
+PUCK = slice(ROBOT_JOINTS, ROBOT_JOINTS + 2)
+"""Where the puck's position is in qpos."""
 
 
 class PushPuckWithAimError(PushPuck):
@@ -38,7 +57,7 @@ class PushPuckWithAimError(PushPuck):
 
     clearance = (0.03, 0.05)  # wider, so that the fingers seldom descend onto the puck
 
-    def __init__(self, rng: Generator, puck: PuckPhysics, aim: float) -> None:
+    def __init__(self, rng: Generator, puck: PuckPhysics | BlockPhysics, aim: float) -> None:
         """aim: standard deviation of the error along each axis, m."""
         super().__init__(rng, puck)
         self._aim = aim
@@ -83,7 +102,26 @@ def simulate_push_field(seed: int, index: int, steps: int, without: Collection[s
 def _simulate(rng: Generator, seed: int, index: int, steps: int, without: Collection[str]) -> Episode:
     draws = draw(PUSH_FIELD, seed, index, without)
     puck = PuckPhysics(**draws["puck"].values) if "puck" in draws else PuckPhysics()
-    aim = draws["aim"].values["std"] if "aim" in draws else 0.0
+    policy = PushPuckWithAimError(rng, puck, aim_error(draws))
+    return simulate_draws(PUSH_FIELD, draws, puck, policy, lambda qpos: qpos[:, PUCK], seed, index, steps)
+
+
+def aim_error(draws: Draws) -> float:
+    """Standard deviation of the error of the policy's aim, m."""
+    return draws["aim"].values["std"] if "aim" in draws else 0.0
+
+
+def simulate_draws(
+    task: Task,
+    draws: Draws,
+    puck: PuckPhysics | BlockPhysics,
+    policy: Policy,
+    states: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    seed: int,
+    index: int,
+    steps: int,
+) -> Episode:
+    """An episode of a field task with a pushed object and drawn ingredients. states: of ``simulate``."""
     nudges = Nudges(draws, puck.friction, steps) if "nudges" in draws else None
     scene = Scene(
         push_model(puck=puck, sleeve=drawn_sleeve(draws)),
@@ -93,16 +131,16 @@ def _simulate(rng: Generator, seed: int, index: int, steps: int, without: Collec
         disturb=nudges,
     )
     episode = simulate(
-        PUSH_FIELD,
+        task,
         scene,
-        PushPuckWithAimError(rng, puck, aim),
-        lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],
+        policy,
+        states,
         seed,
         index,
         steps,
         {"policy": "push"},
     )
-    return finish(PUSH_FIELD, episode, draws, {"nudges": [] if nudges is None else nudges.steps})
+    return finish(task, episode, draws, {"nudges": [] if nudges is None else nudges.steps})
 
 
 def _replay(episode: Episode) -> mujoco.MjModel:

@@ -20,11 +20,12 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.door_field import DOOR_FIELD, simulate_door_field
 from beliefscope.datasets.simulation.ingredients import draw
 from beliefscope.datasets.simulation.push_field import PUSH_FIELD, simulate_push_field
+from beliefscope.datasets.simulation.push_field_yaw import PUSH_FIELD_YAW
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.store import open_dataset
 from beliefscope.datasets.task import Task
 
-FIELD_TASKS = (DOOR_FIELD, PUSH_FIELD)
+FIELD_TASKS = (DOOR_FIELD, PUSH_FIELD, PUSH_FIELD_YAW)
 STEPS = 60
 SENSORS = {"camera-pose", "sleeve", "image-quality", "outages", "wrist", "hand-pose"}
 
@@ -116,7 +117,7 @@ def test_without_ingredients_only_the_control_loop_differs_from_the_paper_task()
 def test_controls_do_not_depend_on_the_measured_hand(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     """A controller that holds the hand back changes the measured positions, but not the commanded path."""
     before = simulated(task, index=1, steps=12)
-    module = {"push-field": push_field, "door-field": door_field}[task.name]
+    module = door_field if task is DOOR_FIELD else push_field
     monkeypatch.setattr(module, "IMPEDANCE", replace(module.IMPEDANCE, lead=0.005))
     after = simulated(task, index=1, steps=12)
     difference = after.observations["effector_position"] - before.observations["effector_position"]
@@ -150,10 +151,18 @@ def test_replay_has_the_object_of_the_episode(task: Task, episode: Episode) -> N
     if task is PUSH_FIELD:
         assert model.geom("puck").size[0] == pytest.approx(values["puck"]["radius"])
         np.testing.assert_allclose(replayed.positions[:, model.body("puck").id, :2], episode.states, atol=1e-7)
+    elif task is PUSH_FIELD_YAW:
+        expected = [values["block"]["length"] / 2, values["block"]["width"] / 2]
+        np.testing.assert_allclose(model.geom("puck").size[:2], expected)
+        along = replayed.rotations[:, model.body("puck").id, :2, 0]  # the x axis of the block
+        yaw = episode.states[:, 2]
+        # The block tilts by less than a degree, and positions of joints are rounded.
+        np.testing.assert_allclose(along, np.stack([np.cos(yaw), np.sin(yaw)], axis=1), atol=2e-3)
+        assert np.ptp(yaw) > 0.02, "pushes turn the block"
     else:
         assert 2 * model.geom("panel").size[1] == pytest.approx(values["panel"]["width"])
         np.testing.assert_allclose(replayed.positions[:, model.body("door").id, :2], episode.states[:, :2], atol=1e-7)
-    broken = replace(episode, provenance={**episode.provenance, "ingredients": {"puck": {"size": 1}, "panel": 3}})
+    broken = replace(episode, provenance={**episode.provenance, "ingredients": {"puck": {"size": 1}, "block": {"size": 1}, "panel": 3}})
     with pytest.raises(BadInput, match="provenance does not describe its"):
         replay(task, broken)
 
