@@ -91,5 +91,7 @@ def _profile(checkpoint: Checkpoint, clean: Path | None) -> HealthyProfile:
                 f"filter {checkpoint.name!r} has no healthy record; give clean episodes, --profile-from DATA"
             )
         return profile
-    with open_dataset(clean) as data:
-        return profile_of(checkpoint, [data[index] for index in data.held_out()], str(clean))
+    with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
+        indices = data.held_out()
+        episodes = [data[index] for index in indices]
+        return profile_of(checkpoint, episodes, str(clean), progress=advance, indices=indices)
