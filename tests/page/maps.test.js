@@ -330,11 +330,13 @@ test('SVG drawing', () => {
   context.lineTo(1.234, 5);
   context.stroke();
   context.fillText('a < b', 0, 0);
+  context.fillText('−2000', 0, 0, 12);
   context.restore();
   const svg = context.document(10, 20);
   assert.match(svg, /^<svg [^>]*viewBox="0 0 10 20">/);
   assert.match(svg, /d="M0 0L1\.23 5" fill="none" stroke="rgb\(0,0,0\)" stroke-opacity="0\.3"/);
-  assert.match(svg, />a &#60; b</);
+  assert.match(svg, /"[^>]*font[^>]*">a &#60; b</);
+  assert.match(svg, /textLength="12" lengthAdjust="spacingAndGlyphs">−2000</);
   assert.equal(svg.split('<g').length, svg.split('</g').length);
 });
 

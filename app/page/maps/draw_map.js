@@ -134,7 +134,7 @@ function drawAxes(context, maps, side, { axes, zoom, textColour, withY, named })
     context.textBaseline = BASELINE[end];
     context.moveTo(0, side - place);
     context.lineTo(-3, side - place);
-    context.fillText(text, -5, side - place);
+    context.fillText(text, -5, side - place, MARGIN.left - 5); // narrows a long label: no minus sign is cut off
   }
   context.stroke();
   if (!named) return;

@@ -125,11 +125,13 @@ export class SvgContext {
     this.#openGroup(`transform="rotate(${number((radians * 180) / Math.PI)})"`);
   }
 
-  /** @param {string} text @param {number} x @param {number} y */
-  fillText(text, x, y) {
+  /** @param {string} text @param {number} x @param {number} y @param {number} [widest] px; a longer text is narrowed */
+  fillText(text, x, y, widest = Infinity) {
+    const narrowed = this.measureText(text).width > widest;
+    const fit = narrowed ? ` textLength="${number(widest)}" lengthAdjust="spacingAndGlyphs"` : '';
     const style = `text-anchor="${ANCHORS[this.textAlign]}" dy="${BASELINES[this.textBaseline]}" style="font: ${escape(this.font)}"`;
     this.#write(
-      `<text x="${number(x)}" y="${number(y)}" ${paint('fill', this.fillStyle)} ${style}>${escape(text)}</text>`,
+      `<text x="${number(x)}" y="${number(y)}" ${paint('fill', this.fillStyle)} ${style}${fit}>${escape(text)}</text>`,
     );
   }
 
