@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     base=opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's."),
     alarm_rate=opt.option("P", "Probability that a healthy filter raises an alarm."),
     profile_from=opt.option("DATA", "Clean episodes whose held-out ones become the healthy record."),
+    profile_filter=opt.option(
+        "NAME|CHECKPOINT|MODULE:BUILD",
+        "Filter that runs over --profile-from. Default: --filter.",
+    ),
     repair=opt.option("I", "Also search the smallest repair of this episode's failure.", parser=opt.integer(0)),
 )
 def diagnose(
@@ -24,6 +28,7 @@ def diagnose(
     base: Path | None = None,
     alarm_rate: float = 0.02,
     profile_from: Path | None = None,
+    profile_filter: str | None = None,
     repair: int | None = None,
     workers: int = 1,
     engine: opt.Engine = "local",
@@ -41,6 +46,7 @@ def diagnose(
       beliefscope diagnose door --filter mine.safetensors --data door.h5 --base crossmodal-ekf --episode 3
       beliefscope diagnose push --filter crossmodal-pf --faults image_occluded=14:from=40:to=60 --repair 142
       beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from door.h5
+      beliefscope diagnose door --filter new.py:build --profile-from door.h5 --profile-filter old.py:build
     """
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
@@ -49,13 +55,16 @@ def diagnose(
 
     if not 0.0 < alarm_rate < 1.0:
         raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
+    if profile_filter is not None and profile_from is None:
+        raise BadInput("--profile-filter needs --profile-from, the clean episodes that it runs over")
     checkpoint, faults = runs.open()
+    correct = checkpoint if profile_filter is None else open_filter(checkpoint.task, profile_filter)
     other = None if base is None else open_filter(checkpoint.task, str(base))
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
         episodes = faults.apply_all(data, indices, runs.seed)
         failed = None if repair is None else data[repair]
-    profile = _profile(checkpoint, profile_from)
+    profile = _profile(correct, profile_from)
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,

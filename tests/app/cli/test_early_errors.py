@@ -49,6 +49,7 @@ EDIT = ("counterfactual", "door", "--faults", "blackout", "--from", 40)
         (("figure", "maps", "door", "-o", "new.svg", "--step", 900), "step 900 is not in this episode"),
         (("figure", "maps", "door", "-o", "new.svg", "--step", 0, "--step", 1), "steps 0 and 1 are both in"),
         (("diagnose", "door", "--repair", 9999), "Episode 9999 is not in"),
+        (("diagnose", "door", "--profile-filter", "crossmodal-ekf"), "--profile-filter needs --profile-from"),
         (("failures", "door", "--by", "eror"), "'eror' does not exist"),
         (("failures", "door", "--url", "foo"), "--url 'foo' is not an address such as http://127.0.0.1:8000"),
         (("evaluate", "door", "--start-offset", "3K"), "start offset '3K' is not in a unit of task 'door': cm, deg"),
