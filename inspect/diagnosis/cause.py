@@ -193,19 +193,21 @@ class Diagnosis:
     def tables(self) -> list[Table]:
         """The ranked causes, the evidence and next action of each, and what was not measured.
 
-        The largest deviations take the place of causes if none is listed.
+        The largest deviations take the place of causes if none is listed, and of evidence if there is none.
         """
         causes = self.listed
         unmeasured = tuple((text,) for text in self.provenance.get("unmeasured", ()))
         missing = [Table("Not measured in these episodes", ("sensor or statistic",), unmeasured)] if unmeasured else []
+        largest = [((), deviation) for deviation in self.deviations]
+        largest_table = [_evidence_table("Largest deviations", (), largest)] if largest else []
         if not causes:
-            rows = [((), deviation) for deviation in self.deviations]
-            return [*([_evidence_table("Largest deviations", (), rows)] if rows else []), *missing]
+            return [*largest_table, *missing]
         ranked = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
         actions = tuple((c.cause.name, c.next) for c in causes)
+        rows = [((c.cause.name,), e) for c in causes for e in c.evidence]
         return [
             Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), ranked),
-            _evidence_table("Evidence", ("cause",), [((c.cause.name,), e) for c in causes for e in c.evidence]),
+            *([_evidence_table("Evidence", ("cause",), rows)] if rows else largest_table),
             Table("Next", ("cause", "action"), actions),
             *missing,
         ]
