@@ -1,7 +1,9 @@
 """Errors caused by user input."""
 
 from collections.abc import Container
+from contextlib import suppress
 from difflib import get_close_matches
+from pathlib import Path
 
 LONG_LIST = 12
 """Names that a reader compares at a glance."""
@@ -33,3 +35,11 @@ def unknown_name(kind: str, name: str, available: object) -> BadInput:
     similar = get_close_matches(name, names, n=2) if len(names) > LONG_LIST else []
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
     return BadInput(f"{kind} {name!r} does not exist.{hint} Available: {', '.join(names) or 'none'}.")
+
+
+def reason_unreadable(path: Path, error: Exception) -> str:
+    """Why a file is no readable safetensors file: it is an HDF5 file, or the message of the library's error."""
+    with suppress(OSError), path.open("rb") as file:
+        if file.read(8) == b"\x89HDF\r\n\x1a\n":
+            return "it is an HDF5 file, such as a data set"
+    return f"{error!s:.200}"

@@ -23,7 +23,7 @@ from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, reason_unreadable
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
@@ -104,7 +104,7 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise BadInput(f"{str(path)!r} is not a readable safetensors file: {error}") from None
+        raise BadInput(f"{str(path)!r} is not a readable safetensors file: {reason_unreadable(path, error)}") from None
     header = _header(path, metadata)
     task = stored_task(header.get("task", header["architecture"].get("task")), given)
     architecture = Architecture.from_json(header["architecture"], task)

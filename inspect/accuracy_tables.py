@@ -20,12 +20,15 @@ LABELS = {
 def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
     """The metrics of a filter and its baselines, a row for each measure; then those of its modalities, if any.
 
+    Without steps that the errors omit, those from step 0 are the same and have no rows.
+
     metrics: of ``filters.evaluate.Metrics.to_dict``.
     """
     columns = [metrics, *(baseline or {} for baseline in metrics["baselines"].values())]
     rows = [
         (f"rmse {name}{label}", *(_number(column.get(key, {}).get(name)) for column in columns))
         for key, label in LABELS.items()
+        if key == "rmse" or metrics.get(key) != metrics["rmse"]
         for name in metrics.get(key, {})
     ]
     rows += [(name, _number(metrics[name]), "", "") for name in ("nll", "nees", "coverage95")]

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, reason_unreadable
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
@@ -34,7 +34,7 @@ def load_weights(module: object, path: Path, place: str) -> None:
     try:
         module.load_state_dict(load_file(path))
     except (OSError, SafetensorError) as error:
-        raise BadInput(f"weights {str(path)!r} cannot be read: {error!s:.200}") from None
+        raise BadInput(f"weights {str(path)!r} cannot be read: {reason_unreadable(path, error)}") from None
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise BadInput(f"weights {str(path)!r} do not fit {place}: {reason:.200}") from None

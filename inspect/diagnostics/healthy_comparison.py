@@ -17,7 +17,7 @@ import numpy as np
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile
-from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LEVER, RISING, label_of, unit_of
+from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LEVER, LOST, RISING, label_of, unit_of
 from beliefscope.inspect.diagnostics.views import Table
 
 SIGNIFICANCE = 0.01
@@ -37,6 +37,9 @@ CRITICAL = 0.05
 
 SMALLEST_T = 2.0
 """Lower limit of this quantile."""
+
+SMALLEST_REST = 0.005
+"""Smallest share of remaining readings that is distinguished from none."""
 
 MIN_HEALTHY = 10
 """Minimum number of healthy trajectories with a value of a statistic."""
@@ -227,7 +230,9 @@ def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np
     logarithmic = np.array([s[1] for s in settings])
     floor = np.array([s[2] * (LEVER if "/torque " in n else 1.0) for n, s in zip(names, settings, strict=True)])
     rising = np.array([name.split("/")[0] in RISING or name.endswith("/range") for name in names])
-    return np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values), floor, rising
+    lost = np.array([name.split("/")[0] in LOST for name in names])
+    scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
+    return np.where(lost, -np.log(np.maximum(1.0 - values, SMALLEST_REST)), scaled), floor, rising
 
 
 @lru_cache(maxsize=16)

@@ -108,6 +108,10 @@ RISING = frozenset(
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 
+LOST = frozenset({"black"})
+"""Kinds of shares of lost readings, which are compared by minus the logarithm of the remaining share: with outages in
+healthy episodes, the loss of all readings is further from the loss of most than that from the loss of few."""
+
 LENGTHS = ("contact distance", "contact distance error", "contact distance scatter", "lever", "position noise")
 """Kinds of statistics in m."""
 

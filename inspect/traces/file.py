@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 
 from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, reason_unreadable
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.io.atomic_write import replacing
 from beliefscope.datasets.io.strict_json import read_json
@@ -137,7 +137,7 @@ def load_trace(path: Path, given: Iterable[Task] = ()) -> Trace:
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
         header = read_json(metadata.get("beliefscope-trace", "null"))
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise BadInput(f"{str(path)!r} is not a readable trace: {error}") from None
+        raise BadInput(f"{str(path)!r} is not a readable trace: {reason_unreadable(path, error)}") from None
     if not isinstance(header, dict):
         raise BadInput(f"{str(path)!r} is a safetensors file, but not a Beliefscope trace")
     if (version := header.pop("format", None)) != FORMAT:

@@ -20,7 +20,7 @@ def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: A
     step = page.state["step"]
     finding = page.page.locator("#finding .sentence")
     assert f"goes dark at step {step + 1}, in contact; haptics takes over" in finding.text_content()
-    assert "The effective weight of haptics in x rises" in finding.text_content()
+    assert "The mean effective weight of haptics in x rises" in finding.text_content()
     parts = ["#finding strong", "#finding span", "#heatmaps canvas", "#step-table", "#tracks .cursor", "#intro .chip"]
     assert page.page.evaluate(VISIBLE, parts) == []
     assert not page.violations()

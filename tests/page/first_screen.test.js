@@ -56,7 +56,7 @@ test('the finding describes the outage in contact, with weights, error and its e
     headline:
       'The camera goes dark at step 8, in contact; haptics takes over until the image returns at step 15.',
     evidence:
-      'The effective weight of haptics rises from 25 % to 90 %; the position error stays below 1.3 cm.',
+      'The mean effective weight of haptics rises from 25 % before to 90 % in the outage; the position error stays below 1.3 cm.',
     step: 8,
   });
   assert.match(outageFinding(run(STEPS - 1), 0)?.headline ?? '', /takes over to the end\.$/);
@@ -66,7 +66,7 @@ test('no modality takes over whose weight stays low', () => {
   const weak = { ...run(14), weight: () => series((t) => (t >= 8 ? 0.4 : 0.25)) };
   const result = outageFinding(weak, 0);
   assert.match(result?.headline ?? '', /in contact, until the image returns at step 15\.$/);
-  assert.match(result?.evidence ?? '', /rises from 25 % to 40 %/);
+  assert.match(result?.evidence ?? '', /rises from 25 % before to 40 % in the outage/);
 });
 
 test('a weight that does not react to an outage stays, although the image is lost', () => {

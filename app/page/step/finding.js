@@ -140,7 +140,7 @@ export function outageFinding(trace, component) {
   const scope = weightScope(trace, component);
   const evidence = weights.map(
     ({ name, before, during }) =>
-      `the effective weight of ${name}${scope} ${change(before, during)}`,
+      `the mean effective weight of ${name}${scope} ${change(before, during)}`,
   );
   const worst = Math.max(...(trace.error('fused', 'main')?.subarray(first, last + 1) ?? [NaN]));
   if (worst >= 0)
@@ -173,7 +173,7 @@ export function largest(values) {
  */
 function change(before, during) {
   if (Math.abs(during - before) >= MIN_CHANGE)
-    return `${during > before ? 'rises' : 'falls'} from ${percent(before)} to ${percent(during)}`;
+    return `${during > before ? 'rises' : 'falls'} from ${percent(before)} before to ${percent(during)} in the outage`;
   return `stays at ${percent(during)}${during < 1 - MIN_CHANGE ? ', although the image is lost' : ''}`;
 }
 

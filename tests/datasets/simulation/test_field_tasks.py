@@ -162,7 +162,10 @@ def test_replay_has_the_object_of_the_episode(task: Task, episode: Episode) -> N
     else:
         assert 2 * model.geom("panel").size[1] == pytest.approx(values["panel"]["width"])
         np.testing.assert_allclose(replayed.positions[:, model.body("door").id, :2], episode.states[:, :2], atol=1e-7)
-    broken = replace(episode, provenance={**episode.provenance, "ingredients": {"puck": {"size": 1}, "block": {"size": 1}, "panel": 3}})
+    broken = replace(
+        episode,
+        provenance={**episode.provenance, "ingredients": {"puck": {"size": 1}, "block": {"size": 1}, "panel": 3}},
+    )
     with pytest.raises(BadInput, match="provenance does not describe its"):
         replay(task, broken)
 

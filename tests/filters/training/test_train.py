@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build, filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
@@ -186,6 +187,8 @@ def test_invalid_checkpoint_files(tmp_path: Path) -> None:
     truncated.write_bytes(source.read_bytes()[:5000])
     with pytest.raises(BadInput, match="not a readable safetensors file"):
         load_checkpoint(truncated)
+    with pytest.raises(BadInput, match="it is an HDF5 file, such as a data set"):
+        load_checkpoint(sample_path("door"))
     other = tmp_path / "other.safetensors"
     save_file({"weight": torch.zeros(3)}, other)
     with pytest.raises(BadInput, match=r"FILE\.py:NAME@"):

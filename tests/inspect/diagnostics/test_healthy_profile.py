@@ -225,3 +225,14 @@ def test_included_images_replace_those_of_the_episodes() -> None:
         a, b = (np.array([row[name] for row in record.rows]) for record in (own, included))
         assert np.nanmean(a) == pytest.approx(np.nanmean(b), abs=0.25)  # of 9 episodes, and of 120
     assert included_reference(replace(task, name="unknown")) is None
+
+
+def test_the_loss_of_all_readings_is_an_alarm_although_healthy_episodes_lose_many() -> None:
+    rng = np.random.default_rng(1)
+    columns = {"black/image/all": rng.beta(4.0, 6.0, 120)}
+    assert 0.7 < columns["black/image/all"].max() < 0.9
+    lossy = HealthyProfile("simulated", 120, None, columns)
+    lost, many = (compare(lossy, [{"black/image/all": share}]) for share in (1.0, 0.7))
+    assert bool(lost.alarms)
+    assert not many.alarms
+    assert lost.deviations[0].t > 3.0 * many.deviations[0].t, "the last readings count most"
