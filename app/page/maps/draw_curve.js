@@ -48,7 +48,8 @@ export function drawCurve(context, layer, side, options) {
     if (Number.isFinite(mean)) line(offsetOf(maps, [mean])[0], lineStyle(name).stroke, [2, 3]);
   }
   line(offsetOf(maps, [maps.estimate[axis.index]])[0], lineStyle('fused').stroke, [5, 3]);
-  [context.strokeStyle, context.lineWidth] = [lineStyle(name).stroke, 2];
+  const source = trace.fuses ? name : 'fused'; // as the dot in the title
+  [context.strokeStyle, context.lineWidth] = [lineStyle(source).stroke, 2];
   context.beginPath();
   shade.values.forEach((value, i) => {
     const place = x((((i + 0.5) / maps.size) * 2 - 1) * axis.half_width);
