@@ -39,11 +39,11 @@ class Shot:
 
 
 SHOTS = (
-    Shot("page", OUTAGE, "#maps-scale span"),
+    Shot("page", OUTAGE, "#maps-colour-bar span"),
     Shot("walkthrough-outage", OUTAGE | {"tab": "compare", "against": WITHOUT_HAPTICS}, "#compare .verdict"),
     Shot("diagnosis", FROZEN, "#diagnosis[data-state=ready] .headline"),
     Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Search for failures"),
-    Shot("walkthrough-moment", {"tab": "scene"}, "#maps-scale span"),
+    Shot("walkthrough-moment", {"tab": "scene"}, "#maps-colour-bar span"),
     Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
     Shot("walkthrough-standalone", {"tab": "diagnostics", "diagnostic": "standalone"}, READY, "Compute"),
     Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, READY, "Compute"),

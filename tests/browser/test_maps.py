@@ -150,9 +150,9 @@ def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
         assert page.maps() != before
     top = expected.log_likelihood.max()
     lowest = max(expected.log_likelihood.min(), top - 40.0)
-    ends = page.page.locator("#maps-scale b").all_text_contents()
+    ends = page.page.locator("#maps-colour-bar b").all_text_contents()
     assert [numbers(end)[0] for end in ends] == pytest.approx([lowest, top], abs=0.51)
-    assert page.page.locator("#maps-scale span").text_content() == "log likelihood, nats"
+    assert page.page.locator("#maps-colour-bar span").text_content() == "log likelihood, nats"
     page.screenshot("maps-log-world")
     page.page.locator("#maps-scale label").first.click()
     page.page.keyboard.press("Escape")

@@ -223,7 +223,7 @@ export class MapPanel {
     this.#readout.hide();
     const layers = this.#figures.map(({ name }) => name);
     this.#tiles.draw({ maps, trace: this.#trace, layers, zoom: this.#zoom });
-    this.#tiles.showColours(html('#maps-scale', this.#panel));
+    this.#tiles.showColours(html('#maps-colour-bar', this.#panel));
     html('#maps-axis-names', this.#panel).textContent = axesText(maps, this.#world);
     return tiled;
   }
@@ -233,7 +233,7 @@ export class MapPanel {
    * @param {Reference | null} reference
    */
   #showColours(maps, reference) {
-    const bar = html('#maps-scale', this.#panel);
+    const bar = html('#maps-colour-bar', this.#panel);
     bar.hidden = isCurve(maps);
     const { scale, range } = this.#store.state;
     const layers = this.#figures.map(({ name, shade }, i) => ({
