@@ -5,7 +5,8 @@ import { cssVariable } from '../../app/page/core/palette.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
 import { chartData, shadeIntervals, valueRange } from '../../app/page/timeline/chart.js';
 import { secondsAxis } from '../../app/page/timeline/step_axis.js';
-import { formatValue } from '../../app/page/timeline/legend.js';
+import { trackHeights } from '../../app/page/timeline/layout.js';
+import { formatValue, legendWidth } from '../../app/page/timeline/legend.js';
 import {
   fitWindow,
   formatWindow,
@@ -177,6 +178,23 @@ test('values in legends', () => {
   const track = { title: '', unit: '', series: [] };
   assert.equal(formatValue(1.2345, track), '1.23');
   assert.equal(formatValue(1.2345, { ...track, digits: 1 }), '1.2');
+});
+
+test('legends have room for the longest name, in two columns if it is short', () => {
+  const { haptics, full } = { haptics: 'haptics'.length, full: 'haptics-only update'.length };
+  assert.ok(legendWidth(trace, 'full') > 0.58 * full);
+  assert.ok(legendWidth(trace, 'compact') > 2 * 0.58 * haptics);
+  assert.ok(legendWidth(trace, 'dense') > legendWidth(trace, 'compact'));
+});
+
+test('in a low timeline the chart of areas shrinks first', () => {
+  const names = ['fused', 'a', 'b', 'c', 'd', 'e', 'f', 'truth'];
+  const lines = { series: names.map((name) => ({ name })) };
+  const areas = { series: names.slice(1, 7).map((name) => ({ name, stacked: true })) };
+  const low = trackHeights(/** @type {any} */ ([areas, lines, lines]), 177);
+  assert.deepEqual(low, [51, 63, 63]);
+  const [areaHeight] = trackHeights(/** @type {any} */ ([areas, lines, lines]), 400);
+  assert.ok(areaHeight > 84);
 });
 
 test('the summary of a step names error, deviation and dominant modality', () => {

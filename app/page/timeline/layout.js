@@ -45,32 +45,38 @@ export const isCompact = (height) => height < COMPACT_HEIGHT;
 export const isDense = ({ series }, height) =>
   height < legendHeight(new Set(series.map(({ name }) => name)).size);
 
+/** @param {readonly number[]} values */
+const total = (values) => values.reduce((a, b) => a + b, 0);
+
 /** @param {number} rows */
 const legendHeight = (rows) => 3 + LINE_HEIGHT * (1 + rows);
 
 /**
  * Returns the height of each track in px. Each has room for its legend, stacked ones get most of the rest, and in a low
- * timeline all shrink. The lowest track always has a chart, because of the axis.
+ * timeline the stacked ones shrink first, then all. The lowest track always has a chart, because of the axis.
  * @param {Track[]} tracks
  * @param {number} height px
  */
 export function trackHeights(tracks, height) {
   const compact = isCompact(height + GUTTER.axis);
   const noteOnly = tracks.map(({ note }, i) => Boolean(note) && i < tracks.length - 1);
-  const minimum = tracks.map(({ series }, i) => {
+  const stacked = tracks.map(({ series }) => series.some((item) => item.stacked));
+  const legends = tracks.map(({ series }, i) => {
     if (noteOnly[i]) return NOTE_HEIGHT;
-    const names = new Set(series.map(({ name }) => name));
-    if (series.some(({ stacked }) => stacked)) return STACKED_HEIGHT;
-    const rows = compact ? Math.ceil(names.size / 2) : Math.max(names.size, 2);
-    return legendHeight(rows);
+    const { size } = new Set(series.map(({ name }) => name));
+    const rows = legendHeight(compact ? Math.ceil(size / 2) : Math.max(size, 2));
+    return stacked[i] ? Math.min(rows, STACKED_HEIGHT) : rows;
   });
-  const sum = minimum.reduce((a, b) => a + b, 0);
+  // Where the room is short, the charts of areas shrink first, to the height of their legends.
+  const spare = stacked.map((isStacked, i) => (isStacked ? STACKED_HEIGHT - legends[i] : 0));
+  const room = Math.max(height - total(legends), 0);
+  const part = total(spare) > room ? room / total(spare) : 1;
+  const minimum = legends.map((value, i) => value + part * spare[i]);
+  const sum = total(minimum);
   if (sum >= height) return minimum.map((value) => Math.floor((value / sum) * height));
   /** @type {number[]} */
-  const weights = tracks.map(({ series }, i) =>
-    noteOnly[i] ? 0 : series.some(({ stacked }) => stacked) ? STACKED_WEIGHT : 1,
-  );
-  const share = (height - sum) / weights.reduce((a, b) => a + b, 0);
+  const weights = stacked.map((isStacked, i) => (noteOnly[i] ? 0 : isStacked ? STACKED_WEIGHT : 1));
+  const share = (height - sum) / total(weights);
   return minimum.map((value, i) => Math.floor(value + weights[i] * share));
 }
 

@@ -9,6 +9,9 @@ import { displayName, fixed, significant } from '../core/units.js';
 import { seriesStyle } from './chart.js';
 import { areaSample } from './stack.js';
 
+const CHARACTER = 0.61; // rem
+const SAMPLE_AND_VALUE = { full: 8, compact: 6.3, dense: 7 }; // rem
+
 /** @typedef {{text: Text, track: Track, index: number}} ValueCell index of the series in the track */
 
 /**
@@ -38,7 +41,8 @@ export function legend(track, trace, compared, compact) {
       : lineSample(cssVariable(name), dash, width);
     const short = displayName(name);
     const label = track.ofModalities ? short : trace.label(name);
-    list.append(create('dt', { title: label }, sample, compact && trace.fuses ? short : label));
+    const text = create('span', { textContent: compact && trace.fuses ? short : label });
+    list.append(create('dt', { title: label }, sample, text));
     for (const comparison of compared ? [false, true] : [false]) {
       const text = new Text();
       const index = series.findIndex(
@@ -49,6 +53,20 @@ export function legend(track, trace, compared, compact) {
     }
   }
   return { element: create('div', { className: 'legend' }, heading, list), cells };
+}
+
+/**
+ * Returns the width of a legend that shows its names in full, in rem.
+ * @param {Trace} trace
+ * @param {keyof typeof SAMPLE_AND_VALUE} kind full: one column of labels; else two columns of short names
+ */
+export function legendWidth(trace, kind) {
+  const isFull = kind === 'full';
+  const names = trace.sources.map((name) =>
+    isFull || !trace.fuses ? trace.label(name) : displayName(name),
+  );
+  const width = CHARACTER * Math.max(...names.map(({ length }) => length));
+  return (isFull ? 1 : 2) * (width + SAMPLE_AND_VALUE[kind]);
 }
 
 /**
