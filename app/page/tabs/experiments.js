@@ -28,7 +28,7 @@ const EMPTY = {
   title: 'No sweep yet',
   paragraphs: [
     [
-      'A sweep runs many checkpoints over many episodes. Its table answers which of them fail, where and under which sensor faults; each row opens its worst moment.',
+      'A sweep runs many checkpoints over many episodes. Its table shows which of them fail, where and under which sensor faults; each row opens its worst step.',
     ],
   ],
   purpose: 'To make one, run your checkpoints and serve the results.',
