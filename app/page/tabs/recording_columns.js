@@ -32,9 +32,9 @@ const textColumn = (name, title, help, value) => ({
 const RUN_COLUMNS = [
   textColumn('task', 'task', 'Task', ({ task }) => task),
   textColumn('filter', 'filter', 'Filter', ({ filter }) => filter),
-  { ...textColumn('episode', 'ep.', 'Episode index', ({ episode }) => episode), number: true },
+  { ...textColumn('episode', 'episode', 'Episode index', ({ episode }) => episode), number: true },
   {
-    ...textColumn('faults', 'sensors', 'Sensor faults', ({ task, faults }) =>
+    ...textColumn('faults', 'faults', 'Sensor faults', ({ task, faults }) =>
       task === null ? null : faults || 'as recorded',
     ),
     hint: ({ faults }) => faults,
