@@ -77,8 +77,9 @@ def reason(filter_: Filter) -> str:
     if not settings.mix:
         return ""
     ((slice_, _),) = settings.mix
+    modules = settings.train[0].replace("-", " ")
     return (
         f"Shipped filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which multiplies their "
-        f"error; by default, the modules of \u201c{settings.train[0]}\u201d learn from data with this fault. If this "
+        f"error; by default, the modules of \u201c{modules}\u201d learn from data with this fault. If this "
         "brings no change, try other modules or faults."
     )

@@ -60,7 +60,7 @@ const BODY = `
     <h4 id="data-title"><b>3</b> Data and success criterion</h4>
     <div class="row">
       <label title="Data slice to train on">Train on <select name="slice"></select></label>
-      <label>Sensors <select name="faults"></select></label>
+      <label>Faults <select name="faults"></select></label>
     </div>
     <details><summary>More settings</summary>
       <div class="row">

@@ -7,7 +7,6 @@ import { create, element, html } from '../core/dom.js';
 import {
   displayName,
   fixed,
-  mainName,
   mainText,
   mainUnit,
   percent,
@@ -256,9 +255,14 @@ function progressFigures({ losses, validations, steps }, task, settings) {
         { name: 'limit of the others', layer: 'truth', x: [0, steps], y: [others, others] },
       ]
     : [];
-  const loss = { name: '', layer: '', x: losses.map(([step]) => step), y: losses.map((l) => l[1]) };
+  const loss = {
+    name: '',
+    layer: '',
+    x: [0, ...losses.map(([step]) => step), steps], // the same steps as above
+    y: [null, ...losses.map(([, value]) => value), null],
+  };
   const plots = [
-    linePlot('Validation', `change of the ${mainName(task)} error, %`, [...errors, ...bounds]),
+    linePlot('Validation', `change of the ${task.main.name} error, %`, [...errors, ...bounds]),
     linePlot('Loss', '', losses.length ? [loss] : []),
   ];
   return {

@@ -1,7 +1,7 @@
 /** The fine-tuning runs of a task: their criterion and outcome in a table, their validations in one chart. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Plot } from '../types/server.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Job, Plot } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
@@ -85,10 +85,10 @@ export class FinetuneRuns {
     link.addEventListener('click', () => this.#store.set({ run: run.run }));
     const [target, ...others] = success?.slices ?? [];
     const worst = others.sort((a, b) => Number(b.change) - Number(a.change))[0];
-    const state = run.finetuned ? 'no criterion' : job ? jobSummary(job) : 'removed';
+    const state = run.finetuned ? 'no criterion' : job ? stateOf(job) : 'removed';
     const texts = [
       run.filter,
-      settings.train.join(', '),
+      settings.train.map((name) => name.replace(/-only$/, ' only')).join(', '),
       trainingData(run),
       settings.success ? criterionText(settings.success) : '–',
       success?.outcome ?? state,
@@ -177,10 +177,18 @@ export function changes(validations, slice, key) {
   return [first, ...others].map((value) => 100 * (value / first - 1));
 }
 
+/** @param {Job} job */
+const stateOf = (job) =>
+  job.state === 'running' ? `running, ${percent(job.progress)}` : jobSummary(job);
+
+/** @param {number} value */
+const signedPercent = (value) => `${value >= 0.005 ? '+' : ''}${percent(value)}`;
+
 /**
  * @param {{change: number | null, low: number | null, high: number | null}} slice
  */
 export function changeText({ change, low, high }) {
-  const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
-  return `${percent(change ?? NaN)}${range}`;
+  const range =
+    low === null || high === null ? '' : ` (${signedPercent(low)} to ${signedPercent(high)})`;
+  return `${signedPercent(change ?? NaN)}${range}`;
 }
