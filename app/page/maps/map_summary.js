@@ -198,7 +198,8 @@ function shapeText({ numbers, shape: shapes, axes }, layer) {
     };
   }
   if (shape !== 'ridge') return { short: shape, long: `${ratio}shape: ${shape}` };
-  const direction = `ridge ${fixed(degrees(axis), 0)}°`;
+  const angle = Math.round(degrees(axis) ?? NaN);
+  const direction = `ridge ${fixed(angle > -90 ? angle : angle + 180, 0)}°`;
   const off = deviation === null ? '' : `, ${fixed(degrees(deviation), 0)}° off`;
   return {
     short: `${direction}, ${elongation}:1${off && `${off} expected`}`,
