@@ -365,6 +365,8 @@ function summary({ preset }, results, { quantity, start, filters }) {
   if (!opened.length) return `${text} The weights are not available here.`;
   const seedList = [...new Set(opened)].sort().join(' or ');
   const link = `A click opens the failures of seed ${seedList} on the held-out episodes of the catalog`;
-  const rest = missing.length ? `; the weights of ${missing.join(', ')} are not available` : '';
+  const rest = missing.length
+    ? `; the weights of ${missing.join(', ').replace(/, ([^,]+)$/, ' and $1')} are not available`
+    : '';
   return `${text} ${link}${rest}.`;
 }
