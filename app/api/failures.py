@@ -56,7 +56,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         arguments = _arguments(store, request)
         count, faults = len(arguments["episodes"]), arguments["faults"]
         scope = f"all {count} episodes" if request.among == "all" else f"{count} held-out episodes"
-        title = ", ".join(filter(None, [f"Failures of {request.filter}", f"{request.task} {scope}", faults]))
+        title = ", ".join(filter(None, [f"Failures of {request.filter}", request.task, scope, faults]))
         state = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults")}
         link = page_link(**state, tab="failures")
         return JobReply(job=jobs.submit("failures", title, arguments, key_over_episodes(store, arguments), link))

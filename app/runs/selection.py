@@ -33,7 +33,7 @@ class Selection:
 
     def describe(self, scope: str = "") -> str:
         """The run in words, for titles. scope: episodes, by default that of the run."""
-        run = f"{self.filter}, {self.task} {scope or f'episode {self.episode}'}"
+        run = f"{self.filter}, {self.task}{f', {scope}' if scope else f' episode {self.episode}'}"
         return run + (f", {self.faults}" if self.faults else "")
 
     @property

@@ -176,7 +176,7 @@ def test_held_out_episodes(server: TestClient) -> None:
     poll(server, url("consistency"))
     assert server.get(url("consistency"), params={"episodes": "held-out"}).json() == {"job": None}
     job = server.post(url("consistency"), params={"episodes": "held-out"}).json()["job"]
-    assert job["title"].endswith("door all 64 held-out episodes")
+    assert job["title"].endswith("door, all 64 held-out episodes")
     answer = poll(server, url("consistency"), episodes="held-out")
     assert answer.status_code == 200, answer.text
     assert answer.json()["trajectories"] == 64

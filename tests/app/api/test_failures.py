@@ -49,7 +49,7 @@ def test_survey_is_a_job_and_stores_no_traces(
         response = client.post(URL, params=query)
         assert response.status_code == 202
         job = response.json()["job"]
-        assert job["title"] == f"Failures of crossmodal-ekf, door all 2 episodes, {FAULTS}"
+        assert job["title"] == f"Failures of crossmodal-ekf, door, all 2 episodes, {FAULTS}"
         assert client.post(URL, params=query).json()["job"]["id"] == job["id"]
         result = wait_for_failures(client, **query)
         link = dict(parse_qsl(job["link"].removeprefix("?")))
