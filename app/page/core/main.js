@@ -32,10 +32,18 @@ async function start() {
   if (state.faults)
     await api.checkSelection({ ...state, against: '' }).catch((error) => {
       problems.push(
-        `The link has an invalid fault injection “${state.faults}”: ${messageOf(error)}`,
+        `The link has an invalid fault injection “${state.faults}”: ${withoutList(messageOf(error))}`,
       );
       state.faults = '';
     });
   messages.show('link', problems.join('\n'));
   new Page(catalog, new Store(state), live, messages);
+}
+
+/**
+ * Returns a message without the list of all names where it suggests similar ones.
+ * @param {string} message
+ */
+function withoutList(message) {
+  return message.replace(/( Did you mean .*\?) Available: .*$/, '$1');
 }
