@@ -108,8 +108,10 @@ def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference |
     advice = _advice(rows) if outcome == "inconclusive" else ""
     if worst is None:
         return f"{text}.{advice}"
-    label = "beyond the limit" if beyond else "largest change elsewhere"
-    return f"{text}; {label}: {_description(worst)}.{advice}"
+    label = "beyond the limit:" if beyond else "largest change elsewhere:"
+    if len(beyond) > 1:
+        label = f"beyond the limit in {len(beyond)} slices, most in"
+    return f"{text}; {label} {_description(worst)}.{advice}"
 
 
 def _advice(rows: Sequence[SliceChange]) -> str:
