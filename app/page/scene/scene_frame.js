@@ -4,7 +4,7 @@ import { html } from '../core/dom.js';
 import { setPanelState } from '../widgets/panel_state.js';
 
 const NO_SCENE =
-  'No 3D scene: the maps of this task are not over a position in m, and it has no replay and no outline';
+  'No 3D scene: this task has no replay, no outline, and no map over a position in m';
 
 /**
  * Interface of viser_frame_throttle.js, in the frame.
