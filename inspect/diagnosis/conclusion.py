@@ -44,7 +44,7 @@ MAX_NEES = 2.0
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
-    text = f"all {count} statistics are within the record of {record} healthy episodes."
+    text = f"no significant deviation from the record of {record} healthy episodes in {count} statistics."
     largest = tuple(_evidence(case, deviation) for deviation in case.deviations[:LARGEST])
     headline = f"Healthy{_miscalibration(case.profile)}: {text}"
     return Diagnosis("healthy", False, headline, (), largest, _provenance(case))

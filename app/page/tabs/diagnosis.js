@@ -25,7 +25,8 @@ const OVER = [
   ['held-out', 'held-out episodes'],
 ];
 const UNLIKELY = 'Every cause of the catalog has a probability below 0.05.';
-const WITHIN = 'The largest of all statistics; healthy episodes have some of this size as well.';
+const WITHIN =
+  'The largest of all statistics; healthy episodes, too, have some outside of these ranges.';
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MEASURE = 'Measure a healthy record';

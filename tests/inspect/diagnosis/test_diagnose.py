@@ -68,9 +68,9 @@ def test_clean_episodes_are_healthy() -> None:
 @pytest.mark.parametrize(
     ("nees", "start"),
     [
-        (4.0, "Healthy, though overconfident (median NEES 4): all 1 statistics are within the record"),
-        (0.2, "Healthy, though underconfident (median NEES 0.2): all"),
-        (1.3, "Healthy: all 1 statistics are within the record of 44 healthy episodes."),
+        (4.0, "Healthy, though overconfident (median NEES 4): no significant deviation from the record of 44"),
+        (0.2, "Healthy, though underconfident (median NEES 0.2): no"),
+        (1.3, "Healthy: no significant deviation from the record of 44 healthy episodes in 1 statistics."),
     ],
 )
 def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, start: str) -> None:
