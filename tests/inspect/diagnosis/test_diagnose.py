@@ -112,7 +112,7 @@ def test_a_healthy_diagnosis_states_what_was_compared() -> None:
     result = diagnose(checkpoint(), simulated(100, 6), profile=profile())
     numbers = result.to_json()["statistics"]
     assert {*checkpoint().task.observations, "control", "labels", "models", "filter"} == set(numbers)
-    assert f"all {sum(numbers.values())} statistics" in result.headline
+    assert f"in {sum(numbers.values())} statistics" in result.headline
     touching = {i: with_contact(episode) for i, episode in simulated(100, 6).items()}
     compared_ = diagnose(checkpoint(), touching, profile=profile())
     assert compared_.to_json()["statistics"]["force"] < numbers["force"]
