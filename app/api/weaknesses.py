@@ -32,12 +32,14 @@ def weaknesses_of(store: TraceStore, jobs: Jobs, selection: Selection) -> list[W
         diagnosis = {"causes": []}
     path = found_failures(store, jobs, selection)
     scores = [] if path is None else json.loads(path.read_bytes())["scores"]
-    filter_ = checkpoint.filter
+    filter_, faults, episode = checkpoint.filter, selection.faults, selection.episode
     found = [
-        *weaknesses.diagnosed(diagnosis, filter_, selection.faults, selection.episode),
+        *weaknesses.diagnosed(diagnosis, filter_, faults, episode),
         *weaknesses.failing(scores, filter_),
         *weaknesses.untrained(filter_),
     ]
+    if not any(weakness.source == "diagnosis" for weakness in found):
+        found = [*weaknesses.injected(faults, filter_, episode), *found]
     return [Weakness(**vars(weakness) | _training(weakness.settings)) for weakness in found]
 
 

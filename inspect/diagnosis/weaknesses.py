@@ -1,4 +1,4 @@
-"""Weaknesses of a filter that fine-tuning can address: probable causes, phases with failures, defaults."""
+"""Weaknesses of a filter that fine-tuning can address: probable causes, faults, phases with failures, defaults."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.filters.finetuning.slices import Slice
+from beliefscope.filters.finetuning.slices import Slice, fault_slice
 from beliefscope.filters.finetuning.success import Criterion
 from beliefscope.inspect.diagnosis.training import training_for, training_on
 
@@ -34,7 +34,7 @@ class Weakness:
     source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
     """
 
-    source: Literal["diagnosis", "failures", "default"]
+    source: Literal["diagnosis", "faults", "failures", "default"]
     title: str
     evidence: str
     episode: int | None
@@ -55,6 +55,14 @@ def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, epi
         title = diagnosis["headline"] if cause is diagnosis["causes"][0] else cause["title"]
         at = episode if evidence["episode"] is None else evidence["episode"]
         yield Weakness("diagnosis", title, f"{text}.", at, evidence["step"], settings)
+
+
+def injected(faults: Faults, filter_: Filter, episode: int) -> Iterator[Weakness]:
+    """Faults that were injected into a run over an episode, if the filter can learn to expect them."""
+    settings = training_on(fault_slice(faults), filter_) if faults else None
+    if settings is not None:
+        title = f"Injected faults \u201c{settings.mix[0][0].name}\u201d"
+        yield Weakness("faults", title, "Faults of the displayed run.", episode, None, settings)
 
 
 def failing(scores: Sequence[Mapping[str, Any]], filter_: Filter) -> Iterator[Weakness]:

@@ -2059,7 +2059,7 @@ export interface components {
              * Source
              * @enum {string}
              */
-            source: "diagnosis" | "failures" | "default";
+            source: "diagnosis" | "faults" | "failures" | "default";
             /** Title */
             title: string;
             /** Evidence */

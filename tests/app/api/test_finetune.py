@@ -39,6 +39,23 @@ def filters(client: TestClient) -> list[str]:
     return [f["name"] for f in next(task for task in tasks if task["name"] == "door")["filters"]]
 
 
+def test_injected_faults_are_offered_as_a_weakness(shared_client: TestClient) -> None:
+    url, faults = "/api/weaknesses/door/crossmodal-ekf/0", "force_noise=30:from=3"
+    end = time.monotonic() + TIMEOUT
+    while (reply := shared_client.get(url, params={"faults": faults})).status_code == 202:  # the run is computed
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    first = next(weakness for weakness in reply.json() if weakness["source"] != "diagnosis")
+    assert (first["source"], first["episode"]) == ("faults", 0)
+    assert first["title"] == "Injected faults \u201cforce_noise 30 from 3\u201d"
+    assert [slice_["name"] for slice_ in first["slices"]] == ["force_noise 30 from 3"]
+    assert "force_noise 30 from 3" in first["settings"]["success"]
+    clean = shared_client.get(url)
+    while clean.status_code == 202:
+        clean = shared_client.get(url)
+    assert all(weakness["source"] != "faults" for weakness in clean.json())
+
+
 def test_options(shared_client: TestClient) -> None:
     offer = shared_client.get(URL).json()
     assert offer["why_not"] is None
