@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +20,9 @@ DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 
 HALF_WIDTHS = {"m": 0.135, "rad": 0.5}
 """Unit -> default of ``Task.map_half_width``; 1 in other units."""
+
+LARGE = 5.0
+"""m: half width of a map from which lengths are displayed in m instead of cm."""
 
 LENGTHS = ("m", "km", "dm", "cm", "mm", "um", "nm", "px")
 """Units of a position."""
@@ -49,7 +52,8 @@ class Component:
     Attributes:
         unit: of its values: ``rad`` for an angle, ``m``, or any other text, such as ``m/s``.
         static: whether it is constant in every episode.
-        display: unit for display and its factor, such as ``("km/h", 3.6)``. Default: cm, degrees, else the unit.
+        display: unit for display and its factor, such as ``("km/h", 3.6)``. Default: cm, degrees, else the unit; m
+            instead of cm in a task with a map of 10 m or more.
         rotation: name of the rotation whose vector it is a component of; see ``rotation``.
     """
 
@@ -235,7 +239,7 @@ class Task:
     clouds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Fill in the default map."""
+        """Fill in the default map, and the unit for display of lengths in a large space."""
         if not self.map_components:
             first = self.components[:2]
             alike = [c.name for c in first if c.unit == first[0].unit]
@@ -243,6 +247,11 @@ class Task:
         if math.isnan(self.map_half_width) and self.map_components:
             units = [c.unit for c in self.components if c.name == self.map_components[0]]
             object.__setattr__(self, "map_half_width", HALF_WIDTHS.get(units[0], 1.0) if units else 1.0)
+        if self.map_half_width >= LARGE and any(
+            c.unit == "m" and c.name in self.map_components for c in self.components
+        ):
+            in_metres = (replace(c, display=c.display or ("m", 1.0)) if c.unit == "m" else c for c in self.components)
+            object.__setattr__(self, "components", tuple(in_metres))
 
     def __hash__(self) -> int:
         return hash(self.name)

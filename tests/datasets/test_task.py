@@ -10,6 +10,8 @@ import pytest
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task_json import difference, task_from_json, task_to_json
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
@@ -48,3 +50,12 @@ def test_main_error_is_that_of_map_components_of_one_unit(
     assert main.key == key
     assert main.norm(np.array([[3.0, 4.0, 7.0]]))[0] == (5.0 if len(main.indices) == 2 else 3.0)
     assert replace(DOOR, components=(*parts, *DOOR.components[2:])).floor == ((0, 1) if units == ("m", "m") else None)
+
+
+@pytest.mark.parametrize(("half_width", "key"), [(4.9, "east_cm"), (5.0, "east_m")])
+def test_lengths_of_a_large_map_are_in_metres(half_width: float, key: str) -> None:
+    components = (Component("east", "m"), Component("north", "m"), Component("height", "m", display=("mm", 1e3)))
+    task = Task("field", components, {"gps": (2,)}, {"gps": ("gps",)}, 0, 0.1, map_half_width=half_width)
+    assert [component.key for component in task.components][::2] == [key, "height_mm"]
+    assert task.main_error.key == f"position_{key.partition('_')[2]}"
+    assert not difference(task_from_json(task_to_json(task)), task)
