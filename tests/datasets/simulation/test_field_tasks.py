@@ -197,8 +197,11 @@ def test_every_ingredient_is_documented() -> None:
     for task in FIELD_TASKS:
         section = page.split(f"## {task.name}\n")[1].split("\n## ")[0]
         rows = [line.split("|")[1:-1] for line in section.splitlines() if line.startswith("| `")]
+        same = PUSH_FIELD.ingredients if task is PUSH_FIELD_YAW else {}
         assert [(name.strip(" `"), meaning.strip(), ranges.strip()) for name, meaning, ranges in rows] == [
-            (name, ingredient.meaning, ranges_text(ingredient.ranges)) for name, ingredient in task.ingredients.items()
+            (name, ingredient.meaning, ranges_text(ingredient.ranges))
+            for name, ingredient in task.ingredients.items()
+            if ingredient != same.get(name)
         ]
 
 
