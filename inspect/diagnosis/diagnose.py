@@ -85,7 +85,7 @@ def diagnose(
     if not episodes:
         raise BadInput("no episodes to diagnose")
     profile = profile or required_profile(checkpoint)
-    _check_size(profile, len(episodes), alarm_rate)
+    check_size(profile.episodes, len(episodes), alarm_rate)
     items = list(episodes.items())
     blocks = [items[i : i + BLOCK] for i in range(0, len(items), BLOCK)]
     observed: dict[int, Observed] = {}
@@ -149,17 +149,22 @@ def preliminary(
 def _examined(
     checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
-    _check_size(profile, len(traces), alarm_rate)
+    check_size(profile.episodes, len(traces), alarm_rate)
     rows, sensors = zip(*(observe(trace, checkpoint, profile) for trace in traces), strict=True)
     setting = _setting(checkpoint, traces, particles, profile)
     return compared(setting, traces, rows, sensors, profile, alarm_rate)
 
 
-def _check_size(profile: HealthyProfile, count: int, alarm_rate: float) -> None:
-    """A single episode has a p-value of at least 1 / (N + 1). Raises BadInput if no alarm is possible."""
-    if count == 1 and 1 / (profile.episodes + 1) > alarm_rate:
+def check_size(healthy: int, count: int, alarm_rate: float) -> None:
+    """Raise BadInput if no diagnosis of ``count`` episodes is possible with a record of ``healthy`` episodes.
+
+    Fewer than ``MIN_HEALTHY`` have no statistics. A single episode has a p-value of at least 1 / (healthy + 1).
+    """
+    if healthy < MIN_HEALTHY:
+        raise BadInput(f"a healthy record of {healthy} episodes is too small; measure it from at least {MIN_HEALTHY}")
+    if count == 1 and 1 / (healthy + 1) > alarm_rate:
         raise BadInput(
-            f"a healthy record of {profile.episodes} episodes cannot show a fault in a single one: an alarm rate of "
+            f"a healthy record of {healthy} episodes cannot show a fault in a single one: an alarm rate of "
             f"{alarm_rate:g} needs {math.ceil(1 / alarm_rate) - 1}; diagnose several episodes, or measure the record "
             "from more"
         )

@@ -64,7 +64,7 @@ def diagnose(
         indices = data.held_out() if episode is None else [episode]
         episodes = faults.apply_all(data, indices, runs.seed)
         failed = None if repair is None else data[repair]
-    profile = _profile(correct, profile_from)
+    profile = _profile(correct, profile_from, len(episodes), alarm_rate)
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
@@ -87,9 +87,13 @@ def diagnose(
     return console.Result(document, "\n\n".join(parts))
 
 
-def _profile(checkpoint: Checkpoint, clean: Path | None) -> HealthyProfile:
-    """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``."""
+def _profile(checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float) -> HealthyProfile:
+    """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``.
+
+    Raises BadInput, before the runs, if these are too few for the diagnosis of ``count`` episodes.
+    """
     from beliefscope.datasets.store import open_dataset
+    from beliefscope.inspect.diagnosis.diagnose import check_size
     from beliefscope.inspect.diagnostics.healthy_profile import find_profile
     from beliefscope.inspect.healthy import profile_of
 
@@ -102,5 +106,6 @@ def _profile(checkpoint: Checkpoint, clean: Path | None) -> HealthyProfile:
         return profile
     with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
+        check_size(len(indices), count, alarm_rate)
         episodes = [data[index] for index in indices]
         return profile_of(checkpoint, episodes, str(clean), progress=advance, indices=indices)

@@ -13,10 +13,10 @@ pytestmark = pytest.mark.slow
 Run = Callable[..., tuple[int, str, str]]
 
 
-def test_progress_of_measuring_the_healthy_record(run: Run, base_settings: Settings) -> None:
+def test_too_few_clean_episodes_are_refused_before_the_runs(run: Run, base_settings: Settings) -> None:
     checkpoint, data = base_settings.checkpoints["crossmodal-pf"], base_settings.data["mine"]
     line = ["diagnose", "door", "--filter", checkpoint, "--data", data, "--profile-from", data, "--particles", 30]
     code, _, error = run(*line)
     assert code == 2
-    assert "Measuring the healthy record" in error
-    assert "a healthy record of 1 episodes cannot show a fault" in error
+    assert "a healthy record of 1 episodes is too small; measure it from at least 10" in error
+    assert "Measuring the healthy record" not in error
