@@ -22,7 +22,7 @@ import { StudyTable } from './study_table.js';
 
 const SHIPPED = 'shipped'; // name of the study that comes with the software
 const LEGEND =
-  'Bars: mean over the seeds ± standard deviation. Dots: seeds; a click opens the ringed one.';
+  'Bars: mean over the seeds ± standard deviation, in the order and colours of the table. Dots: seeds; a click opens the ringed one.';
 
 const BODY = `
   <div class="top">
