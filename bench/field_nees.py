@@ -11,33 +11,18 @@ one for each combination of contact and outage, which a robot can measure. Brack
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from field_tasks import Array, phases, triple
+from field_tasks import Array, mean_of_steps, nees_by_step, phases
 
-from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset
-from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import load_checkpoint
-from beliefscope.filters.evaluate import run
-from beliefscope.filters.filter import Filter
 from beliefscope.filters.names import shipped
-from beliefscope.inspect.statistics.intervals import jackknife
 
-FILTERS = ("information-ekf", "crossmodal-pf", *(f"{rule}-ekf" for rule in ("crossmodal", "unimodal", "feature")))
-SINGLE = ("image-ekf", "haptics-ekf")
-
-
-def nees(filter_: Filter, episodes: Sequence[Episode]) -> Array:
-    """(T, R) NEES / n."""
-    steps = Steps.from_episodes(filter_.task, episodes)
-    error, covariance = run(filter_, steps.windows(steps.first, len(episodes[0])), None, particles=300, seed=0)
-    white = torch.linalg.solve(covariance.double(), error.double().unsqueeze(-1)).squeeze(-1)
-    values: Array = (error.double() * white).mean(-1).numpy()
-    return values
+RULES = ("crossmodal", "unimodal", "feature", "image", "haptics")
+FILTERS = ("information-ekf", "crossmodal-pf", *(f"{rule}-ekf" for rule in RULES))
 
 
 def cells(masks: dict[str, Array]) -> Array:
@@ -46,11 +31,7 @@ def cells(masks: dict[str, Array]) -> Array:
 
 
 def row(values: Array, masks: dict[str, Array]) -> str:
-    means = (
-        triple(jackknife(np.stack([mask.sum(0), (mask * values).sum(0)], 1), lambda s: s[..., 1] / s[..., 0]))
-        for mask in masks.values()
-    )
-    return " | ".join(means)
+    return " | ".join(mean_of_steps(values, mask) for mask in masks.values())
 
 
 def main(task: str, fit: Path, test: Path) -> None:
@@ -59,9 +40,9 @@ def main(task: str, fit: Path, test: Path) -> None:
         fitted, tested = list(first), list(second)
     fit_masks, test_masks = phases(fitted), phases(tested)
     print(f"| filter | factors | {' | '.join(test_masks)} |")
-    for name in (*FILTERS, *SINGLE):
+    for name in FILTERS:
         filter_ = load_checkpoint(shipped(task, name)).filter
-        before, values = nees(filter_, fitted), nees(filter_, tested)
+        before, values = nees_by_step(filter_, fitted), nees_by_step(filter_, tested)
         factors = np.array([before[cells(fit_masks) == cell].mean() for cell in range(4)])
         print(f"| {name} | none | {row(values, test_masks)} |")
         print(f"| | one, {before.mean():.2f} | {row(values / before.mean(), test_masks)} |")

@@ -124,17 +124,24 @@ def phases(episodes: Sequence[Episode]) -> dict[str, Array]:
     return {"all": np.ones_like(contact), "contact": contact, "free motion": ~contact, "outage": outage}
 
 
-def nees(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, str]:
-    """Mean NEES / n by phase."""
+def nees_by_step(filter_: Filter, episodes: Sequence[Episode]) -> Array:
+    """(T, R) NEES / n of episodes of equal length."""
     steps = Steps.from_episodes(filter_.task, episodes)
     error, covariance = run(filter_, steps.windows(steps.first, len(episodes[0])), None, particles=300, seed=0)
     white = torch.linalg.solve(covariance.double(), error.double().unsqueeze(-1)).squeeze(-1)
-    values = (error.double() * white).mean(-1).numpy()  # (T, R)
-    return {
-        phase: triple(jackknife(np.stack([mask.sum(0), (mask * values).sum(0)], 1), lambda s: s[..., 1] / s[..., 0]))
-        for phase, mask in phases(episodes).items()
-        if mask.any()
-    }
+    values: Array = (error.double() * white).mean(-1).numpy()
+    return values
+
+
+def mean_of_steps(values: Array, mask: Array) -> str:
+    """Mean of the values (T, R) of some steps, with its interval over trajectories."""
+    return triple(jackknife(np.stack([mask.sum(0), (mask * values).sum(0)], 1), lambda s: s[..., 1] / s[..., 0]))
+
+
+def nees(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, str]:
+    """Mean NEES / n by phase."""
+    values = nees_by_step(filter_, episodes)
+    return {phase: mean_of_steps(values, mask) for phase, mask in phases(episodes).items() if mask.any()}
 
 
 @torch.no_grad()

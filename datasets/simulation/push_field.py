@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import TypeVar
 
 import mujoco
 import numpy as np
@@ -46,6 +47,7 @@ from beliefscope.datasets.simulation.simulate import (
 from beliefscope.datasets.task import Ingredient, Task
 
 Vector = NDArray[np.float64]
+Physics = TypeVar("Physics", PuckPhysics, BlockPhysics)
 
 GRAVITY = 9.81  # m/s^2
 PUCK = slice(ROBOT_JOINTS, ROBOT_JOINTS + 2)
@@ -143,15 +145,24 @@ def simulate_draws(
     return finish(task, episode, draws, {"nudges": [] if nudges is None else nudges.steps})
 
 
-def _replay(episode: Episode) -> mujoco.MjModel:
+def recorded(episode: Episode, name: str, physics: type[Physics], expected: str, initial: str = "") -> Physics:
+    """The pushed object that an episode's provenance describes. Raises BadInput if there is none.
+
+    Args:
+        name: of the ingredient with its parameters. expected: these parameters, for the error.
+        initial: another parameter of the ingredient, of the first state.
+    """
     try:
-        values = episode.provenance["ingredients"].get("puck", {})
-        puck = PuckPhysics(**{key: float(value) for key, value in values.items()})
+        values = episode.provenance["ingredients"].get(name, {})
+        return physics(**{key: float(value) for key, value in values.items() if key != initial})
     except (KeyError, TypeError, ValueError, AttributeError):
         raise BadInput(
-            "The episode's provenance does not describe its puck: expected 'ingredients': {'puck': {'radius': m, "
-            "'mass': kg, 'friction': number}}."
+            f"The episode's provenance does not describe its {name}: expected 'ingredients': {{'{name}': {expected}}}."
         ) from None
+
+
+def _replay(episode: Episode) -> mujoco.MjModel:
+    puck = recorded(episode, "puck", PuckPhysics, "{'radius': m, 'mass': kg, 'friction': number}")
     return push_model(visual=True, puck=puck)
 
 

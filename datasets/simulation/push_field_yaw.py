@@ -11,7 +11,6 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.ingredients import draw, start_ingredient
 from beliefscope.datasets.simulation.push import HEIGHT, BlockPhysics, push_model
 from beliefscope.datasets.simulation.push_field import (
@@ -19,6 +18,7 @@ from beliefscope.datasets.simulation.push_field import (
     PUSH_FIELD,
     PushPuckWithAimError,
     aim_error,
+    recorded,
     simulate_draws,
 )
 from beliefscope.datasets.simulation.simulate import first_free_start
@@ -69,18 +69,12 @@ def block_outline(states: ArrayLike) -> Outline:
 
 
 def _replay(episode: Episode) -> mujoco.MjModel:
-    try:
-        values = episode.provenance["ingredients"].get("block", {})
-        block = BlockPhysics(**{key: float(value) for key, value in values.items() if key != "yaw"})
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise BadInput(
-            "The episode's provenance does not describe its block: expected 'ingredients': {'block': {'length': m, "
-            "'width': m, 'mass': kg, 'friction': number}}."
-        ) from None
+    expected = "{'length': m, 'width': m, 'mass': kg, 'friction': number}"
+    block = recorded(episode, "block", BlockPhysics, expected, initial="yaw")
     return push_model(visual=True, puck=block)
 
 
-START = {"m": (0.03, 0.05), "rad": (float(np.deg2rad(10.0)), float(np.deg2rad(20.0)))}
+START = {**PUSH_FIELD.start_distance, "rad": (float(np.deg2rad(10.0)), float(np.deg2rad(20.0)))}
 
 PUSH_FIELD_YAW = replace(
     PUSH_FIELD,

@@ -226,11 +226,11 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_
 
 def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
     """Values (N, S) on the scale of their kind, smallest standard deviations (S,), and whether ``RISING`` (S,)."""
-    settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
-    logarithmic = np.array([s[1] for s in settings])
+    kinds = [name.split("/")[0] for name in names]
+    settings = [KINDS.get(kind, ("", False, 1e-9)) for kind in kinds]
+    logarithmic, lost = np.array([s[1] for s in settings]), np.array([kind in LOST for kind in kinds])
     floor = np.array([s[2] * (LEVER if "/torque " in n else 1.0) for n, s in zip(names, settings, strict=True)])
-    rising = np.array([name.split("/")[0] in RISING or name.endswith("/range") for name in names])
-    lost = np.array([name.split("/")[0] in LOST for name in names])
+    rising = np.array([k in RISING or n.endswith("/range") for n, k in zip(names, kinds, strict=True)])
     scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
     return np.where(lost, -np.log(np.maximum(1.0 - values, SMALLEST_REST)), scaled), floor, rising
 

@@ -168,7 +168,7 @@ export class FinetuneForm {
     const { modules, presets, measures, simulated } = offer;
     this.#diagram.show(modules, presets.find(({ name }) => name === 'all')?.trains ?? []);
     fill(this.#select('preset'), [
-      ...presets.map(({ name }) => pair(name, displayName(name).replace('-only', ' only'))),
+      ...presets.map(({ name }) => pair(name, presetName(displayName(name)))),
       [CUSTOM, 'custom'],
     ]);
     const single = offer.slices.filter(({ only }) => only.length);
@@ -355,6 +355,9 @@ export class FinetuneForm {
     return settings;
   }
 }
+
+/** @param {string} name of a preset, or of a module, which is returned unchanged */
+export const presetName = (name) => name.replace(/-only$/, ' only');
 
 /**
  * Returns the names of the data slices that a run was trained on.

@@ -7,7 +7,7 @@ import { create } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { jobSummary } from '../widgets/jobs.js';
-import { trainingData } from './finetune_form.js';
+import { presetName, trainingData } from './finetune_form.js';
 
 const PLACES = { default: 'promoted', saved: 'saved' };
 const COLUMNS = [
@@ -88,7 +88,7 @@ export class FinetuneRuns {
     const state = run.finetuned ? 'no criterion' : job ? stateOf(job) : 'removed';
     const texts = [
       run.filter,
-      settings.train.map((name) => name.replace(/-only$/, ' only')).join(', '),
+      settings.train.map(presetName).join(', '),
       trainingData(run),
       settings.success ? criterionText(settings.success) : '–',
       success?.outcome ?? state,
