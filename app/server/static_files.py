@@ -1,7 +1,8 @@
 """The page's own files, at addresses with a hash of their content, which browsers may cache forever.
 
-The page has about fifty modules and no build step. So that browsers need not discover them one level of imports at a
-time, the index lists all of them for preloading.
+The page has more than a hundred files and no build step, and a request costs a browser a few milliseconds. So the
+styles are sent as one file, modules that are imported by a call load when the page needs them, and the index lists all
+others for preloading: browsers need not discover them one level of imports at a time.
 """
 
 import hashlib
@@ -19,7 +20,11 @@ from beliefscope.app.protocol.etag import IMMUTABLE, REVALIDATE, tagged
 
 ENTRY = "core/main.js"
 _IMPORT = re.compile(rb"""^(?:import|export)\b[\w\s{},*$]*['"](\.\.?/[\w./-]+)['"]""", re.MULTILINE)
+_IMPORT_CALL = re.compile(rb"""\bawait import\(['"](\.\.?/[\w./-]+)['"]\)""")
 _NAMED = re.compile(r"/static/([\w./-]+)")
+_STYLE = re.compile(r'<link rel="stylesheet" href="/static/(styles/[\w.-]+)">\n')
+_STYLES = re.compile(f"(?:{_STYLE.pattern})+")
+STYLES = "styles/all.css"  # the styles of the page, in their order
 
 
 class PageFiles:
@@ -61,17 +66,22 @@ class PageFiles:
         version = _hash(repr([(name, state.st_size, state.st_mtime_ns) for name, _, state in states]).encode())[:12]
         if version != self._version:
             contents = {name: path.read_bytes() for name, path, _ in states}
+            contents[STYLES] = b"".join(contents[name] for name in _STYLE.findall(contents["index.html"].decode()))
             self._index = page_index(self._folder, version)
             self._files = {name: (content, _hash(content)) for name, content in contents.items()}
             self._version = version
 
 
-def modules(folder: Path) -> list[str]:
-    """The page's entry module and all modules it imports, in breadth-first order."""
+def modules(folder: Path, lazy: bool = False) -> list[str]:
+    """The page's entry module and the modules it imports, in breadth-first order.
+
+    lazy: with those that are imported by a call, when the page needs them.
+    """
     names = [ENTRY]
     for name in names:
-        paths = (match.decode() for match in _IMPORT.findall((folder / name).read_bytes()))
-        imported = (posixpath.normpath(posixpath.join(posixpath.dirname(name), path)) for path in paths)
+        content = (folder / name).read_bytes()
+        paths = [*_IMPORT.findall(content), *(_IMPORT_CALL.findall(content) if lazy else ())]
+        imported = (posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode())) for path in paths)
         names += [other for other in dict.fromkeys(imported) if other not in names]
     return names
 
@@ -79,7 +89,7 @@ def modules(folder: Path) -> list[str]:
 def page_files(folder: Path) -> list[str]:
     """All files that the page uses. Raises OSError if the index or a module is missing."""
     index = (folder / "index.html").read_text(encoding="utf-8")
-    return [*dict.fromkeys([*_NAMED.findall(index), *modules(folder)])]
+    return [*dict.fromkeys([*_NAMED.findall(index), *modules(folder, lazy=True)])]
 
 
 def page_index(folder: Path, version: str) -> bytes:
@@ -87,7 +97,8 @@ def page_index(folder: Path, version: str) -> bytes:
     where = f"/static/{version}/"
     preloads = ['<link rel="preload" href="/api/catalog" as="fetch" crossorigin="anonymous">']
     preloads += [f'<link rel="modulepreload" href="{where}{name}">' for name in modules(folder)]
-    text = (folder / "index.html").read_text(encoding="utf-8").replace("/static/", where)
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    text = _STYLES.sub(f'<link rel="stylesheet" href="/static/{STYLES}">\n', text).replace("/static/", where)
     return text.replace("</head>", "\n".join([*preloads, "</head>"]), 1).encode()
 
 

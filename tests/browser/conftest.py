@@ -141,6 +141,7 @@ class MonitoredPage:
             link = f"{link or '?'}&tab=compare"
         self.page.goto(self.url + link, timeout=1000 * TIMEOUT)
         self.until("() => window.beliefscope?.stats.maps?.size === 135")
+        self.until("() => document.documentElement.classList.contains('with-tabs')")
         return self
 
     def until(self, condition: str, timeout: float = TIMEOUT) -> None:

@@ -3,6 +3,7 @@
 /** @import { Catalog, LiveList, Selection } from '../data/api.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Handlers } from '../data/view_socket.js' */
+/** @import { Tabs } from '../tabs/tabs.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */
 /** @import { State, Store } from './state.js' */
 
@@ -16,16 +17,7 @@ import { Camera } from '../scene/camera.js';
 import { SceneFrame } from '../scene/scene_frame.js';
 import { SceneMenu } from '../scene/scene_menu.js';
 import { StepTable } from '../step/step_table.js';
-import { ComparisonTab } from '../tabs/comparison.js';
-import { Diagnosis } from '../tabs/diagnosis.js';
-import { Diagnostics } from '../tabs/diagnostics.js';
-import { Failures } from '../tabs/failures.js';
-import { Finetune } from '../tabs/finetune.js';
 import { Live } from '../tabs/live_runs.js';
-import { Recordings } from '../tabs/recordings.js';
-import { Rerun } from '../tabs/rerun.js';
-import { Experiments } from '../tabs/experiments.js';
-import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
 import { CommandPalette } from '../widgets/command_palette.js';
 import { FaultDialog } from '../widgets/fault_dialog.js';
@@ -50,7 +42,7 @@ import {
   startLoading,
   useful,
 } from './common_panels.js';
-import { element, html } from './dom.js';
+import { element, html, messageOf } from './dom.js';
 import { layoutMenu, layoutSetter } from './layouts.js';
 import { assignSpareColours } from './palette.js';
 import { Splitters } from './splitters.js';
@@ -61,10 +53,9 @@ import { Theme } from './theme.js';
 import { Undo } from './undo.js';
 import { displayName } from './units.js';
 
-const MAX_SCENE_DELAY = 1000; // ms until the 3D scene starts, which slows down the other panels
+const MAX_DELAY = 1000; // ms until tabs and 3D scene load, which would slow down the other panels
 
-/** @param {number} ms */
-const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+const delayed = new Promise((resolve) => setTimeout(resolve, MAX_DELAY));
 
 export class Page {
   #catalog;
@@ -73,7 +64,12 @@ export class Page {
   /** @type {Trace | null} */
   #trace = null;
   #loading = new AbortController();
-  #failed = false; // whether the last trace could not be loaded
+  #failure = ''; // why the last trace could not be loaded
+  #faultDialog;
+  /** @type {Promise<Tabs | null> | null} */
+  #loadingTabs = null;
+  /** Null until the run is displayed. @type {Tabs | null} */
+  tabs = null;
 
   /**
    * @param {Catalog} catalog
@@ -85,11 +81,11 @@ export class Page {
     this.#catalog = catalog;
     this.#store = store;
     this.#messages = messages;
-    const faultDialog = new FaultDialog(
+    this.#faultDialog = new FaultDialog(
       element('#fault-dialog', HTMLDialogElement),
       catalog.faults,
     );
-    const refreshPickers = connectPickers(catalog, store, faultDialog, () =>
+    const refreshPickers = connectPickers(catalog, store, this.#faultDialog, () =>
       this.commands.toggle('episode '),
     );
     this.finding = new FindingBar(html('#finding'), store);
@@ -121,27 +117,7 @@ export class Page {
       (at) => this.socket.setViewpoint(at),
     );
     this.jobs = new Jobs(html('#jobs'), element('#jobs-button', HTMLButtonElement));
-    this.rerun = new Rerun(html('#rerun'), this.jobs, (/** @type {number} */ step) =>
-      store.set({ step, playing: false }, { origin: 'rerun' }),
-    );
-    this.diagnosis = new Diagnosis(html('#diagnosis'), catalog, store, this.jobs, this.timeline);
-    this.diagnosis.confirmed = (trace, result) => this.finding.confirm(trace, result);
-    this.diagnosis.recorded = () => this.#load();
-    this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
-    this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
-    this.compare = new ComparisonTab(
-      html('#compare'),
-      catalog,
-      store,
-      faultDialog,
-      (/** @type {Trace | null} */ trace, /** @type {string} */ name) =>
-        this.#setComparison(trace, name),
-    );
-    this.finetune = new Finetune(html('#finetune'), catalog, store, this.jobs, faultDialog);
-    this.study = new Study(html('#study'), catalog, store, this.failures, this.jobs);
-    this.experiments = new Experiments(html('#experiments'), catalog, store);
     this.live = new Live(catalog, store, this.#liveHandlers(refreshPickers), live);
-    this.recordings = new Recordings(html('#recordings'), catalog, store, this.jobs, this.rerun);
     this.selectTab = tabBar(store);
     this.socket = new ViewSocket(
       this.#socketHandlers(),
@@ -175,17 +151,48 @@ export class Page {
     bindControls(this);
     this.#showTab(store.state.tab);
     this.#load();
-    const { timeline, live, rerun } = this;
+    Promise.race([useful, delayed]).then(() => this.#loadTabs());
+    const { timeline, live } = this;
     window.beliefscope = {
       state: () => ({ ...store.state }),
       stats,
       timeline,
       live,
       rerun: {
-        getState: () => rerun.getState(),
-        files: (files) => rerun.files(files),
+        getState: async () => (await this.#loadTabs())?.rerun.getState(),
+        files: async (files) => (await this.#loadTabs())?.rerun.files(files),
       },
     };
+  }
+
+  /** Loads the tabs, once. They are a third of the page, and the run is readable without them. */
+  #loadTabs() {
+    this.#loadingTabs ??= this.#createTabs().catch((error) => {
+      this.#loadingTabs = null;
+      this.#messages.show('tabs', `The tabs cannot be loaded: ${messageOf(error)}`);
+      return null;
+    });
+    return this.#loadingTabs;
+  }
+
+  async #createTabs() {
+    const { Tabs } = await import('../tabs/tabs.js');
+    const tabs = new Tabs(this.#catalog, this.#store, {
+      jobs: this.jobs,
+      timeline: this.timeline,
+      finding: this.finding,
+      faultDialog: this.#faultDialog,
+      reload: () => this.#load(),
+      setComparison: (trace, name) => this.#setComparison(trace, name),
+    });
+    this.tabs = tabs;
+    document.documentElement.classList.add('with-tabs');
+    tabs.open(this.#store.state.tab);
+    if (this.#failure) tabs.diagnosis.fail(this.#failure);
+    if (!this.#trace) return tabs;
+    tabs.show(this.#trace);
+    tabs.move(this.#store.state.step, false);
+    return tabs;
   }
 
   #bindSaveButton() {
@@ -195,7 +202,7 @@ export class Page {
       openRerun: () => this.openTab('rerun'),
       openRecordings: (name) => {
         this.openTab('recordings');
-        this.recordings.point(name);
+        this.tabs?.recordings.point(name);
       },
     });
   }
@@ -218,8 +225,8 @@ export class Page {
         this.#grow(trace, hasNewColumns),
       ended: (/** @type {Trace} */ trace) => {
         this.timeline.grow();
-        this.diagnostics.show(trace);
-        this.failures.show(trace);
+        this.tabs?.diagnostics.show(trace);
+        this.tabs?.failures.show(trace);
       },
       listed: refreshPickers,
       message: (/** @type {string} */ text) => this.#messages.show('live', text),
@@ -229,11 +236,14 @@ export class Page {
   /** @returns {Handlers} */
   #socketHandlers() {
     return {
-      view: ({ scene }) => this.scene.open(scene, Promise.race([useful, pause(MAX_SCENE_DELAY)])),
+      view: ({ scene }) => {
+        const others = useful.then(() => this.#loadTabs());
+        this.scene.open(scene, Promise.race([others, delayed]));
+      },
       pace: (factor) => this.scene.pace(factor),
       maps: (maps, inputTime) => {
         if (!this.#trace) return;
-        this.maps.draw(maps, this.#trace, this.compare.name);
+        this.maps.draw(maps, this.#trace, this.tabs?.compare.name);
         setPanelState(html('#heatmaps'), 'ready');
         stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
         if (inputTime !== null) addLatency(stats.scrub, performance.now() - inputTime);
@@ -251,7 +261,7 @@ export class Page {
       error: (line) => this.#messages.show('cursor', line),
       connection: (problem) => {
         this.#messages.show('connection', problem ?? '');
-        if (!problem && this.#failed) this.#load();
+        if (!problem && this.#failure) this.#load();
       },
     };
   }
@@ -266,12 +276,7 @@ export class Page {
     const any = (...keys) => keys.some((key) => changed.has(key));
     if (any('task', 'filter', 'data', 'episode', 'faults')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
-    if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
-    if (any('over')) this.diagnosis.load();
-    if (any('against') && this.#trace) this.compare.choose();
-    if (any('task', 'filter', 'data', 'faults', 'among')) this.failures.load();
-    else if (any('by', 'phase', 'list')) this.failures.draw();
-    if (any('task', 'filter', 'data', 'episode', 'faults', 'run')) this.finetune.load();
+    this.tabs?.follow(changed, Boolean(this.#trace));
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track', 'charts', 'time')) this.#showComponent(this.#trace);
@@ -286,10 +291,10 @@ export class Page {
     if (!task) return;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());
-    [this.#trace, this.#failed] = [null, false];
+    [this.#trace, this.#failure] = [null, ''];
     this.clock.show(null);
     this.scene.failure = '';
-    this.diagnosis.show(null);
+    this.tabs?.diagnosis.show(null);
     this.finding.show(null);
     const loadingState = startLoading();
     try {
@@ -300,12 +305,11 @@ export class Page {
     } catch (error) {
       loadingState.stop();
       if (loading.signal.aborted) return;
-      this.#failed = true;
       document.documentElement.classList.add('started');
       const text = showError(error);
-      this.scene.failure = text;
+      this.#failure = this.scene.failure = text;
       this.finding.fail(text, () => this.#load());
-      this.diagnosis.fail(text);
+      this.tabs?.diagnosis.fail(text);
     }
   }
 
@@ -324,16 +328,12 @@ export class Page {
     this.camera.show(trace);
     this.timeline.show(trace);
     this.angleSlider.show(trace);
-    this.rerun.show(trace);
-    this.diagnosis.show(trace);
-    this.diagnostics.show(trace);
-    this.failures.show(trace);
     this.report.show(trace);
     this.finding.show(trace);
     showProperties(trace);
     this.adaptMapMenu(trace);
     this.sceneMenu.show(trace);
-    this.compare.show(trace);
+    this.tabs?.show(trace);
     this.#showComponent(trace);
     this.#move(trace);
     document.documentElement.classList.add('started');
@@ -362,8 +362,8 @@ export class Page {
    * @param {string} name
    */
   #setComparison(trace, name) {
-    this.timeline.compareWith(trace, name);
-    if (this.#trace) this.#move(this.#trace);
+    const changed = this.timeline.compareWith(trace, name);
+    if (this.#trace && changed) this.#move(this.#trace);
   }
 
   /**
@@ -404,10 +404,7 @@ export class Page {
     this.camera.move(step);
     this.stepTable.move(step);
     this.angleSlider.move(step);
-    this.diagnostics.move(step);
-    this.failures.move(step);
-    this.compare.move(step);
-    this.rerun.move(step, origin === 'rerun');
+    this.tabs?.move(step, origin === 'rerun');
     const cursor = { ...trace.selection, step, angle, against, ...mapChoices(state, trace) };
     this.socket.move({ ...cursor, comparison_maps: state.beside === 'gain' }, inputTime);
     showSummary(trace, step, state.component);
@@ -417,16 +414,8 @@ export class Page {
   /** @param {string} tab */
   #showTab(tab) {
     this.selectTab(tab);
-    this.rerun.open = tab === 'rerun';
-    this.diagnosis.open = tab === 'diagnosis';
-    this.diagnostics.open = tab === 'diagnostics';
-    this.failures.draw();
-    this.compare.open = tab === 'compare';
-    this.recordings.open = tab === 'recordings';
-    this.finetune.open = tab === 'finetune';
-    this.study.open = tab === 'study';
-    this.experiments.open = tab === 'experiments';
-    if (this.#trace) this.rerun.move(this.#store.state.step, false);
+    this.tabs?.open(tab);
+    if (this.#trace) this.tabs?.rerun.move(this.#store.state.step, false);
   }
 
   /** @param {boolean} playing */
@@ -440,10 +429,7 @@ export class Page {
     this.socket.setTheme(dark);
     this.timeline.redraw();
     this.maps.redraw();
-    this.diagnostics.redraw();
-    this.compare.redraw();
-    this.finetune.redraw();
-    this.experiments.redraw();
+    this.tabs?.redraw();
   }
 
   /** @param {number} step */
@@ -482,7 +468,7 @@ export class Page {
    */
   markIntervention(end) {
     this.openTab('compare');
-    this.compare.mark(end, this.#store.state.step);
+    this.tabs?.compare.mark(end, this.#store.state.step);
   }
 
   selectNextComponent() {

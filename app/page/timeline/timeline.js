@@ -230,12 +230,14 @@ export class Timeline {
    * Draws a comparison run, as thin lines, if it has the same episode.
    * @param {Trace | null} trace
    * @param {string} [name] its name; without a trace, the progress of its computation
+   * @returns {boolean} whether the run has changed
    */
   compareWith(trace, name = '') {
     const changed = trace !== this.#comparison;
     [this.#comparison, this.#comparisonName] = [trace, name];
     if (changed) this.redraw();
     else this.#showComparison();
+    return changed;
   }
 
   /** Shows the name of the comparison run, or the progress of its computation. */

@@ -1,5 +1,6 @@
 import type { FrameThrottle } from '../scene/scene_frame.js';
 import type { Page } from '../core/page.js';
+import type { Rerun } from '../tabs/rerun.js';
 import type { State } from '../core/state.js';
 
 declare global {
@@ -10,7 +11,10 @@ declare global {
       stats: typeof import('../core/stats.js').stats;
       timeline: Page['timeline'];
       live: Page['live'];
-      rerun: Pick<Page['rerun'], 'getState' | 'files'>;
+      rerun: {
+        getState(): Promise<unknown>;
+        files(files: Parameters<Rerun['files']>[0]): Promise<void>;
+      };
     };
     /** In the frame of the 3D scene. */
     frameThrottle?: FrameThrottle;

@@ -50,9 +50,10 @@ export class Jobs {
     return element('.bar button', HTMLButtonElement, this.#drawer);
   }
 
-  /** @param {(jobs: Job[]) => void} listener called when a job has changed */
+  /** @param {(jobs: Job[]) => void} listener called when a job has changed, and at once if there are jobs */
   listen(listener) {
     this.#listeners.add(listener);
+    if (this.#list.length) queueMicrotask(() => listener(this.#list));
   }
 
   /**
