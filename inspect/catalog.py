@@ -8,6 +8,7 @@ from typing import Any
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import (
     consistency,
+    conventions,
     ensemble,
     errors,
     fusion_efficiency,
@@ -34,6 +35,7 @@ ENTRIES: tuple[Entry, ...] = (
     ensemble.ENTRY,
     shapley.ENTRY,
     saliency.ENTRY,
+    conventions.ENTRY,
 )
 
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}

@@ -42,15 +42,12 @@ def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
     """
     nll = float(np.mean([negative_log_likelihood(trace) for trace in before]))
     nll -= float(np.mean([negative_log_likelihood(trace) for trace in after]))
-    task = before[0].task
-    others = [i for i in range(len(task.components)) if i not in task.main_error.indices]
-    names = [task.main_error.name, *(task.components[i].label for i in others)]
-    columns = [0, *(1 + i for i in others)]
-    sums = np.array([[_squared_errors(trace)[columns] for trace in pair] for pair in zip(before, after, strict=True)])
+    names = measures.error_names(before[0].task)
+    sums = np.array([[measures.squared_errors(trace) for trace in pair] for pair in zip(before, after, strict=True)])
     if not np.isfinite(sums).all():
         return Recovery(np.nan, np.nan, np.nan, nll, names[0])
-    k = int(np.argmax(_removed(sums.sum(0).T)))
-    share, low, high = jackknife(sums[..., k], _removed)
+    k = int(np.argmax(measures.removed_share(sums.sum(0).T)))
+    share, low, high = jackknife(sums[..., k], measures.removed_share)
     return Recovery(float(share), float(low), float(high), nll, names[k])
 
 
@@ -72,14 +69,3 @@ def _gaussian_nll(error: Array, covariance: Array) -> Array:
     squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
     n = error.shape[-1]
     return np.asarray(0.5 * (squared + np.linalg.slogdet(covariance).logabsdet + n * np.log(2.0 * np.pi)))
-
-
-def _squared_errors(trace: Trace) -> Array:
-    """(1 + n,) SI: sums over the counted steps of the squared main error and those of the components."""
-    error = measures.with_main(trace.task, measures.errors(trace)[measures.counted(trace), -1])
-    return np.asarray(np.square(error).sum(0))
-
-
-def _removed(sums: Array) -> Array:
-    """Share of the root of the first of two sums (..., 2) that is missing in that of the second."""
-    return np.asarray(1.0 - np.sqrt(sums[..., 1] / np.maximum(sums[..., 0], 1e-12)))

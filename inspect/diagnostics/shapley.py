@@ -214,22 +214,27 @@ def shapley_weights(count: int) -> Array:
 
 @torch.no_grad()
 def run_subsets(
-    checkpoint: Checkpoint, trace: Trace, offset: float = 0.0, progress: Callable[[float], None] | None = None
+    checkpoint: Checkpoint,
+    trace: Trace,
+    offset: float = 0.0,
+    progress: Callable[[float], None] | None = None,
+    subsets: Mask | None = None,
 ) -> Array:
-    """(T, 2^K, n) m, rad: estimates of the trace's filter with every subset of its modalities.
+    """(T, S, n) m, rad: estimates of the trace's filter with subsets of its modalities.
 
     All subsets run side by side in one rollout, with the random numbers of the trace.
 
     Args:
         offset: initial error in standard deviations of the initial belief, times a normal random vector determined by
             the trace's seed and episode.
+        subsets: (S, K) membership; default: all 2^K, in the order of ``members``.
     """
+    member = members(len(modalities_of(checkpoint))) if subsets is None else subsets
     report = progress or (lambda share: None)
     if isinstance(checkpoint, ExternalFilter):
-        return _external_subsets(checkpoint, trace, offset, report)
+        return _external_subsets(checkpoint, trace, offset, report, member)
     replay = Replay(checkpoint, trace, lambda share: report(REPLAY_TIME * share))
-    filter_, member = checkpoint.filter, members(len(modalities_of(checkpoint)))
-    start = replay.start
+    filter_, start = checkpoint.filter, replay.start
     count, mean = len(member), _offset_mean(start, trace, offset)
     start = Gaussian(mean.expand(count, -1), start.covariance.expand(count, -1, -1))
     result = rollout(
@@ -252,15 +257,17 @@ def _offset_mean(start: Gaussian, trace: Trace, offset: float) -> Tensor:
     return start.mean + offset * shift[..., 0]
 
 
-def _external_subsets(external: ExternalFilter, trace: Trace, offset: float, report: Callable[[float], None]) -> Array:
+def _external_subsets(
+    external: ExternalFilter, trace: Trace, offset: float, report: Callable[[float], None], member: Mask
+) -> Array:
     """As ``run_subsets``, one run by subset: absent sensors carry no information (``filters/external/ablation.py``)."""
     check_origin(external, trace)
     modalities, start = np.array(modalities_of(external)), external.start([trace.episode])
     start = Gaussian(_offset_mean(start, trace, offset), start.covariance)
     estimates = []
-    for has in members(len(modalities)):
+    for has in member:
         estimates.append(run_with(external, trace, tuple(modalities[has]), start))
-        report(len(estimates) / 2 ** len(modalities))
+        report(len(estimates) / len(member))
     return np.stack(estimates, axis=1)
 
 

@@ -228,3 +228,31 @@ def display_units(task: Task) -> tuple[tuple[str, ...], Array]:
     """Display units (``cm``, ``deg``) of the n components, and the conversion factors (n,) from SI."""
     pairs = [component.shown for component in task.components]
     return tuple(unit for unit, _ in pairs), np.array([factor for _, factor in pairs])
+
+
+def error_names(task: Task) -> list[str]:
+    """Names of the main error and of the components that are not part of it."""
+    return [task.main_error.name, *(task.components[i].label for i in _others(task))]
+
+
+def squared_errors(trace: Trace, estimates: NDArray[Any] | None = None) -> Array:
+    """(..., Q) SI: sums over the counted steps of the squared errors of ``error_names``.
+
+    estimates: (T, ..., n) other estimates than those of the trace.
+    """
+    error = errors(trace)[:, -1]
+    if estimates is not None:
+        shape = (len(trace), *(1,) * (estimates.ndim - 2), estimates.shape[-1])
+        error = wrapped(trace.task, estimates - trace.episode.states.reshape(shape))
+    columns = [0, *(1 + i for i in _others(trace.task))]
+    return np.asarray(np.square(with_main(trace.task, error[counted(trace)])[..., columns]).sum(0))
+
+
+def _others(task: Task) -> list[int]:
+    """Indices of the components that are not part of the main error."""
+    return [i for i in range(len(task.components)) if i not in task.main_error.indices]
+
+
+def removed_share(sums: Array) -> Array:
+    """Share of the root of the first of two sums (..., 2) that is missing in that of the second."""
+    return np.asarray(1.0 - np.sqrt(sums[..., 1] / np.maximum(sums[..., 0], 1e-12)))

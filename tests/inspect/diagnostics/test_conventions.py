@@ -1,0 +1,104 @@
+"""Conventions of the inputs: a planted change is found and undone exactly; sensors without influence change nothing."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.hand_on_arc import HandOnArc
+from beliefscope.filters.external.load import as_external
+from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnostics.conventions import RELEVANT, Conventions, conventions
+from beliefscope.inspect.statistics.measures import squared_errors
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
+
+sys.path.insert(0, str(Path(__file__).parent))
+import planted_traces as plant
+
+EPISODES, STEPS = 8, 100
+MIRRORED = "sensor_gain=effector_position:factor=-1"
+
+
+class HandOnFieldArc(HandOnArc):
+    task = "door-field"
+
+
+@cache
+def filter_() -> Checkpoint:
+    return as_external(HandOnFieldArc(), "hand on arc")
+
+
+@cache
+def episodes() -> dict[int, Episode]:
+    with open_dataset(sample_path("door-field")) as data:
+        return {index: plant.of_length(data[index], STEPS) for index in range(len(data) - EPISODES, len(data))}
+
+
+def traces(faults: str = "") -> list[Trace]:
+    changed = {index: Faults.parse(faults).apply(episode) for index, episode in episodes().items()}
+    return list(trace_all(filter_(), changed, changed))
+
+
+@cache
+def of_mirrored_positions() -> Conventions:
+    return conventions(traces(MIRRORED), filter_())
+
+
+def test_a_planted_sign_is_the_first_finding_and_its_share_that_of_the_clean_runs() -> None:
+    result = of_mirrored_positions()
+    change, error = result.found[0]
+    assert result.changes[change].text == "the opposite sign of effector position"
+    assert result.verdict.startswith("With the opposite sign of effector position, the ")
+    clean, faulty = (np.sum([squared_errors(trace) for trace in runs], axis=0) for runs in (traces(), traces(MIRRORED)))
+    assert result.share[change] == pytest.approx(1.0 - np.sqrt(clean / faulty), abs=1e-9)
+    assert RELEVANT <= result.share[change, error] <= 1.0
+    assert result.low[change, error] > 0.0
+    assert result.alarms
+
+
+def test_sensors_without_influence_change_nothing() -> None:
+    """The filter reads neither force nor torque."""
+    result = of_mirrored_positions()
+    rows = [i for i, change in enumerate(result.changes) if "force" in change.text or "torque" in change.text]
+    assert len(rows) == 12
+    assert (result.share[rows] == 0.0).all()
+
+
+def test_clean_episodes_have_no_finding() -> None:
+    result = conventions(traces(), filter_())
+    assert (result.found, result.alarms) == ([], ())
+    assert result.verdict.startswith(f"None of {len(result.changes)} changes of signs")
+
+
+def test_single_traces_have_no_intervals() -> None:
+    result = conventions(traces(MIRRORED)[:1], filter_())
+    assert np.isnan(result.low).all()
+    assert result.alarms == ()
+    assert "No intervals: too few trajectories (1; at least 5 needed)." in result.verdict
+    assert len(result.tables()[0].columns) == 2 + 2 * len(result.errors)
+
+
+@pytest.mark.long
+def test_repeated_episodes_are_separate_runs() -> None:
+    """Traces of one episode, as with several seeds, cannot run together; pooled twice, they have the same shares."""
+    runs = traces()[:2]
+    twice, once = conventions([*runs, *runs], filter_()), conventions(runs, filter_())
+    assert twice.trajectories == 4
+    np.testing.assert_allclose(twice.share, once.share, rtol=1e-9)
+
+
+def test_a_run_without_truth_is_refused() -> None:
+    run = traces()[0]
+    entry = DIAGNOSTICS["conventions"]
+    assert entry.refusal(run, filter_()) is None
+    run.episode.states[3] = np.nan
+    assert entry.refusal(run, filter_()) == "the episode has no ground truth at some steps"
