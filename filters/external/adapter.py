@@ -286,8 +286,8 @@ def _is_finite(value: Tensor) -> bool:
 
 
 def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
-    """Mean and covariance as ``moments``; of rotations, their mean and the covariance of the differences from it."""
-    parts = [moments(*block) for block in _blocks(particles, particles, log_weights)]
+    """Mean and covariance as ``moments``; of angles across half a turn and of rotations, those of the differences."""
+    parts = [_turned(task, moments(*block), *block) for block in _blocks(particles, particles, log_weights)]
     linear = Gaussian(torch.cat([part.mean for part in parts]), torch.cat([part.covariance for part in parts]))
     if not task.rotations:
         return linear
@@ -297,6 +297,32 @@ def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
     deviation = task.difference(states, mean[..., None, :])
     covariance = np.einsum("...m,...mi,...mj->...ij", weights, deviation, deviation)
     return Gaussian(torch.from_numpy(mean).to(particles.dtype), torch.from_numpy(covariance).to(particles.dtype))
+
+
+def _turned(task: Task, linear: Gaussian, particles: Tensor, log_weights: Tensor) -> Gaussian:
+    """Moments in which angles on both sides of half a turn are close; those of all other particles are unchanged.
+
+    Deviations are differences from the particle of the largest weight, wrapped to -pi..pi.
+    """
+    angles = [i for i, component in enumerate(task.components) if component.unit == "rad" and not component.rotation]
+    distances = particles[..., angles] - linear.mean[..., angles].unsqueeze(-2)
+    apart = (distances.abs() > torch.pi).any(-1).any(-1)
+    if not apart.any():
+        return linear
+    states = particles.expand(*log_weights.shape, particles.shape[-1])[apart].double()
+    weights = log_weights[apart].double().exp().unsqueeze(-1)
+    best = states.gather(1, weights.argmax(1, keepdim=True).expand(-1, -1, states.shape[-1]))
+    mean = best + (weights * _wrapped(states - best, angles)).sum(1, keepdim=True)
+    deviation = _wrapped(states - mean, angles)
+    linear.mean[apart] = mean.squeeze(1).to(linear.mean.dtype)
+    linear.covariance[apart] = ((weights * deviation).mT @ deviation).to(linear.covariance.dtype)
+    return linear
+
+
+def _wrapped(states: Tensor, angles: list[int]) -> Tensor:
+    """States (..., n) with angles in -pi..pi."""
+    states[..., angles] = (states[..., angles] + torch.pi) % (2.0 * torch.pi) - torch.pi
+    return states
 
 
 def derived(values: Values, task: Task) -> Values:

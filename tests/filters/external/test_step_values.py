@@ -141,3 +141,25 @@ def test_moments_of_blocks_are_those_of_all_steps(monkeypatch: pytest.MonkeyPatc
     weights = torch.softmax(values["log_weights"], -1)
     mean = (weights.unsqueeze(-1) * values["particles"]).sum(2)
     torch.testing.assert_close(results[0]["modality_mean"][:, :, 0], mean)
+
+
+def test_moments_of_angles_do_not_depend_on_where_they_wrap() -> None:
+    generator = torch.Generator().manual_seed(2)
+    task = find_task("door")  # the third component is an angle
+    likelihood = torch.randn(5, 1, 2, 200, generator=generator)
+    values = {
+        "estimate_mean": torch.zeros(5, 1, 3),
+        "particles": 0.1 * torch.randn(5, 1, 200, 3, generator=generator),
+        "prior_log_weights": torch.zeros(5, 1, 200),
+        "log_weights": likelihood.sum(2),
+        "log_likelihood": likelihood,
+    }
+    turned = {name: value.clone() for name, value in values.items()}
+    angle = turned["particles"][..., 2] + torch.pi
+    turned["particles"][..., 2] = (angle + torch.pi) % (2.0 * torch.pi) - torch.pi
+    assert (turned["particles"][..., 2].amax(2) - turned["particles"][..., 2].amin(2) > 6.0).all()
+    expected, result = adapter.derived(values, task), adapter.derived(turned, task)
+    for name in ("estimate_covariance", "modality_covariance"):
+        torch.testing.assert_close(result[name], expected[name], atol=1e-6, rtol=1e-4)
+    difference = task.difference(result["modality_mean"].numpy(), expected["modality_mean"].numpy())
+    np.testing.assert_allclose(np.abs(difference), np.broadcast_to([0, 0, np.pi], difference.shape), atol=1e-5)
