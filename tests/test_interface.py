@@ -6,6 +6,7 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,35 @@ def test_task_and_episode_need_few_fields(tmp_path: Path) -> None:
         bs.open_dataset([])
     with pytest.raises(bs.BadInput, match="tasks 'tank' and 'push'"):
         bs.open_dataset([episodes[0], bs.open_dataset("push")[0]])
+
+
+def test_episodes_that_no_command_could_read_are_not_saved(tmp_path: Path) -> None:
+    task = bs.Task("tank", (bs.Component("level", "m"),), {"gauge": (1,), "eye": (4, 4)}, {"g": ("gauge",)}, 0, 0.1)
+    good = bs.Episode(task, np.zeros((5, 1)), observations={"gauge": np.ones((5, 1)), "eye": np.zeros((5, 4, 4), "u1")})
+    path = bs.save_dataset([good], tmp_path / "tank.h5")
+    before = path.read_bytes()
+    gauge = np.ones((5, 1))
+    gauge[3] = np.nan
+    cases = {
+        "'observations/gauge' of episode 1 is nan at step 3, expected finite numbers": {"gauge": gauge},
+        r"'observations/gauge' of episode 1 has shape \(4, 1\), expected \(5, 1\)": {"gauge": np.ones((4, 1))},
+        "'observations/eye' of episode 1 is float32, expected uint8": {"eye": np.zeros((5, 4, 4))},
+        "has 'observations/nose', which task 'tank' does not declare. Available: observations/gauge": {"nose": gauge},
+    }
+    for message, changed in cases.items():
+        with pytest.raises(bs.BadInput, match=message):
+            bs.save_dataset([good, replace(good, observations={**good.observations, **changed})], path)
+    for message, other in {
+        "episode 1 has no 'observations/gauge'": replace(good, observations={"eye": good.observations["eye"]}),
+        "'split' of episode 1 is 'training'. Available: train, val, test": replace(good, split="training"),
+        "'time' of episode 1 is 0 s at step 1, after 0 s; expected ascending": replace(good, time=np.zeros(5)),
+        "'dt' of episode 1 is 0.2 s; task 'tank' has steps of 0.1 s": replace(good, dt=0.2),
+        "expected at least one step": good.part(0, 0),
+    }.items():
+        with pytest.raises(bs.BadInput, match=message):
+            bs.save_dataset([good, other], path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["tank.h5"]
 
 
 def test_every_function_has_a_call_in_the_example() -> None:

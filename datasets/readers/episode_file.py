@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode, time_error
+from beliefscope.datasets.episode_check import array_error
 from beliefscope.datasets.episode_index import read_index, write_index
 from beliefscope.datasets.episode_parts import STEPS_PER_PART, EpisodeParts
 from beliefscope.datasets.errors import BadInput
@@ -252,16 +253,8 @@ class EpisodeFile(Dataset):
     ) -> NDArray[Any]:
         """Some rows of an array, validated. unknown: whether values may be NaN."""
         array, place = self._stored(group, key)[rows], self._place(group, key)
-        fits = np.ndim(array) == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
-        if not fits:
-            expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-            raise BadInput(f"{place} has shape {np.shape(array)}, expected {expected}.")
-        if array.dtype != kind:
-            raise BadInput(f"{place} is {array.dtype}, expected {np.dtype(kind)}.")
-        invalid = np.isinf(array) if unknown else ~np.isfinite(array)
-        if invalid.any():
-            at = tuple(np.argwhere(invalid)[0])
-            raise BadInput(f"{place} is {array[at]} at step {at[0]}, expected finite numbers.")
+        if error := array_error(array, shape, kind, unknown):
+            raise BadInput(f"{place} {error}.")
         return np.asarray(array)
 
     def _place(self, group: h5py.Group, key: str) -> str:

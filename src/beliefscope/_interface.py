@@ -11,6 +11,7 @@ from beliefscope.datasets import store
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.dataset import Dataset, EpisodeList
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_check import check_episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import Faults, read_faults
 from beliefscope.datasets.task import Task
@@ -83,8 +84,14 @@ def open_dataset(source: str | Path | Sequence[Episode], task: Task | None = Non
 
 
 def save_dataset(episodes: Sequence[Episode], path: str | Path) -> Path:
-    """Write episodes of one task to an HDF5 file, which all commands read as ``--data``."""
+    """Write episodes of one task to an HDF5 file, which all commands read as ``--data``.
+
+    Raises BadInput, and writes nothing, if an episode does not fit its task: a missing or undeclared sensor, another
+    shape or type, a number that is not finite, times that do not ascend.
+    """
     source = EpisodeList(episodes)
+    for index, episode in enumerate(episodes):
+        check_episode(episode, f"episode {index}")
     store.write_dataset(path, source.task, source)
     return Path(path)
 
