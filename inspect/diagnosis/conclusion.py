@@ -139,6 +139,8 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
     if is_unused(cause, checkpoint):
         sensor = display_name(cause.component)
         return f"This filter does not use the {sensor} sensor, so it is unaffected; repair it for filters that do."
+    if isinstance(checkpoint, ExternalFilter) and cause.name == "particles.few":
+        return "Use more particles in the filter's own code."
     return cause.next.format(task=checkpoint.task.name, filter=checkpoint.name)
 
 
@@ -162,14 +164,14 @@ def _evidence(case: Case, deviation: Deviation) -> Evidence:
 def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int) -> str:
     """The first cause, or two, with their probability; two that cannot be separated; or the largest deviation.
 
-    It names the next action unless the first cause is sure. count: number of all episodes.
+    Of deviations, those of the readings come first, as others follow from them. It names the next action unless the
+    first cause is sure. count: number of all episodes.
     """
     if not candidates or not candidates[0].evidence or candidates[0].probability < SHOWN:
         sure = bool(candidates) and candidates[0].probability >= SURE
-        return (
-            f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {case.alarms[0].text}; "
-            f"try: {_search(case, count)}"
-        )
+        of_sensors = [alarm for alarm in case.alarms if alarm.statistic in _of_sensors(case)]
+        shown = (of_sensors or case.alarms)[0].text  # a faulty sensor changes the belief as well
+        return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {shown}; try: {_search(case, count)}"
     first = candidates[0]
     similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:

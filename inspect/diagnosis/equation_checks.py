@@ -5,6 +5,7 @@ In a filter that follows its equations, each of them has a fixed value, whatever
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,9 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+
+NO_EVIDENCE = 1e-6
+"""Variation of a log-likelihood over the particles of an episode, nats, below which its use cannot be seen."""
 
 
 @torch.no_grad()
@@ -112,6 +116,41 @@ def _particle_statistics(trace: Trace, filter_: MixtureParticleFilter) -> dict[s
         "offspring//all": float(np.square(offspring - count * log_weights.exp().numpy()).mean()),
         "prior ess//all": float((1.0 / (2.0 * prior).exp().sum(-1)).mean() / count),
     }
+
+
+def reported_particle_statistics(trace: Trace) -> dict[str, float]:
+    """Of the particles that an external filter reports: those of ``equation_statistics`` that need no equations of it.
+
+    ``prior ess`` is of the steps after a resampling, of all steps if there is none: not every filter resamples always.
+    ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
+    to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it.
+    """
+    if trace.all_particles_ess is not None or trace.log_weights is None or trace.prior_log_weights is None:
+        return {}
+    log_weights, prior = _tensor(trace.log_weights), _tensor(trace.prior_log_weights)
+    count = log_weights.shape[1]
+    values = {"particles//all": float(count), "prior ess//all": _ess_after_resampling(log_weights, prior)}
+    if trace.log_likelihood is None:
+        return values
+    weight = log_weights.exp()
+    valid = torch.isfinite(log_weights - prior) & torch.isfinite(_tensor(trace.log_likelihood)).all(1)
+    weight = torch.where(valid, weight, 0.0)
+    columns = [torch.where(valid, v, 0.0) for v in (*_tensor(trace.log_likelihood).unbind(1), log_weights - prior)]
+    total = weight.sum(-1, keepdim=True).clamp_min(1e-12)
+    centred = torch.stack([(v - (weight * v).sum(-1, keepdim=True) / total) * weight.sqrt() for v in columns], -1)
+    flat = centred.reshape(-1, len(columns))
+    if bool((flat.norm(dim=0)[:-1] < NO_EVIDENCE).any()):
+        return values
+    share = torch.linalg.lstsq(flat[:, :-1], flat[:, -1:], driver="gelsd").solution[:, 0]
+    names = trace.modalities if len(trace.modalities) == len(share) else ()
+    return values | {f"likelihood share/{name}/all": float(x) for name, x in zip(names, share, strict=False)}
+
+
+def _ess_after_resampling(log_weights: Tensor, prior: Tensor) -> float:
+    """Relative effective sample size of the prior weights (T, M), where that of the weights before is smaller."""
+    before, after = (1.0 / (2.0 * values).exp().sum(-1) / values.shape[1] for values in (log_weights[:-1], prior[1:]))
+    resampled = after > 1.001 * before
+    return float(after[resampled if resampled.any() else slice(None)].mean()) if len(after) else math.nan
 
 
 def _likelihood_power(trace: Trace, filter_: MixtureParticleFilter, prior: Tensor, log_weights: Tensor) -> float:

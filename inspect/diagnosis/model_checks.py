@@ -20,7 +20,7 @@ from beliefscope.filters.filter import MAX_LOGIT
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
+from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.signals import lag
@@ -57,7 +57,10 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
     Statistics that do not apply are absent.
     """
     known, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
-    values = {} if external else weight_statistics(trace) | equation_statistics(trace, checkpoint)
+    if external:
+        values = reported_particle_statistics(trace)
+    else:
+        values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if known:
         values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
     if known and not external:

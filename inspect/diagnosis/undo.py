@@ -239,7 +239,9 @@ def invert_beta(setting: Setting, deviations: Deviations) -> Setting | None:
 
 
 def healthy_particles(setting: Setting, deviations: Deviations) -> Setting | None:
-    """As many particles as in the healthy record; None if there are more already."""
+    """As many particles as in the healthy record; None if there are more already, or the filter has its own number."""
+    if isinstance(setting.checkpoint, ExternalFilter):
+        return None
     known = deviations.get("particles//all")
     healthy = 0 if known is None else round(known.healthy)
     return replace(setting, particles=healthy) if healthy > setting.particles else None

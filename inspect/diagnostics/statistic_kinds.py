@@ -35,6 +35,7 @@ KINDS = {
     "fusion mean": ("distance of the estimate from the fusion rule", True, 1.0),
     "prior ess": ("effective sample size after resampling", False, 0.01),
     "particles": ("number of particles", True, 0.02),
+    "likelihood share": ("power of the likelihood{of} in the particle weights", False, 0.02),
     "ancestors": ("share of particles with offspring", False, 0.01),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),

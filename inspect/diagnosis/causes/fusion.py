@@ -36,6 +36,13 @@ CAUSES = (
         "healthy beta",
     ),
     Cause(
+        "weights.ignores_likelihood",
+        "Particle weights ignore a likelihood",
+        (Symptom("likelihood share/*", -1),),
+        FILTER,
+        "Multiply the particle weights by the likelihood of every measurement model.",
+    ),
+    Cause(
         "fusion.shared_prior",
         "Prior counted more than once in the fusion",
         (Symptom("fusion mean/*", 1),),

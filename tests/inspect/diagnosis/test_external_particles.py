@@ -1,0 +1,109 @@
+"""A particle filter from outside: causes that its reported particles and weights show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+import beliefscope as bs
+from beliefscope.filters.external.load import as_external
+from beliefscope.inspect.diagnosis.cause import Diagnosis
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.equation_checks import reported_particle_statistics
+from beliefscope.inspect.healthy import profile_of
+
+TASK = bs.Task(
+    "rail",
+    (bs.Component("x", "m"),),
+    {"near": (1,), "far": (1,)},
+    {"near": ("near",), "far": ("far",)},
+    1,
+    0.1,
+    warmup=0,
+)
+STD = {"near": 0.1, "far": 0.15}
+
+
+def ride(seed: int, steps: int = 40) -> bs.Episode:
+    rng = np.random.default_rng(seed)
+    speed = rng.normal(0, 0.3, (steps, 1))
+    x = np.cumsum(0.1 * speed + rng.normal(0, 0.05, (steps, 1)), axis=0)
+    return bs.Episode(TASK, x, controls=speed, observations={k: x + rng.normal(0, s, x.shape) for k, s in STD.items()})
+
+
+class Particles:
+    def __init__(self, count: int = 100, powers: Mapping[str, float] | None = None, resample: bool = True) -> None:
+        self.count, self.powers, self.resample = count, powers or {}, resample
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        self.rng = np.random.default_rng(0)
+        self.x = mean + np.sqrt(covariance[0]) * self.rng.standard_normal((self.count, 1))
+        self.log_weights = np.full(self.count, -np.log(self.count))
+
+    def __call__(self, *, observations: Any, controls: Any) -> dict[str, Any]:
+        self.x = self.x + 0.1 * controls + 0.05 * self.rng.standard_normal((self.count, 1))
+        prior = self.log_weights
+        likelihood = np.stack([-0.5 * ((observations[k] - self.x[:, 0]) / s) ** 2 for k, s in STD.items()])
+        posterior = prior + sum(self.powers.get(k, 1.0) * row for k, row in zip(STD, likelihood, strict=True))
+        posterior -= np.logaddexp.reduce(posterior)
+        values = {"particles": self.x, "log_weights": posterior, "prior_log_weights": prior}
+        values |= {"log_likelihood": likelihood, "estimate_mean": np.exp(posterior) @ self.x}
+        self.log_weights = posterior
+        if self.resample and 1 / np.exp(2 * posterior).sum() < 0.5 * self.count:
+            self.x = self.x[self.rng.choice(self.count, self.count, p=np.exp(posterior))]
+            self.log_weights = np.full(self.count, -np.log(self.count))
+        return values
+
+
+def filter_of(module: Particles) -> Any:
+    return as_external(bs.Adapter(module, batched=False, modalities=tuple(STD), initial_std=(0.1,)), "rail", TASK)
+
+
+def diagnosis(module: Particles) -> Diagnosis:
+    record = profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
+    return diagnose(filter_of(module), {seed: ride(seed) for seed in range(100, 106)}, profile=record)
+
+
+def test_statistics_of_particles_that_a_filter_reports() -> None:
+    healthy, half, off = (
+        reported_particle_statistics(bs.trace(filter_of(module), [ride(0)], 0))
+        for module in (Particles(), Particles(powers={"far": 0.5}), Particles(resample=False))
+    )
+    assert healthy["particles//all"] == 100.0
+    assert healthy["prior ess//all"] == pytest.approx(1.0)
+    assert off["prior ess//all"] < 0.3
+    shares = [{k: values[f"likelihood share/{k}/all"] for k in STD} for values in (healthy, half, off)]
+    assert shares[0] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
+    assert shares[1] == pytest.approx({"near": 1.0, "far": 0.5}, abs=1e-3)
+    assert shares[2] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("module", "cause"),
+    [
+        (Particles(count=8), "particles.few"),
+        (Particles(powers={"far": 0.0}), "weights.ignores_likelihood"),
+        (Particles(resample=False), "resampling.off"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_faults_of_the_particles_of_an_external_filter_are_named(module: Particles, cause: str) -> None:
+    result = diagnosis(module)
+    assert (result.state, result.causes[0].cause.name) == ("fault", cause)
+    assert "--particles" not in result.causes[0].next  # the number of an external filter is its own
+
+
+@pytest.mark.slow
+def test_a_sensor_without_causes_in_the_catalog_is_named_before_its_effects() -> None:
+    record = profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
+    episodes = {}
+    for seed in range(100, 106):
+        episode = ride(seed)
+        episode.observations["near"][10:] = episode.observations["near"][10]
+        episodes[seed] = episode
+    headline = diagnose(filter_of(Particles()), episodes, profile=record).headline
+    assert headline.startswith("No cause stands out: share of repeated readings of near is 0.7")
