@@ -305,30 +305,25 @@ def test_busy_port(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert not (tmp_path / "workspace").exists()
 
 
-def test_an_interrupt_prints_one_line_and_exits_with_130(tmp_path: Path) -> None:
-    code = (
+@pytest.mark.parametrize(
+    ("number", "line", "code"),
+    [(signal.SIGINT, "error: interrupted", 130), (signal.SIGTERM, "error: terminated", 143)],
+    ids=["SIGINT", "SIGTERM"],
+)
+def test_a_signal_prints_one_line_and_exits_with_the_code_of_the_shell(
+    number: signal.Signals, line: str, code: int, tmp_path: Path
+) -> None:
+    program = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from beliefscope.app.cli.main import main; main()"
     )
-    command = [
-        sys.executable,
-        "-c",
-        code,
-        "collect",
-        "push",
-        "--episodes",
-        "40",
-        "--steps",
-        "50",
-        "-o",
-        str(tmp_path / "push.h5"),
-    ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    command = f"collect push --episodes 40 --steps 50 -o {tmp_path / 'push.h5'}".split()
+    with subprocess.Popen([sys.executable, "-c", program, *command], stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert process.stderr.readline().count("%") == 1, "the first line of the progress"
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         *_, last = process.stderr.read().splitlines()
-    assert (last, process.returncode) == ("error: interrupted", 130)
+    assert (last, process.returncode) == (line, code)
 
 
 def test_unexpected_errors_exit_with_1_and_a_traceback_on_request(

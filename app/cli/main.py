@@ -5,6 +5,7 @@ modules only when they run, so that ``--help`` is fast.
 """
 
 import io
+import signal
 import sys
 from contextlib import suppress
 from importlib import import_module
@@ -26,6 +27,14 @@ COMMANDS = (
 INTERRUPTED = 130
 """Exit code after Ctrl-C, of the shell; typer returns it instead of raising the interrupt."""
 
+TERMINATED = 128 + signal.SIGTERM
+"""Exit code after SIGTERM, of the shell."""
+
+
+class Terminated(BaseException):
+    """SIGTERM: commands end as after Ctrl-C and remove their unfinished files."""
+
+
 cli = typer.Typer(
     name="beliefscope",
     add_completion=False,
@@ -43,6 +52,7 @@ def main() -> None:
     debug = "--debug" in sys.argv[1:]
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # like standard error: file names may not be valid text
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         code = cli(prog_name="beliefscope", standalone_mode=False)
         if code == INTERRUPTED:
@@ -55,6 +65,8 @@ def main() -> None:
         console.fail(f"{message}{end} See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
         console.fail("interrupted", INTERRUPTED)
+    except Terminated:
+        console.fail("terminated", TERMINATED)
     except Exception as error:
         if debug:
             raise
@@ -66,6 +78,10 @@ def main() -> None:
             raise SystemExit(1) from None
         console.fail(f"{type(error).__name__}: {error} (run beliefscope --debug ... for a traceback)", 1)
     raise SystemExit(code)
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise Terminated
 
 
 @cli.callback(invoke_without_command=True)
