@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +103,22 @@ def _reading(path: Path) -> Iterator[None]:
         raise BadInput(f"{path.name} cannot be read: {reason:.200}") from None
 
 
+ABSENT = (None, "", "None")
+"""Missing values of a column that is no column of numbers."""
+
+
+def _not_numbers(values: NDArray[Any]) -> str:
+    """Why values (T, ...) are no numbers: the first text that is none, and its row."""
+    for row, value in enumerate(values.reshape(len(values), -1)[:, 0]) if values.size else ():
+        if value in ABSENT:
+            continue
+        try:
+            float(value)
+        except (TypeError, ValueError):
+            return f"has text, such as {str(value)!r:.50} in row {row}"
+    return "has no value" if all(value in ABSENT for value in values.flat) else "has text"
+
+
 def column(columns: Columns, reference: str, purpose: str) -> NDArray[np.float64]:
     """(T, ...) numbers of a column, ``NAME``, or of elements of its rows: ``NAME[I]`` (T,), ``NAME[I,J]`` (T, 2).
 
@@ -116,7 +133,7 @@ def column(columns: Columns, reference: str, purpose: str) -> NDArray[np.float64
     if values.dtype.kind == "M":  # dates as s since 1970
         values = np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) / 1e9)
     if values.dtype.kind not in "fiub":
-        raise BadInput(f"column {name!r} of {purpose} has text, such as {str(values.flat[0])!r:.50}, expected numbers")
+        raise BadInput(f"column {name!r} of {purpose} {_not_numbers(values)}, expected numbers")
     if not elements:
         return values.astype(np.float64)
     index = [int(element) for element in elements.split(",")]

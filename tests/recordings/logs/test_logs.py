@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -309,3 +310,17 @@ def test_a_published_ensemble_filter(tmp_path: Path) -> None:
     mapping = read_map(map_file(tmp_path, text))
     trace = recorded_trace(columns, mapping, read_log(columns, mapping, path.name), 0, path.name)
     assert nees(trace)[:, -1].mean() == pytest.approx(0.0747, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (["0.1", "0.2", "", "oops", "0.4"], "has text, such as 'oops' in row 3, expected numbers"),
+        ([None] * 5, "has no value, expected numbers"),
+        (["None"] * 5, "has no value, expected numbers"),
+    ],
+    ids=["text", "empty", "empty-as-text"],
+)
+def test_the_error_of_a_column_names_the_first_value_that_is_no_number(values: list[str | None], message: str) -> None:
+    with pytest.raises(BadInput, match=re.escape(f"column 'g' of sensor gps {message}")):
+        column({"g": np.array(values, dtype=object)}, "g", "sensor gps")
