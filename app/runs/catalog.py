@@ -163,6 +163,7 @@ def task_catalogs(
     for name, path in data.items():
         with _collect_error(problems):
             episodes = open_dataset(path, given=tasks)
+            first_moment(episodes)  # the page opens it there: damage of these episodes is a problem of the data set
             _catalog_of(catalogs, episodes.task, name).user_data[name] = episodes
             # A file of the MIT Push data set fits several tasks: offer it for each one that the user has filters for.
             for task in tasks_with_filters:

@@ -17,7 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import httpx
+import numpy as np
 import pytest
 import torch
 from starlette.testclient import TestClient
@@ -223,6 +225,24 @@ def test_missing_input_files_are_reported(
         catalog = client.get("/api/catalog").json()
     assert [line for line in catalog["problems"] if "missing.h5 does not exist" in line]
     assert "mine" in [entry["name"] for entry in catalog["tasks"][0]["data"]]
+
+
+def test_a_data_set_with_nan_in_its_first_episode_leaves_the_others_available(
+    settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    with open_dataset(sample_path("door")) as data:
+        write_dataset(tmp_path / "damaged.h5", DOOR, [data[9]])
+    with h5py.File(tmp_path / "damaged.h5", "r+") as file:
+        stored = file["trajectory0/observations/force"]
+        force = stored[...]
+        force[17] = np.nan
+        stored[...] = force
+    data_of = {"damaged": tmp_path / "damaged.h5", **settings.data}
+    with open_client(replace(settings, data=data_of)) as client:
+        catalog = client.get("/api/catalog").json()
+    message = "'observations/force' of trajectory0 is nan at step 17, expected finite numbers."
+    assert catalog["problems"] == [f"{tmp_path / 'damaged.h5'}: {message}"]
+    assert next(entry["name"] for entry in catalog["tasks"][0]["data"]) == "mine"
 
 
 def add_scaled_filter(settings: Settings, path: Path, value: float) -> Settings:
