@@ -15,6 +15,7 @@ import typer
 
 from beliefscope import __version__
 from beliefscope.app.cli import console
+from beliefscope.app.cli.options import with_options
 from beliefscope.datasets.errors import BadInput
 
 COMMANDS = (
@@ -44,7 +45,7 @@ cli = typer.Typer(
 )
 for name in COMMANDS:
     function = "import_" if name == "import" else name
-    cli.command(name)(getattr(import_module(f"beliefscope.app.cli.commands.{function}"), function))
+    cli.command(name)(with_options(getattr(import_module(f"beliefscope.app.cli.commands.{function}"), function)))
 
 
 def main() -> None:

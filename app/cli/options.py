@@ -65,43 +65,53 @@ def _check_json(value: str | None) -> str | None:
     return value
 
 
-def option(metavar: str, description: str, *names: str, **settings: Any) -> Any:
+REQUIRED = inspect.Parameter.empty
+"""Default of an option that must be given."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """Default of a parameter of a command, and its description for typer."""
+
+    default: Any
+    info: Any
+
+
+def option(metavar: str, description: str, default: Any = REQUIRED, *names: str, **settings: Any) -> Any:
     """An option with a value. names: default: ``--`` and the parameter's name. settings: of ``typer.Option``."""
-    return typer.Option(*names, metavar=metavar, help=description, **settings)
+    return Described(default, typer.Option(*names, metavar=metavar, help=description, **settings))
 
 
 def argument(metavar: str, description: str) -> Any:
     """A positional argument."""
-    return typer.Argument(metavar=metavar, help=description)
+    return Described(REQUIRED, typer.Argument(metavar=metavar, help=description))
 
 
-def flag(description: str, *names: str) -> Any:
+def flag(description: str, *names: str, default: bool = False) -> Any:
     """An option without a value."""
-    return typer.Option(*names, help=description)
+    return Described(default, typer.Option(*names, help=description))
 
 
-def output_file(metavar: str, description: str, *suffixes: str, names: tuple[str, ...] = ("-o", "--output")) -> Any:
+def output_file(
+    metavar: str, description: str, *suffixes: str, names: Sequence[str] = ("-o", "--output"), default: Any = None
+) -> Any:
     """An option for a file to write, by default ``-o``, checked before the command runs: another suffix is refused."""
-
-    def check(path: Path | None) -> Path | None:
-        return check_output(path, *suffixes)
-
-    return option(metavar, description, *names, callback=check)
+    return option(metavar, description, default, *names, callback=lambda path: check_output(path, *suffixes))
 
 
-DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5")
-CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors")
-TRACE = output_file("RUN.trace", "Output trace file.", ".trace")
-FIGURE = output_file("FIGURE", "Output figure: .svg, .pdf or .png.")
+DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=REQUIRED)
+CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=REQUIRED)
 TRACE_FILTER = option(
     "NAME|CHECKPOINT",
     "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
+    "",
 )
 
 TASK_OF_FILES = option(
     "NAME|FILE.py:NAME",
     "Task of the files. They contain its definition; needed for files of earlier versions that only name a task of "
     "your own, and for its functions (replay, outline).",
+    "",
     "--task",
 )
 
@@ -132,12 +142,14 @@ OPTIONS: dict[str, Any] = {
         "SLICE",
         "Data slice: 'contact', 'free motion', 'blackout 0.8', 'haptics only', or a custom one, "
         "NAME:faults=FAULTS:contact=yes:only=MODALITY. Repeatable.",
+        REQUIRED,
         "--slice",
     ),
     "quantity": option(
         "likelihood|posterior",
         "Quantity of the maps: likelihood of each observation, or posterior of the state. Default: likelihood, or "
         "posterior for an external filter that reports no virtual observations.",
+        REQUIRED,
         "--map",
     ),
     "particles_kept": option("M", "Particles of each step that are stored; moments are of all.", parser=integer(1)),
@@ -162,48 +174,47 @@ OPTIONS: dict[str, Any] = {
     "align": flag("Move data of another frame by the constant offset that explains the difference.", "--align"),
     "json": option("-", "Print one JSON document instead of text: --json -", callback=_check_json),
 }
-"""Parameter of a command -> its description; ``with_options`` adds those of a single command."""
+"""Parameter of a command -> its description, where the command has no own one."""
 
 
-Command = Callable[..., console.Result | None]
+def with_options(command: Callable[..., console.Result | None]) -> Callable[..., None]:
+    """The command as typer runs it: prints its result, with option ``--json``.
 
-
-def with_options(**own: Any) -> Callable[[Command], Callable[..., None]]:
-    """Describe the parameters of a command: by ``own``, else by ``OPTIONS``; print its result, with option ``--json``.
-
-    A parameter whose type is a dataclass, such as ``Run``, stands for an option for each of its fields.
+    The default of a parameter is its description, or a plain value, with a description in ``OPTIONS``. A parameter
+    whose type is a dataclass, such as ``Run``, stands for an option for each of its fields.
     """
+    hints = get_type_hints(command)
+    has_result = hints.pop("return") is console.Result
+    groups: dict[str, Any] = {name: type_ for name, type_ in hints.items() if is_dataclass(type_)}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        group = groups.get(name)
+        parameters += inspect.signature(group).parameters.values() if group else [parameter]
+        hints |= get_type_hints(group) if group else {}
+    if has_result:
+        parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None))
+        hints["json"] = str | None
 
-    def decorate(command: Command) -> Callable[..., None]:
-        descriptions, hints = OPTIONS | own, get_type_hints(command)
-        has_result = hints.pop("return") is console.Result
-        groups: dict[str, Any] = {name: type_ for name, type_ in hints.items() if is_dataclass(type_)}
-        parameters: list[inspect.Parameter] = []
-        for name, parameter in inspect.signature(command).parameters.items():
-            group = groups.get(name)
-            parameters += inspect.signature(group).parameters.values() if group else [parameter]
-            hints |= get_type_hints(group) if group else {}
-        if has_result:
-            parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None))
-            hints["json"] = str | None
-        annotations = {p.name: Annotated[hints[p.name], descriptions[p.name]] for p in parameters}
+    @wraps(command)
+    def run(json: str | None = None, **values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+        if (result := command(**values)) is not None:
+            result.print(json)
+            if result.code:
+                raise typer.Exit(result.code)
 
-        @wraps(command)
-        def run(json: str | None = None, **values: Any) -> None:
-            for name, group in groups.items():
-                values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-            if (result := command(**values)) is not None:
-                result.print(json)
-                if result.code:
-                    raise typer.Exit(result.code)
+    described = [_described(parameter, hints[parameter.name]) for parameter in parameters]
+    run.__signature__ = inspect.Signature(described)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
+    return run
 
-        run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-            [p.replace(kind=p.KEYWORD_ONLY, annotation=annotations[p.name]) for p in parameters]
-        )
-        run.__annotations__ = annotations
-        return run
 
-    return decorate
+def _described(parameter: inspect.Parameter, type_: Any) -> inspect.Parameter:
+    """A parameter in typer's form."""
+    own = parameter.default
+    default, info = (own.default, own.info) if isinstance(own, Described) else (own, OPTIONS[parameter.name].info)
+    return parameter.replace(kind=parameter.KEYWORD_ONLY, default=default, annotation=Annotated[type_, info])
 
 
 @dataclass(frozen=True)

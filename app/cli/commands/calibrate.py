@@ -3,11 +3,11 @@ from pathlib import Path
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(
-    level=opt.option("P", "Share of the steps that a region must contain."),
-    output=opt.output_file("CALIBRATION", "Output .json file.", ".json"),
-)
-def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Result:
+def calibrate(
+    runs: opt.Runs,
+    output: Path = opt.output_file("CALIBRATION", "Output .json file.", ".json", default=opt.REQUIRED),
+    level: float = opt.option("P", "Share of the steps that a region must contain.", 0.95),
+) -> console.Result:
     """Calibrate the uncertainty of a filter.
 
     Fits factors on the covariances, and conformal regions, to every other held-out episode, and reports the coverage

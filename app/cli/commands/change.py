@@ -5,19 +5,13 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import serve_command
 
 
-@opt.with_options(
-    before=opt.argument(
+def change(
+    before: str = opt.argument(
         "BEFORE",
         "Path of a .safetensors file, name of a built-in filter such as crossmodal-ekf, or path/to/file.py:build.",
     ),
-    after=opt.argument("AFTER", "As BEFORE."),
-    task=opt.option("TASK", "Task of both filters. Required for two names."),
-    output=opt.option("DIR", "New folder for change.json, change.svg and change.md.", "-o"),
-)
-def change(
-    before: str,
-    after: str,
-    task: str | None = None,
+    after: str = opt.argument("AFTER", "As BEFORE."),
+    task: str | None = opt.option("TASK", "Task of both filters. Required for two names.", None),
     data: Path | None = None,
     skip_bad: bool = False,
     every: bool = False,
@@ -26,7 +20,7 @@ def change(
     seed: int = 0,
     engine: opt.Engine = "local",
     workers: int = 1,
-    output: Path | None = None,
+    output: Path | None = opt.option("DIR", "New folder for change.json, change.svg and change.md.", None, "-o"),
 ) -> console.Result:
     """Report improvements and regressions between filters.
 

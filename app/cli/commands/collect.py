@@ -3,29 +3,24 @@ from pathlib import Path
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(
-    output=opt.DATASET,
-    episodes=opt.option(
-        "N", "Episodes. Default as in the paper: door 600, push 1000; others 100.", parser=opt.integer(1)
-    ),
-    steps=opt.option(
-        "T",
-        "Steps of 0.1 s per episode. Default as in the paper: door 800, push 250; others 200.",
-        parser=opt.integer(2),
-    ),
-    split=opt.option("NAME", "train, val or test: split of all episodes. Default: by number."),
-    without=opt.option("INGREDIENT", "Ingredient of a field task to switch off (docs/field_tasks.md). Repeatable."),
-    workers=opt.option("W", "Processes. Default: one per CPU core.", parser=opt.integer(1)),
-)
 def collect(
     task: str,
-    output: Path,
-    episodes: int | None = None,
-    steps: int | None = None,
-    workers: int | None = None,
+    output: Path = opt.DATASET,
+    episodes: int | None = opt.option(
+        "N", "Episodes. Default as in the paper: door 600, push 1000; others 100.", None, parser=opt.integer(1)
+    ),
+    steps: int | None = opt.option(
+        "T",
+        "Steps of 0.1 s per episode. Default as in the paper: door 800, push 250; others 200.",
+        None,
+        parser=opt.integer(2),
+    ),
+    workers: int | None = opt.option("W", "Processes. Default: one per CPU core.", None, parser=opt.integer(1)),
     seed: int = 0,
-    split: str | None = None,
-    without: list[str] | None = None,
+    split: str | None = opt.option("NAME", "train, val or test: split of all episodes. Default: by number.", None),
+    without: list[str] | None = opt.option(
+        "INGREDIENT", "Ingredient of a field task to switch off (docs/field_tasks.md). Repeatable.", None
+    ),
 ) -> console.Result:
     """Simulate episodes and write them to an HDF5 file.
 

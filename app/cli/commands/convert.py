@@ -10,8 +10,12 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
 
 
-@opt.with_options(data=opt.option("FILE|DIR", "Files in a supported format (docs/data.md)."), output=opt.DATASET)
-def convert(task: str, data: Path, output: Path, skip_bad: bool = False) -> console.Result:
+def convert(
+    task: str,
+    data: Path = opt.option("FILE|DIR", "Files in a supported format (docs/data.md)."),
+    output: Path = opt.DATASET,
+    skip_bad: bool = False,
+) -> console.Result:
     """Convert external data to a Beliefscope HDF5 file.
 
     Every command also reads the external files directly; a converted file opens faster and has the same hash.

@@ -4,23 +4,19 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    first=opt.option("STEP", "First step of the intervention.", "--from", parser=opt.integer(0)),
-    to=opt.option("STEP", "First step after the intervention.", parser=opt.integer(1)),
-    weights=opt.option(
-        "MODALITY=BETA,...",
-        "Manual fusion weights that replace the network's; other modalities share the remainder.",
-    ),
-    output=opt.output_file("FIGURE", "Also draw a .svg, .pdf or .png figure."),
-    trace_path=opt.output_file("RUN.trace", "Also write the trace of the modified run.", ".trace", names=("--trace",)),
-)
 def counterfactual(
     run: opt.Run,
-    first: int,
-    to: int,
-    weights: str = "",
-    output: Path | None = None,
-    trace_path: Path | None = None,
+    first: int = opt.option("STEP", "First step of the intervention.", opt.REQUIRED, "--from", parser=opt.integer(0)),
+    to: int = opt.option("STEP", "First step after the intervention.", parser=opt.integer(1)),
+    weights: str = opt.option(
+        "MODALITY=BETA,...",
+        "Manual fusion weights that replace the network's; other modalities share the remainder.",
+        "",
+    ),
+    output: Path | None = opt.output_file("FIGURE", "Also draw a .svg, .pdf or .png figure."),
+    trace_path: Path | None = opt.output_file(
+        "RUN.trace", "Also write the trace of the modified run.", ".trace", names=("--trace",)
+    ),
 ) -> console.Result:
     """Rerun a filter with a temporary intervention.
 

@@ -4,11 +4,10 @@ from pathlib import Path
 from beliefscope.app.cli import options as opt
 
 
-@opt.with_options(
-    port=opt.option("N", "Port; 0 selects a free one.", parser=opt.integer(0, 65535)),
-    open_page=opt.flag("Open the dashboard in a browser.", "--open/--no-open"),
-)
-def demo(port: int = 0, open_page: bool = True) -> None:
+def demo(
+    port: int = opt.option("N", "Port; 0 selects a free one.", 0, parser=opt.integer(0, 65535)),
+    open_page: bool = opt.flag("Open the dashboard in a browser.", "--open/--no-open", default=True),
+) -> None:
     """Open the dashboard on the included example.
 
     Serves the included filters and episodes from a temporary workspace, which is deleted at the end, and opens the page

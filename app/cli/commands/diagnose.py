@@ -11,25 +11,22 @@ if TYPE_CHECKING:
     from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
-@opt.with_options(
-    episode=opt.option("I", "Diagnose only this episode. Default: the held-out ones.", parser=opt.integer(0)),
-    base=opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's."),
-    alarm_rate=opt.option("P", "Probability that a healthy filter raises an alarm."),
-    profile_from=opt.option("DATA", "Clean episodes whose held-out ones become the healthy record."),
-    profile_filter=opt.option(
-        "NAME|CHECKPOINT|MODULE:BUILD",
-        "Filter that runs over --profile-from. Default: --filter.",
-    ),
-    repair=opt.option("I", "Also search the smallest repair of this episode's failure.", parser=opt.integer(0)),
-)
 def diagnose(
     runs: opt.Runs,
-    episode: int | None = None,
-    base: Path | None = None,
-    alarm_rate: float = 0.02,
-    profile_from: Path | None = None,
-    profile_filter: str | None = None,
-    repair: int | None = None,
+    episode: int | None = opt.option(
+        "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
+    ),
+    base: Path | None = opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None),
+    alarm_rate: float = opt.option("P", "Probability that a healthy filter raises an alarm.", 0.02),
+    profile_from: Path | None = opt.option(
+        "DATA", "Clean episodes whose held-out ones become the healthy record.", None
+    ),
+    profile_filter: str | None = opt.option(
+        "NAME|CHECKPOINT|MODULE:BUILD", "Filter that runs over --profile-from. Default: --filter.", None
+    ),
+    repair: int | None = opt.option(
+        "I", "Also search the smallest repair of this episode's failure.", None, parser=opt.integer(0)
+    ),
     workers: int = 1,
     engine: opt.Engine = "local",
 ) -> console.Result:

@@ -3,12 +3,11 @@ from pathlib import Path
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(
-    workspace=opt.option("DIR", "Workspace folder of the server."),
-    host=opt.option("ADDRESS", "Address the server would listen on."),
-    port=opt.option("N", "Port the server would listen on.", parser=opt.integer(0, 65535)),
-)
-def doctor(workspace: Path = Path("workspace"), host: str = "127.0.0.1", port: int = 8000) -> console.Result:
+def doctor(
+    workspace: Path = opt.option("DIR", "Workspace folder of the server.", Path("workspace")),
+    host: str = opt.option("ADDRESS", "Address the server would listen on.", "127.0.0.1"),
+    port: int = opt.option("N", "Port the server would listen on.", 8000, parser=opt.integer(0, 65535)),
+) -> console.Result:
     """Check the installation and suggest fixes.
 
     Checks packages and their versions, PyTorch, the simulation and its camera, hashes of the built-in filters and

@@ -1,16 +1,14 @@
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(
-    only=opt.option("MODALITY", "Run the standalone filter of this modality: all others are masked."),
-    start_offset=opt.option(
-        "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg."
-    ),
-)
 def evaluate(
     runs: opt.Runs,
-    only: str | None = None,
-    start_offset: str = "",
+    only: str | None = opt.option(
+        "MODALITY", "Run the standalone filter of this modality: all others are masked.", None
+    ),
+    start_offset: str = opt.option(
+        "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg.", ""
+    ),
     align: bool = False,
     engine: opt.Engine = "local",
     workers: int = 1,

@@ -4,21 +4,15 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    sweeps=opt.argument("DIR...", "Folders of sweeps; their tables are joined."),
-    phase=opt.option("NAME", "Steps to compare: all, a group such as contact, or blackout."),
-    sort=opt.option("COLUMN", "Column of the overview that ranks the checkpoints, worst first."),
-    top=opt.option("N", "Number of rows.", parser=opt.integer(1)),
-    sql=opt.option("QUERY", "An SQL query (DuckDB) of the tables results, checkpoints and datasets instead."),
-    output=opt.output_file("FILE", "Write all rows to a file: .csv or .parquet.", ".csv", ".parquet"),
-)
 def experiments(
-    sweeps: list[Path],
-    phase: str = "all",
-    sort: str = "error",
-    top: int = 20,
-    sql: str = "",
-    output: Path | None = None,
+    sweeps: list[Path] = opt.argument("DIR...", "Folders of sweeps; their tables are joined."),
+    phase: str = opt.option("NAME", "Steps to compare: all, a group such as contact, or blackout.", "all"),
+    sort: str = opt.option("COLUMN", "Column of the overview that ranks the checkpoints, worst first.", "error"),
+    top: int = opt.option("N", "Number of rows.", 20, parser=opt.integer(1)),
+    sql: str = opt.option(
+        "QUERY", "An SQL query (DuckDB) of the tables results, checkpoints and datasets instead.", ""
+    ),
+    output: Path | None = opt.output_file("FILE", "Write all rows to a file: .csv or .parquet.", ".csv", ".parquet"),
 ) -> console.Result:
     """Query the results of sweeps.
 

@@ -10,17 +10,20 @@ if TYPE_CHECKING:
     from beliefscope.inspect.trace import Trace
 
 
-@opt.with_options(
-    sources=opt.argument("TRACE|RUN.rrd...", "Trace file or recording; several for a folder of interactive pages."),
-    output=opt.option(
-        "FILE|DIR", "Output: .parquet, .mcap, .npz, or .html for an interactive page; or a folder.", "-o", "--output"
-    ),
-    task=opt.TASK_OF_FILES,
-    filter=opt.TRACE_FILTER,
-    interactive=opt.flag("Write interactive pages: the default for .html and for folders.", "--interactive"),
-)
 def export(
-    sources: list[Path], output: Path, task: str = "", filter: str = "", interactive: bool = False
+    sources: list[Path] = opt.argument(
+        "TRACE|RUN.rrd...", "Trace file or recording; several for a folder of interactive pages."
+    ),
+    output: Path = opt.option(
+        "FILE|DIR",
+        "Output: .parquet, .mcap, .npz, or .html for an interactive page; or a folder.",
+        opt.REQUIRED,
+        "-o",
+        "--output",
+    ),
+    task: str = opt.TASK_OF_FILES,
+    filter: str = opt.TRACE_FILTER,
+    interactive: bool = opt.flag("Write interactive pages: the default for .html and for folders.", "--interactive"),
 ) -> console.Result:
     """Export traces as tables or interactive pages.
 

@@ -3,18 +3,13 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.recordings.report.command_lines import serve_command
 
 
-@opt.with_options(
-    top=opt.option("N", "Number of events.", parser=opt.integer(1)),
-    phase=opt.option("NAME", "Only events of this phase, such as 'contact made'."),
-    url=opt.option("URL", "Address of a running server; prints a full permalink per event."),
-)
 def failures(
     runs: opt.Runs,
     by: str = "error",
-    top: int = 20,
-    phase: str | None = None,
+    top: int = opt.option("N", "Number of events.", 20, parser=opt.integer(1)),
+    phase: str | None = opt.option("NAME", "Only events of this phase, such as 'contact made'.", None),
     every: bool = False,
-    url: str | None = None,
+    url: str | None = opt.option("URL", "Address of a running server; prints a full permalink per event.", None),
     engine: opt.Engine = "local",
     workers: int = 1,
 ) -> console.Result:

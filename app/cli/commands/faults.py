@@ -1,7 +1,6 @@
-from beliefscope.app.cli import console, options as opt
+from beliefscope.app.cli import console
 
 
-@opt.with_options()
 def faults() -> console.Result:
     """List the sensor faults available for --faults.
 

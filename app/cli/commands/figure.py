@@ -5,22 +5,19 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    kind=opt.argument("maps|weights", "Kind of figure."),
-    output=opt.FIGURE,
-    steps=opt.option(
+def figure(
+    *,
+    kind: Literal["maps", "weights"] = opt.argument("maps|weights", "Kind of figure."),
+    run: opt.Run,
+    output: Path = opt.output_file("FIGURE", "Output figure: .svg, .pdf or .png.", default=opt.REQUIRED),
+    steps: list[int] | None = opt.option(
         "T",
         "Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle of the "
         "longest stretch of each, or of the episode for a task without contact.",
+        None,
         "--step",
         parser=opt.integer(0),
     ),
-)
-def figure(
-    kind: Literal["maps", "weights"],
-    run: opt.Run,
-    output: Path,
-    steps: list[int] | None = None,
     quantity: opt.Quantity | None = None,
 ) -> console.Result:
     """Draw a figure of the paper from a filter run.

@@ -21,58 +21,55 @@ if TYPE_CHECKING:
     from beliefscope.inspect.compare.success import Success
 
 
-@opt.with_options(
-    target=opt.argument("TASK|CHECKPOINT", "Task of the filter given with --filter, or .safetensors file."),
-    output=opt.CHECKPOINT,
-    filter=opt.option(
+def finetune(
+    target: str = opt.argument("TASK|CHECKPOINT", "Task of the filter given with --filter, or .safetensors file."),
+    output: Path = opt.CHECKPOINT,
+    filter: str | None = opt.option(
         "NAME|FILE",
         "Name of a built-in filter, .safetensors file, or build function of an external filter (FILE.py:NAME).",
+        None,
     ),
-    fault_sets=opt.option("FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", "--faults"),
-    clean_weight=opt.option(
-        "SHARE",
-        "Weight of clean data in the loss (default 0.5; without options for modules and data 0.97 with images).",
-    ),
-    events=opt.option("EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", "--event"),
-    steps=opt.option("N", "Maximum number of optimiser steps (default 300).", parser=opt.integer(1)),
-    length=opt.option("T", "Window length in steps.", parser=opt.integer(1)),
-    rates=opt.option(
-        "R|PATTERN=R",
-        "Learning rate of Adam (default 0.0003), or of modules that match a pattern: 'weight_model=0.0001'.",
-        "--rate",
-    ),
-    l2_sp=opt.option("X", "L2-SP strength (decay to the base weights)."),
-    calibrate=opt.flag("Then scale process and measurement noise such that NEES is 1 on the validation episodes."),
-    patience=opt.option("N", "Stop after N validations without improvement.", parser=opt.integer(1)),
-    success=opt.option(
-        "SLICE[:by=10%:others=5%]",
-        "Success criterion: the error falls by at least this share in the slice and rises by at most that in others.",
-    ),
-    log=opt.option("DIR", "Folder for losses and errors as a Rerun recording and TensorBoard logs."),
-    rerun=opt.option("URL", "Address of a running Rerun viewer to stream to; requires --log."),
-)
-def finetune(
-    target: str,
-    output: Path,
-    filter: str | None = None,
     train: list[str] | None = None,
     freeze: list[str] | None = None,
     slices: list[str] | None = None,
-    fault_sets: list[str] | None = None,
-    clean_weight: float | None = None,
-    events: list[str] | None = None,
+    fault_sets: list[str] | None = opt.option(
+        "FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", None, "--faults"
+    ),
+    clean_weight: float | None = opt.option(
+        "SHARE",
+        "Weight of clean data in the loss (default 0.5; without options for modules and data 0.97 with images).",
+        None,
+    ),
+    events: list[str] | None = opt.option(
+        "EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", None, "--event"
+    ),
     data: Path | None = None,
     skip_bad: bool = False,
-    steps: int | None = None,
-    length: int = 32,
-    rates: list[str] | None = None,
-    l2_sp: float = 1.0,
-    calibrate: bool = False,
-    patience: int = 6,
+    steps: int | None = opt.option(
+        "N", "Maximum number of optimiser steps (default 300).", None, parser=opt.integer(1)
+    ),
+    length: int = opt.option("T", "Window length in steps.", 32, parser=opt.integer(1)),
+    rates: list[str] | None = opt.option(
+        "R|PATTERN=R",
+        "Learning rate of Adam (default 0.0003), or of modules that match a pattern: 'weight_model=0.0001'.",
+        None,
+        "--rate",
+    ),
+    l2_sp: float = opt.option("X", "L2-SP strength (decay to the base weights).", 1.0),
+    calibrate: bool = opt.flag(
+        "Then scale process and measurement noise such that NEES is 1 on the validation episodes."
+    ),
+    patience: int = opt.option("N", "Stop after N validations without improvement.", 6, parser=opt.integer(1)),
     seed: int = 0,
-    success: str | None = None,
-    log: Path | None = None,
-    rerun: str = "",
+    success: str | None = opt.option(
+        "SLICE[:by=10%:others=5%]",
+        "Success criterion: the error falls by at least this share in the slice and rises by at most that in others.",
+        None,
+    ),
+    log: Path | None = opt.option(
+        "DIR", "Folder for losses and errors as a Rerun recording and TensorBoard logs.", None
+    ),
+    rerun: str = opt.option("URL", "Address of a running Rerun viewer to stream to; requires --log.", ""),
 ) -> console.Result:
     """Fine-tune modules of a filter.
 

@@ -12,25 +12,19 @@ if TYPE_CHECKING:
 RECORDINGS = (".rrd", ".live")
 
 
-@opt.with_options(
-    source=opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log: a file or folder, see below."),
-    map=opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", "--map"),
-    guess=opt.flag("Print a first map of a log instead of importing it.", "--guess"),
-    output=opt.output_file(
+def import_(
+    source: Path = opt.argument(
+        "FILE", "Recording (.rrd), file of a live run (.live), or log: a file or folder, see below."
+    ),
+    output: Path | None = opt.output_file(
         "RUN.trace|RUN.live|DATA.h5",
         "Output: a trace, a run for the folder live of a workspace, or a data set.",
         *(".trace", ".live", ".h5"),
     ),
-    episode=opt.option("I", "Index of the episode of a log that becomes a trace.", "--episode"),
-    task=opt.TASK_OF_FILES,
-)
-def import_(
-    source: Path,
-    output: Path | None = None,
-    map: Path | None = None,
-    guess: bool = False,
-    episode: int = 0,
-    task: str = "",
+    map: Path | None = opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", None, "--map"),
+    guess: bool = opt.flag("Print a first map of a log instead of importing it.", "--guess"),
+    episode: int = opt.option("I", "Index of the episode of a log that becomes a trace.", 0, "--episode"),
+    task: str = opt.TASK_OF_FILES,
 ) -> console.Result:
     """Import a recording or a log as a trace or data set.
 

@@ -5,25 +5,17 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
 
 
-@opt.with_options(
-    paths=opt.argument("TRACE...", "Traces of one filter."),
-    filter=opt.TRACE_FILTER,
-    task=opt.TASK_OF_FILES,
-    only=opt.option("NAME", "Run only this diagnostic. Repeatable."),
-    options=opt.option("NAME=VALUE", "Option of a diagnostic, such as step=68. Repeatable.", "--option"),
-    every=opt.flag("Include slow diagnostics.", "--all"),
-    figures=opt.option("DIR", "Write a figure per diagnostic to this folder."),
-    format=opt.option("NAME", "Format of the figures: svg, pdf or png."),
-)
 def inspect(
-    paths: list[Path],
-    filter: str = "",
-    task: str = "",
-    only: list[str] | None = None,
-    options: list[str] | None = None,
-    every: bool = False,
-    figures: Path | None = None,
-    format: Literal["svg", "pdf", "png"] = "svg",
+    paths: list[Path] = opt.argument("TRACE...", "Traces of one filter."),
+    filter: str = opt.TRACE_FILTER,
+    task: str = opt.TASK_OF_FILES,
+    only: list[str] | None = opt.option("NAME", "Run only this diagnostic. Repeatable.", None),
+    options: list[str] | None = opt.option(
+        "NAME=VALUE", "Option of a diagnostic, such as step=68. Repeatable.", None, "--option"
+    ),
+    every: bool = opt.flag("Include slow diagnostics.", "--all"),
+    figures: Path | None = opt.option("DIR", "Write a figure per diagnostic to this folder.", None),
+    format: Literal["svg", "pdf", "png"] = opt.option("NAME", "Format of the figures: svg, pdf or png.", "svg"),
 ) -> console.Result:
     """Run diagnostics on traces of a filter.
 

@@ -4,12 +4,11 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    paths=opt.argument("FOLDER...", "Folders with checkpoints, or checkpoints."),
-    export=opt.option("CHECKPOINT", "Copy this checkpoint (path or hash) and its ancestors to -o."),
-    output=opt.option("DIR", "New folder for --export.", "-o"),
-)
-def lineage(paths: list[Path], export: str | None = None, output: Path | None = None) -> console.Result:
+def lineage(
+    paths: list[Path] = opt.argument("FOLDER...", "Folders with checkpoints, or checkpoints."),
+    export: str | None = opt.option("CHECKPOINT", "Copy this checkpoint (path or hash) and its ancestors to -o.", None),
+    output: Path | None = opt.option("DIR", "New folder for --export.", None, "-o"),
+) -> console.Result:
     """Show which checkpoint was fine-tuned from which.
 
     Prints the tree of all checkpoints in the folders, based on their headers, with the command that created each one

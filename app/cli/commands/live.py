@@ -7,15 +7,11 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    rate=opt.option("HZ", "Steps per second; 0: as fast as possible. Default: the task's rate."),
-    name=opt.option("NAME", "Name of the run. Default: task, filter and episode."),
-)
 def live(
     run: opt.Run,
-    rate: float | None = None,
+    rate: float | None = opt.option("HZ", "Steps per second; 0: as fast as possible. Default: the task's rate.", None),
     workspace: Path = Path("workspace"),
-    name: str = "",
+    name: str = opt.option("NAME", "Name of the run. Default: task, filter and episode.", ""),
 ) -> console.Result:
     """Run a filter in real time and stream it to the dashboard.
 

@@ -4,17 +4,11 @@ from beliefscope.app.cli import options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    task=opt.option("FILE.py:NAME", "Custom task. Repeatable."),
-    data=opt.option("FILE|DIR", "Additional episodes. Repeatable."),
-    filter=opt.option("CHECKPOINT|MODULE:BUILD", "Additional filter. Repeatable."),
-    url=opt.option("URL", "Address of a running dashboard, for the links in answers."),
-)
 def mcp(
-    task: list[str] | None = None,
-    data: list[Path] | None = None,
-    filter: list[str] | None = None,
-    url: str = "",
+    task: list[str] | None = opt.option("FILE.py:NAME", "Custom task. Repeatable.", None),
+    data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes. Repeatable.", None),
+    filter: list[str] | None = opt.option("CHECKPOINT|MODULE:BUILD", "Additional filter. Repeatable.", None),
+    url: str = opt.option("URL", "Address of a running dashboard, for the links in answers.", ""),
     particles: int = 300,
     seed: int = 0,
 ) -> None:

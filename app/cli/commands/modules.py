@@ -1,13 +1,12 @@
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(depth=opt.option("N", "Levels to print.", parser=opt.integer(0)))
 def modules(
     task: str,
     filter: str,
     train: list[str] | None = None,
     freeze: list[str] | None = None,
-    depth: int = 3,
+    depth: int = opt.option("N", "Levels to print.", 3, parser=opt.integer(0)),
 ) -> console.Result:
     """Show the modules of a filter.
 

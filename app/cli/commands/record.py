@@ -4,19 +4,13 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    output=opt.output_file("RUN.rrd", "Output recording.", ".rrd"),
-    maps=opt.option("STRIDE", "Likelihood maps every STRIDE steps; 0: none.", parser=opt.integer(0)),
-    map_size=opt.option("S", "Cells per side of a map.", parser=opt.integer(2, 1024)),
-    diagnostics=opt.flag("Include every applicable fast diagnostic, one tab each."),
-)
 def record(
     run: opt.Run,
-    output: Path,
-    maps: int = 10,
-    map_size: int = 135,
+    output: Path = opt.output_file("RUN.rrd", "Output recording.", ".rrd", default=opt.REQUIRED),
+    maps: int = opt.option("STRIDE", "Likelihood maps every STRIDE steps; 0: none.", 10, parser=opt.integer(0)),
+    map_size: int = opt.option("S", "Cells per side of a map.", 135, parser=opt.integer(2, 1024)),
     quantity: opt.Quantity | None = None,
-    diagnostics: bool = True,
+    diagnostics: bool = opt.flag("Include every applicable fast diagnostic, one tab each.", default=True),
 ) -> console.Result:
     """Record a filter run over one episode as a Rerun recording.
 

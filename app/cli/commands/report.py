@@ -16,33 +16,25 @@ URL = "http://127.0.0.1:8000"
 """Default address of ``beliefscope serve``."""
 
 
-@opt.with_options(
-    paths=opt.argument("TRACE...", "Traces or recordings of one filter, or folders of traces."),
-    output=opt.option("FOLDER", "Output folder; replaces an existing report.", "-o", "--output"),
-    title=opt.option("TEXT", "Title of the report."),
-    events=opt.option(
+def report(
+    paths: list[Path] = opt.argument("TRACE...", "Traces or recordings of one filter, or folders of traces."),
+    output: Path = opt.option(
+        "FOLDER", "Output folder; replaces an existing report.", Path("report"), "-o", "--output"
+    ),
+    title: str = opt.option("TEXT", "Title of the report.", ""),
+    events: list[str] | None = opt.option(
         "[EPISODE:]STEP",
         "Step to show in detail, with images, maps and values. Repeatable. Default: the 3 with largest error.",
+        None,
         "--event",
     ),
-    filter=opt.TRACE_FILTER,
-    task=opt.TASK_OF_FILES,
-    every=opt.flag("Include slow diagnostics.", "--all"),
-    url=opt.option("ADDRESS", "Address of the dashboard, for permalinks."),
-    pdf=opt.flag("Also print report.pdf; requires Chromium.", "--pdf"),
-)
-def report(
-    paths: list[Path],
-    output: Path = Path("report"),
-    title: str = "",
-    events: list[str] | None = None,
-    filter: str = "",
-    task: str = "",
+    filter: str = opt.TRACE_FILTER,
+    task: str = opt.TASK_OF_FILES,
     data: Path | None = None,
     quantity: opt.Quantity | None = None,
-    every: bool = False,
-    url: str = URL,
-    pdf: bool = False,
+    every: bool = opt.flag("Include slow diagnostics.", "--all"),
+    url: str = opt.option("ADDRESS", "Address of the dashboard, for permalinks.", URL),
+    pdf: bool = opt.flag("Also print report.pdf; requires Chromium.", "--pdf"),
 ) -> console.Result:
     """Write a report of filter runs.
 

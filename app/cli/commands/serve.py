@@ -15,42 +15,33 @@ if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
 
 
-@opt.with_options(
-    port=opt.option("N", "Port; 0 selects a free one.", parser=opt.integer(0, 65535)),
-    host=opt.option("ADDRESS", "Address to listen on. Any but the loopback address requires a token."),
-    token=opt.flag("Require a token on the loopback address too (shared machines).", "--token"),
-    read_only=opt.flag("Read-only server: disable recording, computation, training and deletion.", "--read-only"),
-    allow_host=opt.option("NAME", "Additional host name of this machine. Repeatable."),
-    task=opt.option("FILE.py:NAME", "Custom task to serve. Repeatable."),
-    data=opt.option("FILE|DIR", "Additional episodes to serve. Repeatable."),
-    filter=opt.option(
+def serve(
+    port: int = opt.option("N", "Port; 0 selects a free one.", 8000, parser=opt.integer(0, 65535)),
+    host: str = opt.option(
+        "ADDRESS", "Address to listen on. Any but the loopback address requires a token.", "127.0.0.1"
+    ),
+    token: bool = opt.flag("Require a token on the loopback address too (shared machines).", "--token"),
+    read_only: bool = opt.flag(
+        "Read-only server: disable recording, computation, training and deletion.", "--read-only"
+    ),
+    allow_host: list[str] | None = opt.option("NAME", "Additional host name of this machine. Repeatable.", None),
+    workspace: Path = Path("workspace"),
+    task: list[str] | None = opt.option("FILE.py:NAME", "Custom task to serve. Repeatable.", None),
+    data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes to serve. Repeatable.", None),
+    filter: list[str] | None = opt.option(
         "CHECKPOINT|MODULE:BUILD",
         "Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, if it "
         "has none, for the one given with --task.",
+        None,
     ),
-    study=opt.option("DIR", "Folder of a study to serve. Repeatable."),
-    sweep=opt.option("DIR", "Folder of a sweep to serve (docs/sweep.md). Repeatable."),
-    views=opt.option("N", "Maximum number of open pages.", parser=opt.integer(1, 1024)),
-    open_page=opt.flag("Open the dashboard in a browser.", "--open/--no-open"),
-    log_level=opt.option("LEVEL", "Log level on standard error: debug, info, warning or error."),
-    log_format=opt.option("NAME", "Log format: text or json."),
-)
-def serve(
-    port: int = 8000,
-    host: str = "127.0.0.1",
-    token: bool = False,
-    read_only: bool = False,
-    allow_host: list[str] | None = None,
-    workspace: Path = Path("workspace"),
-    task: list[str] | None = None,
-    data: list[Path] | None = None,
-    filter: list[str] | None = None,
-    study: list[Path] | None = None,
-    sweep: list[Path] | None = None,
-    views: int = 32,
-    open_page: bool = False,
-    log_level: Literal["debug", "info", "warning", "error"] = "warning",
-    log_format: Literal["text", "json"] = "text",
+    study: list[Path] | None = opt.option("DIR", "Folder of a study to serve. Repeatable.", None),
+    sweep: list[Path] | None = opt.option("DIR", "Folder of a sweep to serve (docs/sweep.md). Repeatable.", None),
+    views: int = opt.option("N", "Maximum number of open pages.", 32, parser=opt.integer(1, 1024)),
+    open_page: bool = opt.flag("Open the dashboard in a browser.", "--open/--no-open"),
+    log_level: Literal["debug", "info", "warning", "error"] = opt.option(
+        "LEVEL", "Log level on standard error: debug, info, warning or error.", "warning"
+    ),
+    log_format: Literal["text", "json"] = opt.option("NAME", "Log format: text or json.", "text"),
     seed: int = 0,
 ) -> None:
     """Serve the dashboard: replay, maps and weights.

@@ -2,10 +2,12 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_options(
-    alpha=opt.option("P", "Probability of reporting any slice if errors depend on nothing."),
-)
-def slices(runs: opt.Runs, by: str = "error", alpha: float = 0.05, every: bool = False) -> console.Result:
+def slices(
+    runs: opt.Runs,
+    by: str = "error",
+    alpha: float = opt.option("P", "Probability of reporting any slice if errors depend on nothing.", 0.05),
+    every: bool = False,
+) -> console.Result:
     """Find data slices in which a filter is worse.
 
     Runs the filter over the held-out episodes and searches for conditions on phase, speed, force, image outages, true

@@ -11,30 +11,26 @@ if TYPE_CHECKING:
     from beliefscope.filters.training.study import Cell
 
 
-@opt.with_options(
-    output=opt.option("DIR", "Study folder; created if missing.", "-o", "--output"),
-    preset=opt.option("NAME", "Training schedule: smoke, cpu or full."),
-    tasks=opt.option("TASK", "Repeatable. Default: all built-in tasks and those with --data.", "--task"),
-    filters=opt.option(
+def study(
+    output: Path = opt.option("DIR", "Study folder; created if missing.", opt.REQUIRED, "-o", "--output"),
+    preset: str = opt.option("NAME", "Training schedule: smoke, cpu or full.", "cpu"),
+    tasks: list[str] | None = opt.option(
+        "TASK", "Repeatable. Default: all built-in tasks and those with --data.", None, "--task"
+    ),
+    filters: list[str] | None = opt.option(
         "NAME|FILE",
         "Filter to train; or a checkpoint (.safetensors) or build function (FILE.py:NAME) to evaluate only. "
         "Repeatable. Default: all filters of each task.",
+        None,
         "--filter",
     ),
-    seeds=opt.option("K", "Train each filter with seeds 0 to K - 1.", parser=opt.integer(1)),
-    data=opt.option("TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset."),
-    workers=opt.option("N", "Processes of this machine, each with one thread.", parser=opt.integer(1)),
-)
-def study(
-    output: Path,
-    preset: str = "cpu",
-    tasks: list[str] | None = None,
-    filters: list[str] | None = None,
-    seeds: int = 3,
-    data: list[str] | None = None,
+    seeds: int = opt.option("K", "Train each filter with seeds 0 to K - 1.", 3, parser=opt.integer(1)),
+    data: list[str] | None = opt.option(
+        "TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset.", None
+    ),
     skip_bad: bool = False,
     engine: opt.Engine = "local",
-    workers: int = 1,
+    workers: int = opt.option("N", "Processes of this machine, each with one thread.", 1, parser=opt.integer(1)),
 ) -> console.Result:
     """Train and compare filters over many conditions.
 

@@ -3,25 +3,23 @@ from pathlib import Path
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(
-    checkpoints=opt.option("GLOB", "Checkpoints, such as 'runs/*.safetensors' (quoted). Repeatable.", "--checkpoints"),
-    data=opt.option(
-        "FILE.h5|DIR", "Episodes; each checkpoint runs over those of its task. Repeatable. Default: the sample dataset."
-    ),
-    faults=opt.option("FAULTS", "Sensor faults, such as blackout=0.4; '' is clean data. Repeatable. Default: ''."),
-    seeds=opt.option("K", "Run with seeds 0 to K - 1.", parser=opt.integer(1)),
-    block=opt.option("N", "Episodes of a cell, the unit of work that is stored.", parser=opt.integer(1)),
-    output=opt.option("DIR", "Folder of the sweep; created if missing.", "-o", "--output"),
-)
 def sweep(
-    checkpoints: list[str],
-    output: Path,
-    data: list[Path] | None = None,
-    faults: list[str] | None = None,
-    seeds: int = 1,
+    checkpoints: list[str] = opt.option(
+        "GLOB", "Checkpoints, such as 'runs/*.safetensors' (quoted). Repeatable.", opt.REQUIRED, "--checkpoints"
+    ),
+    output: Path = opt.option("DIR", "Folder of the sweep; created if missing.", opt.REQUIRED, "-o", "--output"),
+    data: list[Path] | None = opt.option(
+        "FILE.h5|DIR",
+        "Episodes; each checkpoint runs over those of its task. Repeatable. Default: the sample dataset.",
+        None,
+    ),
+    faults: list[str] | None = opt.option(
+        "FAULTS", "Sensor faults, such as blackout=0.4; '' is clean data. Repeatable. Default: ''.", None
+    ),
+    seeds: int = opt.option("K", "Run with seeds 0 to K - 1.", 1, parser=opt.integer(1)),
     particles: int = 300,
     every: bool = False,
-    block: int = 64,
+    block: int = opt.option("N", "Episodes of a cell, the unit of work that is stored.", 64, parser=opt.integer(1)),
     engine: opt.Engine = "local",
     workers: int = 1,
 ) -> console.Result:

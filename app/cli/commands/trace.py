@@ -3,8 +3,12 @@ from pathlib import Path
 from beliefscope.app.cli import console, options as opt
 
 
-@opt.with_options(output=opt.TRACE)
-def trace(run: opt.Run, output: Path, align: bool = False, particles_kept: int = 10_000) -> console.Result:
+def trace(
+    run: opt.Run,
+    output: Path = opt.output_file("RUN.trace", "Output trace file.", ".trace", default=opt.REQUIRED),
+    align: bool = False,
+    particles_kept: int = 10_000,
+) -> console.Result:
     """Save all internal quantities of a filter run.
 
     A trace contains, for every step, the beliefs before and after the observation, each modality's own update, fusion

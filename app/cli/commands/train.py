@@ -10,24 +10,17 @@ ARCHITECTURES = (
 NETWORKS = "default, or authors: layers and image resolution of the paper's published code (docs/filters.md)."
 
 
-@opt.with_options(
-    filter=opt.option("NAME", ARCHITECTURES),
-    output=opt.CHECKPOINT,
-    networks=opt.option("NAME", NETWORKS),
-    preset=opt.option("NAME", "cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: quick test."),
-    blackouts=opt.option(
-        "P,P,...", "Probabilities of image blackout; each training window uses one of them at random."
-    ),
-)
 def train(
     task: str,
-    filter: str,
-    output: Path,
+    filter: str = opt.option("NAME", ARCHITECTURES),
+    output: Path = opt.CHECKPOINT,
     data: Path | None = None,
     skip_bad: bool = False,
-    networks: str = "default",
-    preset: str = "cpu",
-    blackouts: str = "0,0.4,0.8",
+    networks: str = opt.option("NAME", NETWORKS, "default"),
+    preset: str = opt.option("NAME", "cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: quick test.", "cpu"),
+    blackouts: str = opt.option(
+        "P,P,...", "Probabilities of image blackout; each training window uses one of them at random.", "0,0.4,0.8"
+    ),
     faults: str = "",
     seed: int = 0,
     log: Path | None = None,

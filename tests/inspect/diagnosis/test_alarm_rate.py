@@ -75,5 +75,5 @@ def test_a_smaller_alarm_rate_keeps_the_scale_of_deviations() -> None:
 
 
 def test_the_command_has_the_default_alarm_rate_of_the_library() -> None:
-    assert signature(command).parameters["alarm_rate"].default == ALARM_RATE
+    assert signature(command).parameters["alarm_rate"].default.default == ALARM_RATE
     assert signature(diagnose).parameters["alarm_rate"].default == ALARM_RATE
