@@ -62,11 +62,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/tuned/{run}", response_model=FineTuneDetails)
     def get_run(run: str) -> JSONResponse:
-        current = info(runs.get(run))
-        # Not the job's result: a saved filter outlasts its job.
-        result = runs.read(run, "result.json") if current.finetuned else None
-        progress = runs.read(run, "progress.json")
-        return JSONResponse(asdict(current) | {"progress": progress, "result": result})
+        return JSONResponse(details(runs.get(run)))
 
     @router.post("/api/tuned/{run}/{action}")
     def decide(run: str, action: Action) -> FineTuneRunInfo:
@@ -86,10 +82,15 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return info(record)
 
     def summary(run: FineTuneRun) -> dict[str, Any]:
+        listed = details(run)
+        result = listed.pop("result")
+        return listed | {"success": result and result.get("success")}
+
+    def details(run: FineTuneRun) -> dict[str, Any]:
         current = info(run)
+        # Not the job's result: a saved filter outlasts its job.
         result = runs.read(run.run, "result.json") if current.finetuned else None
-        progress = runs.read(run.run, "progress.json")
-        return vars(current) | {"progress": progress, "success": result and result.get("success")}
+        return asdict(current) | {"progress": runs.read(run.run, "progress.json"), "result": result}
 
     def finetuned_name(run: FineTuneRun) -> str | None:
         """Catalog name of the run's checkpoint; None while there is none."""

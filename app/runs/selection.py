@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 from urllib.parse import parse_qsl
 
 from beliefscope.datasets.errors import BadInput, unknown_name
@@ -48,7 +48,7 @@ class Selection:
         return {**vars(self), "faults": self.faults.to_json(), "edit": edit}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Selection:
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Inverse of ``to_json``."""
         edit = None if values["edit"] is None else Edit.from_json(values["edit"])
         return cls(**{**values, "faults": Faults.from_json(values["faults"]), "edit": edit})

@@ -300,11 +300,11 @@ class TraceStore:
                 source = str(catalog.paths[selection.filter])
             original = str(self._trace_file(replace(selection, edit=None, only="")))
             return RunRequest(
-                selection,
-                task=json.dumps(task_to_json(checkpoint.task), sort_keys=True),
+                **vars(selection),
+                definition=json.dumps(task_to_json(checkpoint.task), sort_keys=True),
                 checkpoint=source,
                 external=external,
-                data=str(data),
+                path=str(data),
                 original=original,
                 output=str(self._trace_file(selection)),
                 seed=self.settings.seed,

@@ -25,23 +25,22 @@ from beliefscope.inspect.trace import save_trace
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileReader
 
 
-@dataclass(frozen=True)
-class RunRequest:
+@dataclass(frozen=True, kw_only=True)
+class RunRequest(Selection):
     """A filter run in terms of files, so that another process can carry it out.
 
     Attributes:
-        task: definition, as JSON text.
+        definition: of the task, as JSON text.
         checkpoint: checkpoint file, or the source of an external filter. external: whether it is the latter.
-        data: file or folder of episodes, or the file of a live run.
+        path: file or folder of episodes, or the file of a live run.
         original: trace file of the run without intervention.
         output: trace file of the run.
     """
 
-    selection: Selection
-    task: str
+    definition: str
     checkpoint: str
     external: bool
-    data: str
+    path: str
     original: str
     output: str
     seed: int
@@ -49,25 +48,15 @@ class RunRequest:
 
     def settings(self) -> dict[str, Any]:
         """Arguments of ``StoredRuns.run``."""
-        selection = self.selection
         return {
             "path": Path(self.original),
-            "edit": selection.edit,
-            "only": selection.only,
-            "episode_index": selection.episode,
+            "edit": self.edit,
+            "only": self.only,
+            "episode_index": self.episode,
             "seed": self.seed,
             "particles": self.particles,
-            "faults": selection.faults,
+            "faults": self.faults,
         }
-
-    def to_json(self) -> dict[str, Any]:
-        """The request as JSON values."""
-        return {**vars(self), "selection": self.selection.to_json()}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> RunRequest:
-        """Inverse of ``to_json``."""
-        return cls(**{**values, "selection": Selection.from_json(values["selection"])})
 
 
 class TraceWorker:
@@ -123,12 +112,12 @@ def _dataset(path: str, task: str) -> Dataset:
 
 
 def _episode(request: RunRequest) -> Episode:
-    if request.data.endswith(SUFFIX):
-        with closing(LiveFileReader(Path(request.data))) as reader:
+    if request.path.endswith(SUFFIX):
+        with closing(LiveFileReader(Path(request.path))) as reader:
             with suppress(BadInput):  # of a damaged file, the steps before the damage are used
                 reader.poll()
             return reader.part().episode
-    return _dataset(request.data, request.task)[request.selection.episode]
+    return _dataset(request.path, request.definition)[request.episode]
 
 
 _runs = StoredRuns()
@@ -137,7 +126,7 @@ _runs = StoredRuns()
 def run_filter(arguments: Mapping[str, Any], report: Callable[[float], None]) -> None:
     """Carry out a ``RunRequest`` in the worker process."""
     request = RunRequest.from_json(arguments)
-    checkpoint = _checkpoint(request.checkpoint, request.external, request.task)
+    checkpoint = _checkpoint(request.checkpoint, request.external, request.definition)
     trace = _runs.run(checkpoint, _episode(request), progress=report, **request.settings())
     if request.output != request.original:
         save_trace(trace, Path(request.output))

@@ -177,25 +177,22 @@ def serve(
             uvicorn.server.HANDLED_SIGNALS = handled  # type: ignore[assignment]
         # A response passes through several threads, which may each wait this long for the GIL; the default is 5 ms.
         sys.setswitchinterval(0.001)
-        _Server(_uvicorn_config(app), started).run(sockets=[listener])
+        config = uvicorn.Config(
+            app,
+            http=HTTPProtocol,
+            ws=WebSocketProtocol,
+            h11_max_incomplete_event_size=MAX_HEAD,
+            proxy_headers=False,  # any local process could send them
+            log_config=None,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            ws_max_size=1 << 20,  # pages send a few KB
+            ws_per_message_deflate=False,  # compression reduces binary messages from 300 to 12 MB/s
+            timeout_graceful_shutdown=3,
+        )
+        _Server(config, started).run(sockets=[listener])
         log.info("stopped", extra={"event": {"url": url}})
-
-
-def _uvicorn_config(app: FastAPI) -> uvicorn.Config:
-    return uvicorn.Config(
-        app,
-        http=HTTPProtocol,
-        ws=WebSocketProtocol,
-        h11_max_incomplete_event_size=MAX_HEAD,
-        proxy_headers=False,  # any local process could send them
-        log_config=None,
-        log_level="warning",
-        access_log=False,
-        server_header=False,
-        ws_max_size=1 << 20,  # pages send a few KB
-        ws_per_message_deflate=False,  # compression reduces binary messages from 300 to 12 MB/s
-        timeout_graceful_shutdown=3,
-    )
 
 
 class _Server(uvicorn.Server):

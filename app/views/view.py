@@ -5,8 +5,7 @@ import contextlib
 import logging
 import secrets
 import time
-from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Callable
 from functools import partial
 from typing import Any
 
@@ -21,24 +20,13 @@ from beliefscope.app.views.scene import Scene
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap
-from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.likelihood import COARSE, FINE
 
 log = logging.getLogger("beliefscope.app")
 # Deadlines in s: coarse maps, which follow a moving cursor, come first.
 COARSE_DEADLINE, SCENE_DEADLINE, FINE_DEADLINE, PREFETCH_DEADLINE = 0.0, 0.25, 0.5, 5.0
 PREFETCH_STEPS = 200  # around the cursor
 PREFETCH_DELAY = 0.4  # s without a new cursor
-
-
-@dataclass(frozen=True)
-class _SceneUpdate:
-    """What the scene is about to show."""
-
-    cursor: Cursor
-    run: TracedRun
-    comparison: Trace | None
-    maps: LikelihoodMap | None
 
 
 class View:
@@ -62,7 +50,7 @@ class View:
         self._newest: Cursor | None = None
         self._cursor_arrived = asyncio.Event()
         self._current: tuple[Selection, TracedRun] | None = None  # keeps the run in memory
-        self._scene_update: _SceneUpdate | None = None
+        self._scene_update: tuple[Cursor, Callable[[], None]] | None = None  # that the scene is about to show
         self._scene_outdated = asyncio.Event()
         self._prefetch_center: tuple[Cursor, TracedRun] | None = None
         self._maps_sent = asyncio.Event()
@@ -144,7 +132,8 @@ class View:
                 self._prefetch_center = cursor, run
                 self._maps_sent.set()
         if cursor.scene:
-            self._scene_update = _SceneUpdate(cursor, run, None if comparison is None else comparison.trace, maps)
+            trace = None if comparison is None else comparison.trace
+            self._scene_update = cursor, partial(self.scene.show, run, cursor.step, trace, maps)
             self._scene_outdated.set()
 
     async def _update_scene(self, websocket: WebSocket) -> None:
@@ -157,15 +146,14 @@ class View:
             self._scene_outdated.clear()
             if self._scene_update is None:
                 continue
-            async with self._errors_sent(websocket, self._scene_update.cursor.serial):
+            async with self._errors_sent(websocket, self._scene_update[0].serial):
                 async with self._scene_lock:
                     update, self._scene_update = self._scene_update, None  # may have been replaced by a newer one
                     if update is None:
                         continue
-                    step, serial = update.cursor.step, update.cursor.serial
-                    show = partial(self.scene.show, update.run, step, update.comparison, update.maps)
+                    cursor, show = update
                     await self._executor.run(show, SCENE_DEADLINE)
-                await websocket.send_json({"type": "drawn", "serial": serial, "step": step})
+                await websocket.send_json({"type": "drawn", "serial": cursor.serial, "step": cursor.step})
 
     async def _prefetch_maps(self) -> None:
         """Compute the coarse maps around the cursor while it does not move."""
