@@ -67,8 +67,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     @router.post("/api/tuned/{run}/{action}")
     def decide(run: str, action: Action) -> FineTuneRunInfo:
         record = runs.get(run)
-        name = finetuned_name(record)
-        if name is None:
+        if (name := finetuned_name(record)) is None:
             raise HTTPException(409, f"Run {run!r} has no checkpoint yet to {action}.")
         result = runs.read(run, "result.json")
         reason = result["finetuned"].get("no_change", "") if result else ""

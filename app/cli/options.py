@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
+from typer.models import ParameterInfo
 
 from beliefscope.app.cli import console
 from beliefscope.datasets.errors import BadInput
@@ -65,31 +66,22 @@ def _check_json(value: str | None) -> str | None:
     return value
 
 
-REQUIRED = inspect.Parameter.empty
-"""Default of an option that must be given."""
+def option(metavar: str, description: str, default: Any = ..., *names: str, **settings: Any) -> Any:
+    """An option with a value. default: ``...`` for none. names: default: ``--`` and the parameter's name.
 
-
-@dataclass(frozen=True)
-class Described:
-    """Default of a parameter of a command, and its description for typer."""
-
-    default: Any
-    info: Any
-
-
-def option(metavar: str, description: str, default: Any = REQUIRED, *names: str, **settings: Any) -> Any:
-    """An option with a value. names: default: ``--`` and the parameter's name. settings: of ``typer.Option``."""
-    return Described(default, typer.Option(*names, metavar=metavar, help=description, **settings))
+    settings: of ``typer.Option``.
+    """
+    return typer.Option(default, *names, metavar=metavar, help=description, **settings)
 
 
 def argument(metavar: str, description: str) -> Any:
     """A positional argument."""
-    return Described(REQUIRED, typer.Argument(metavar=metavar, help=description))
+    return typer.Argument(metavar=metavar, help=description)
 
 
-def flag(description: str, *names: str, default: bool = False) -> Any:
+def flag(description: str, *names: str, default: Any = False) -> Any:
     """An option without a value."""
-    return Described(default, typer.Option(*names, help=description))
+    return typer.Option(default, *names, help=description)
 
 
 def output_file(
@@ -99,8 +91,8 @@ def output_file(
     return option(metavar, description, default, *names, callback=lambda path: check_output(path, *suffixes))
 
 
-DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=REQUIRED)
-CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=REQUIRED)
+DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=...)
+CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=...)
 TRACE_FILTER = option(
     "NAME|CHECKPOINT",
     "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
@@ -131,7 +123,7 @@ OPTIONS: dict[str, Any] = {
         "Episodes: a Beliefscope HDF5 file or a supported external format (docs/data.md). "
         "Default: the built-in sample dataset.",
     ),
-    "skip_bad": flag("Skip unusable trajectories and report the reasons.", "--skip-bad"),
+    "skip_bad": flag("Skip unusable trajectories and report the reasons.", "--skip-bad", default=...),
     "episode": option("I", "Index of the episode in the dataset. Default: the first held-out one.", parser=integer(0)),
     "faults": option(
         "FAULTS",
@@ -142,14 +134,14 @@ OPTIONS: dict[str, Any] = {
         "SLICE",
         "Data slice: 'contact', 'free motion', 'blackout 0.8', 'haptics only', or a custom one, "
         "NAME:faults=FAULTS:contact=yes:only=MODALITY. Repeatable.",
-        REQUIRED,
+        ...,
         "--slice",
     ),
     "quantity": option(
         "likelihood|posterior",
         "Quantity of the maps: likelihood of each observation, or posterior of the state. Default: likelihood, or "
         "posterior for an external filter that reports no virtual observations.",
-        REQUIRED,
+        ...,
         "--map",
     ),
     "particles_kept": option("M", "Particles of each step that are stored; moments are of all.", parser=integer(1)),
@@ -163,7 +155,7 @@ OPTIONS: dict[str, Any] = {
     "freeze": option("PATTERN", "Freeze these modules: dotted names, * matches any text. Repeatable."),
     "workspace": option("DIR", "Workspace folder for recordings and traces; created if missing."),
     "log": option("DIR", "Folder for TensorBoard logs."),
-    "every": flag("Use all episodes, not only the held-out ones.", "--all"),
+    "every": flag("Use all episodes, not only the held-out ones.", "--all", default=...),
     "by": option(
         "SCORE",
         "Score: error (position), the name of an angle, nees, ess (effective sample size), disagreement (of the "
@@ -171,7 +163,9 @@ OPTIONS: dict[str, Any] = {
     ),
     "engine": option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]')."),
     "workers": option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1)),
-    "align": flag("Move data of another frame by the constant offset that explains the difference.", "--align"),
+    "align": flag(
+        "Move data of another frame by the constant offset that explains the difference.", "--align", default=...
+    ),
     "json": option("-", "Print one JSON document instead of text: --json -", callback=_check_json),
 }
 """Parameter of a command -> its description, where the command has no own one."""
@@ -212,9 +206,9 @@ def with_options(command: Callable[..., console.Result | None]) -> Callable[...,
 
 def _described(parameter: inspect.Parameter, type_: Any) -> inspect.Parameter:
     """A parameter in typer's form."""
-    own = parameter.default
-    default, info = (own.default, own.info) if isinstance(own, Described) else (own, OPTIONS[parameter.name].info)
-    return parameter.replace(kind=parameter.KEYWORD_ONLY, default=default, annotation=Annotated[type_, info])
+    own = isinstance(parameter.default, ParameterInfo)
+    annotation = type_ if own else Annotated[type_, OPTIONS[parameter.name]]
+    return parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=annotation)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from beliefscope.app.cli import console, options as opt
 
 def calibrate(
     runs: opt.Runs,
-    output: Path = opt.output_file("CALIBRATION", "Output .json file.", ".json", default=opt.REQUIRED),
+    output: Path = opt.output_file("CALIBRATION", "Output .json file.", ".json", default=...),
     level: float = opt.option("P", "Share of the steps that a region must contain.", 0.95),
 ) -> console.Result:
     """Calibrate the uncertainty of a filter.

@@ -6,7 +6,7 @@ from beliefscope.datasets.errors import BadInput
 
 def counterfactual(
     run: opt.Run,
-    first: int = opt.option("STEP", "First step of the intervention.", opt.REQUIRED, "--from", parser=opt.integer(0)),
+    first: int = opt.option("STEP", "First step of the intervention.", ..., "--from", parser=opt.integer(0)),
     to: int = opt.option("STEP", "First step after the intervention.", parser=opt.integer(1)),
     weights: str = opt.option(
         "MODALITY=BETA,...",

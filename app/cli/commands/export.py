@@ -17,7 +17,7 @@ def export(
     output: Path = opt.option(
         "FILE|DIR",
         "Output: .parquet, .mcap, .npz, or .html for an interactive page; or a folder.",
-        opt.REQUIRED,
+        ...,
         "-o",
         "--output",
     ),

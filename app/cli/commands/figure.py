@@ -9,7 +9,7 @@ def figure(
     *,
     kind: Literal["maps", "weights"] = opt.argument("maps|weights", "Kind of figure."),
     run: opt.Run,
-    output: Path = opt.output_file("FIGURE", "Output figure: .svg, .pdf or .png.", default=opt.REQUIRED),
+    output: Path = opt.output_file("FIGURE", "Output figure: .svg, .pdf or .png.", default=...),
     steps: list[int] | None = opt.option(
         "T",
         "Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle of the "

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,60 @@ if TYPE_CHECKING:
     from beliefscope.inspect.compare.success import Success
 
 
+@dataclass(frozen=True)
+class Learning:
+    """Options of fine-tuning: modules, data and training."""
+
+    train: list[str] | None = None
+    freeze: list[str] | None = None
+    slices: list[str] | None = None
+    fault_sets: list[str] | None = opt.option(
+        "FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", None, "--faults"
+    )
+    clean_weight: float | None = opt.option(
+        "SHARE",
+        "Weight of clean data in the loss (default 0.5; without options for modules and data 0.97 with images).",
+        None,
+    )
+    events: list[str] | None = opt.option(
+        "EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", None, "--event"
+    )
+    data: Path | None = None
+    skip_bad: bool = False
+    steps: int | None = opt.option("N", "Maximum number of optimiser steps (default 300).", None, parser=opt.integer(1))
+    length: int = opt.option("T", "Window length in steps.", 32, parser=opt.integer(1))
+    rates: list[str] | None = opt.option(
+        "R|PATTERN=R",
+        "Learning rate of Adam (default 0.0003), or of modules that match a pattern: 'weight_model=0.0001'.",
+        None,
+        "--rate",
+    )
+    l2_sp: float = opt.option("X", "L2-SP strength (decay to the base weights).", 1.0)
+    calibrate: bool = opt.flag(
+        "Then scale process and measurement noise such that NEES is 1 on the validation episodes."
+    )
+    patience: int = opt.option("N", "Stop after N validations without improvement.", 6, parser=opt.integer(1))
+    seed: int = 0
+    success: str | None = opt.option(
+        "SLICE[:by=10%:others=5%]",
+        "Success criterion: the error falls by at least this share in the slice and rises by at most that in others.",
+        None,
+    )
+
+    def settings(self, base: Checkpoint) -> FineTune:
+        """The settings, completed by defaults for the filter. Raises BadInput if they do not fit it."""
+        from beliefscope.filters.finetuning.defaults import settings_from
+        from beliefscope.filters.finetuning.success import Criterion
+
+        names = ("clean_weight", "steps", "length", "l2_sp", "calibrate", "patience", "seed")
+        values = {name: getattr(self, name) for name in names}
+        values["success"] = Criterion.parse(self.success) if self.success else None
+        selected = self.train, self.freeze, self.slices, self.fault_sets, self.events, self.rates
+        return settings_from(base, *selected, **values)
+
+
 def finetune(
+    *,
     target: str = opt.argument("TASK|CHECKPOINT", "Task of the filter given with --filter, or .safetensors file."),
     output: Path = opt.CHECKPOINT,
     filter: str | None = opt.option(
@@ -29,43 +82,7 @@ def finetune(
         "Name of a built-in filter, .safetensors file, or build function of an external filter (FILE.py:NAME).",
         None,
     ),
-    train: list[str] | None = None,
-    freeze: list[str] | None = None,
-    slices: list[str] | None = None,
-    fault_sets: list[str] | None = opt.option(
-        "FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", None, "--faults"
-    ),
-    clean_weight: float | None = opt.option(
-        "SHARE",
-        "Weight of clean data in the loss (default 0.5; without options for modules and data 0.97 with images).",
-        None,
-    ),
-    events: list[str] | None = opt.option(
-        "EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", None, "--event"
-    ),
-    data: Path | None = None,
-    skip_bad: bool = False,
-    steps: int | None = opt.option(
-        "N", "Maximum number of optimiser steps (default 300).", None, parser=opt.integer(1)
-    ),
-    length: int = opt.option("T", "Window length in steps.", 32, parser=opt.integer(1)),
-    rates: list[str] | None = opt.option(
-        "R|PATTERN=R",
-        "Learning rate of Adam (default 0.0003), or of modules that match a pattern: 'weight_model=0.0001'.",
-        None,
-        "--rate",
-    ),
-    l2_sp: float = opt.option("X", "L2-SP strength (decay to the base weights).", 1.0),
-    calibrate: bool = opt.flag(
-        "Then scale process and measurement noise such that NEES is 1 on the validation episodes."
-    ),
-    patience: int = opt.option("N", "Stop after N validations without improvement.", 6, parser=opt.integer(1)),
-    seed: int = 0,
-    success: str | None = opt.option(
-        "SLICE[:by=10%:others=5%]",
-        "Success criterion: the error falls by at least this share in the slice and rises by at most that in others.",
-        None,
-    ),
+    learning: Learning,
     log: Path | None = opt.option(
         "DIR", "Folder for losses and errors as a Rerun recording and TensorBoard logs.", None
     ),
@@ -95,8 +112,6 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.defaults import settings_from
-    from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnostics.healthy_profile import included_reference
     from beliefscope.inspect.healthy import measure_profile
@@ -107,14 +122,12 @@ def finetune(
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
-    values: dict[str, Any] = {"clean_weight": clean_weight, "steps": steps, "length": length, "l2_sp": l2_sp}
-    values |= {"calibrate": calibrate, "patience": patience, "seed": seed}
-    values["success"] = Criterion.parse(success) if success else None
-    settings = settings_from(base, train, freeze, slices, fault_sets, events, rates, **values)
-    with opt.open_episodes(base.task, data, skip_bad) as episodes:
+    settings, data = learning.settings(base), learning.data
+    with opt.open_episodes(base.task, data, learning.skip_bad) as episodes:
         members, data_hash = _training_episodes(episodes, data, output.parent)
         command = finetune_command(target, filter, data, settings)
-        source = {"data_hash": data_hash, "command": command, "settings": settings, "partial": _partial(output)}
+        partial = output.with_name(f"{output.name}.partial")  # from which an interrupted run resumes
+        source = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source)
         tuned = _run(base, members, log, rerun, source)

@@ -6,7 +6,7 @@ from beliefscope.datasets.errors import BadInput
 
 def record(
     run: opt.Run,
-    output: Path = opt.output_file("RUN.rrd", "Output recording.", ".rrd", default=opt.REQUIRED),
+    output: Path = opt.output_file("RUN.rrd", "Output recording.", ".rrd", default=...),
     maps: int = opt.option("STRIDE", "Likelihood maps every STRIDE steps; 0: none.", 10, parser=opt.integer(0)),
     map_size: int = opt.option("S", "Cells per side of a map.", 135, parser=opt.integer(2, 1024)),
     quantity: opt.Quantity | None = None,

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def study(
-    output: Path = opt.option("DIR", "Study folder; created if missing.", opt.REQUIRED, "-o", "--output"),
+    output: Path = opt.option("DIR", "Study folder; created if missing.", ..., "-o", "--output"),
     preset: str = opt.option("NAME", "Training schedule: smoke, cpu or full.", "cpu"),
     tasks: list[str] | None = opt.option(
         "TASK", "Repeatable. Default: all built-in tasks and those with --data.", None, "--task"

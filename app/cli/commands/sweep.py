@@ -5,9 +5,9 @@ from beliefscope.app.cli import console, options as opt
 
 def sweep(
     checkpoints: list[str] = opt.option(
-        "GLOB", "Checkpoints, such as 'runs/*.safetensors' (quoted). Repeatable.", opt.REQUIRED, "--checkpoints"
+        "GLOB", "Checkpoints, such as 'runs/*.safetensors' (quoted). Repeatable.", ..., "--checkpoints"
     ),
-    output: Path = opt.option("DIR", "Folder of the sweep; created if missing.", opt.REQUIRED, "-o", "--output"),
+    output: Path = opt.option("DIR", "Folder of the sweep; created if missing.", ..., "-o", "--output"),
     data: list[Path] | None = opt.option(
         "FILE.h5|DIR",
         "Episodes; each checkpoint runs over those of its task. Repeatable. Default: the sample dataset.",

@@ -5,7 +5,7 @@ from beliefscope.app.cli import console, options as opt
 
 def trace(
     run: opt.Run,
-    output: Path = opt.output_file("RUN.trace", "Output trace file.", ".trace", default=opt.REQUIRED),
+    output: Path = opt.output_file("RUN.trace", "Output trace file.", ".trace", default=...),
     align: bool = False,
     particles_kept: int = 10_000,
 ) -> console.Result:

@@ -8,6 +8,7 @@ ARCHITECTURES = (
     "(docs/filters.md)."
 )
 NETWORKS = "default, or authors: layers and image resolution of the paper's published code (docs/filters.md)."
+PROBABILITIES = "Probabilities of image blackout; each training window uses one of them at random."
 
 
 def train(
@@ -18,9 +19,7 @@ def train(
     skip_bad: bool = False,
     networks: str = opt.option("NAME", NETWORKS, "default"),
     preset: str = opt.option("NAME", "cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: quick test.", "cpu"),
-    blackouts: str = opt.option(
-        "P,P,...", "Probabilities of image blackout; each training window uses one of them at random.", "0,0.4,0.8"
-    ),
+    blackouts: str = opt.option("P,P,...", PROBABILITIES, "0,0.4,0.8"),
     faults: str = "",
     seed: int = 0,
     log: Path | None = None,
