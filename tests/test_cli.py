@@ -307,7 +307,10 @@ def test_busy_port(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize(
     ("number", "line", "code"),
-    [(signal.SIGINT, "error: interrupted", 130), (signal.SIGTERM, "error: terminated", 143)],
+    [
+        (signal.SIGINT, "error: interrupted; the same command resumes", 130),
+        (signal.SIGTERM, "error: terminated; the same command resumes", 143),
+    ],
     ids=["SIGINT", "SIGTERM"],
 )
 def test_a_signal_prints_one_line_and_exits_with_the_code_of_the_shell(

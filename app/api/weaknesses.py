@@ -36,7 +36,7 @@ def weaknesses_of(store: TraceStore, jobs: Jobs, selection: Selection) -> list[W
     found = [
         *weaknesses.diagnosed(diagnosis, filter_, faults, episode),
         *weaknesses.failing(scores, filter_),
-        *weaknesses.untrained(filter_),
+        *weaknesses.untrained(checkpoint),
     ]
     if not any(weakness.source == "diagnosis" for weakness in found):
         found = [*weaknesses.injected(faults, filter_, episode), *found]

@@ -32,6 +32,10 @@ TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM, of the shell."""
 
 
+RESUMED = {"collect", "train", "finetune", "study", "sweep"}
+"""Commands that continue interrupted work."""
+
+
 class Terminated(BaseException):
     """SIGTERM: commands end as after Ctrl-C and remove their unfinished files."""
 
@@ -65,9 +69,9 @@ def main() -> None:
         end = "" if message.endswith("?") else "."
         console.fail(f"{message}{end} See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        console.fail("interrupted", INTERRUPTED)
+        console.fail(f"interrupted{_resumption()}", INTERRUPTED)
     except Terminated:
-        console.fail("terminated", TERMINATED)
+        console.fail(f"terminated{_resumption()}", TERMINATED)
     except Exception as error:
         if debug:
             raise
@@ -79,6 +83,10 @@ def main() -> None:
             raise SystemExit(1) from None
         console.fail(f"{type(error).__name__}: {error} (run beliefscope --debug ... for a traceback)", 1)
     raise SystemExit(code)
+
+
+def _resumption() -> str:
+    return "; the same command resumes" if RESUMED.intersection(sys.argv[1:3]) else ""
 
 
 def _terminate(number: int, frame: object) -> None:

@@ -40,23 +40,36 @@ LARGEST = 3
 MAX_NEES = 2.0
 """Largest ratio of a healthy record's NEES to 1, and of 1 to it, that the headline does not mention."""
 
+WRONG_NEES = 10.0
+"""As ``MAX_NEES``, from which the filter is not called healthy, although it does not deviate from its record."""
+
+CONVENTIONS = "test the signs, scales and axes of its inputs: diagnostic Conventions of the inputs"
+
 
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
     text = f"no significant deviation from the record of {record} healthy episodes in {count} statistics."
     largest = tuple(_evidence(case, deviation) for deviation in case.deviations[:LARGEST])
-    headline = f"Healthy{_miscalibration(case.profile)}: {text}"
+    nees = _nees(case.profile)
+    headline = f"Healthy: {text}"
+    if _is_miscalibrated(nees):
+        overconfident = f"{'over' if nees > 1 else 'under'}confident (median NEES {nees:.2g})"
+        headline = f"Healthy, though {overconfident}: {text}"
+        if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
+            headline = f"Always {overconfident}, also in its record; {text[:-1]}; try: {CONVENTIONS}."
     return Diagnosis("healthy", False, headline, (), largest, _provenance(case))
 
 
-def _miscalibration(profile: HealthyProfile) -> str:
-    """What a comparison with the record cannot show: that the filter has never been consistent."""
+def _nees(profile: HealthyProfile) -> float:
+    """Median NEES of the record; 1 if unknown. No comparison with it shows that a filter has never been consistent."""
     values = profile.statistics.get("nees/fused/all", np.empty(0))
     values = values[np.isfinite(values)]
-    if not len(values) or 1 / MAX_NEES <= (nees := float(np.median(values))) <= MAX_NEES:
-        return ""
-    return f", though {'over' if nees > 1 else 'under'}confident (median NEES {nees:.2g})"
+    return float(np.median(values)) if len(values) else 1.0
+
+
+def _is_miscalibrated(nees: float) -> bool:
+    return not 1 / MAX_NEES <= nees <= MAX_NEES
 
 
 def statistics_by_subject(case: Case) -> dict[str, int]:
@@ -193,10 +206,11 @@ def _search(case: Case, count: int) -> str:
     checkpoint = case.setting.checkpoint
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
+    external = isinstance(checkpoint, ExternalFilter)
     source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
     return (
-        "Search the data slices with large errors, in the tab Failures or by "
-        f"`beliefscope slices {checkpoint.task.name} --filter {source}`."
+        f"{f'{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search' if external else 'Search'} the data slices with "
+        f"large errors, in the tab Failures or by `beliefscope slices {checkpoint.task.name} --filter {source}`."
     )
 
 
@@ -223,7 +237,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
         "healthy_data": case.profile.data,
-        "miscalibrated": bool(_miscalibration(case.profile)),
+        "miscalibrated": _is_miscalibrated(_nees(case.profile)),
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers),
         "alarm_rate": case.alarm_rate,

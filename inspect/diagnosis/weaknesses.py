@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.settings import FineTune
@@ -82,10 +83,11 @@ def failing(scores: Sequence[Mapping[str, Any]], filter_: Filter) -> Iterator[We
         yield Weakness("failures", title, evidence, event["episode"], event["step"], settings)
 
 
-def untrained(filter_: Filter) -> Iterator[Weakness]:
+def untrained(checkpoint: Checkpoint) -> Iterator[Weakness]:
     """The sensor fault that the training data of a filter lack, if its default fine-tuning addresses one."""
-    if why := reason(filter_):
-        settings = default_settings(filter_)
-        name = settings.mix[0][0].name
+    settings = default_settings(checkpoint.filter)
+    learned = checkpoint.record.get("base", {}).get("settings", {}).get("mix", ())
+    known = {item["slice"]["name"] for item in learned}
+    if (why := reason(checkpoint.filter)) and (name := settings.mix[0][0].name) not in known:
         title = f"Sensor fault \u201c{name}\u201d, which the training data lack"
         yield Weakness("default", title, why, None, None, replace(settings, success=Criterion(name)))

@@ -154,10 +154,11 @@ def find_slices(
         by: one of ``scores_of(checkpoint.task)``. alpha: see ``ErrorSlices``.
         progress: called with the completed fraction, 0..1.
 
-    Raises BadInput for an unknown score, one that does not apply, and as ``trace``.
+    Raises BadInput for too few episodes, an unknown score, one that does not apply, and as ``trace``.
     """
     find_score(by, checkpoint.task)
     indices = list(episodes)
+    check_episodes(len(indices))
     settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
     try_score(by, checkpoint, data, indices[:1], **settings)
     runs = trace_all(checkpoint, data, indices, **settings, progress=lambda share: progress(0.8 * share))

@@ -142,3 +142,5 @@ def test_runs_of_a_data_set(traces: list[Trace]) -> None:
     assert report == slices_of(traces, "nees")
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
+    with pytest.raises(BadInput, match="1 episode; a search for slices needs at least 8"):
+        find_slices(checkpoint, [traces[0].episode], range(1))
