@@ -10,5 +10,5 @@ def test_a_fault_that_a_filter_was_fine_tuned_on_is_not_offered_again() -> None:
     checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
     (weakness,) = untrained(checkpoint)
     settings = weakness.settings.to_json()
-    assert [item["slice"]["name"] for item in settings["mix"]] == ["image_noise"]
+    assert [item["slice"]["faults"][0]["fault"] for item in settings["mix"]] == ["image_noise"]
     assert not list(untrained(replace(checkpoint, record={"base": {"settings": settings}})))
