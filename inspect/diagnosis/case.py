@@ -10,7 +10,7 @@ import numpy as np
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
-from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
@@ -107,7 +107,8 @@ def focus(case: Case) -> Case:
 
 def explain_all(case: Case) -> dict[str, Explanation]:
     """How well each cause that can be observed explains all deviations, by name."""
-    return {c.name: explain(c, case.deviations) for c in applicable(CAUSES, case.by_statistic)}
+    causes = applicable(causes_of(case.setting.checkpoint.task), case.by_statistic)
+    return {cause.name: explain(cause, case.deviations) for cause in causes}
 
 
 def symptoms_of(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.causes import (
     data,
@@ -11,6 +12,7 @@ from beliefscope.inspect.diagnosis.causes import (
     image,
     model,
     other_sensors,
+    own_sensors,
     particles,
 )
 
@@ -25,3 +27,8 @@ CAUSES: tuple[Cause, ...] = (
     *particles.CAUSES,
 )
 """All causes, by component."""
+
+
+def causes_of(task: Task) -> tuple[Cause, ...]:
+    """All causes, and those in sensors that only this task has."""
+    return (*CAUSES, *own_sensors.own_causes(task))

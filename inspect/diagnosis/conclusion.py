@@ -13,7 +13,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
-from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
@@ -120,7 +120,7 @@ def conclude(
         effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown
             unless it does not use the sensor.
     """
-    by_name = {cause.name: cause for cause in CAUSES}
+    by_name = {cause.name: cause for cause in causes_of(case.setting.checkpoint.task)}
     ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE

@@ -29,7 +29,7 @@ from beliefscope.inspect.diagnosis.case import (
     observe,
     symptoms_of,
 )
-from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
@@ -248,7 +248,7 @@ def confirm(
 
 def _undone(everything: Case, case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect | None:
     """Effect of undoing a cause; None if it cannot be undone."""
-    cause = next(cause for cause in CAUSES if cause.name == name)
+    cause = next(cause for cause in causes_of(case.setting.checkpoint.task) if cause.name == name)
     alarms = symptoms_of(cause, case.alarms)
     hit = affected_episodes(case, alarms)
     steps = affected_steps(case, alarms[0], hit) if alarms else None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 
 import beliefscope as bs
+from beliefscope.datasets.catalog import load_task
 from beliefscope.filters.external.load import as_external
+from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.equation_checks import reported_particle_statistics
@@ -97,13 +99,33 @@ def test_faults_of_the_particles_of_an_external_filter_are_named(module: Particl
     assert "--particles" not in result.causes[0].next  # the number of an external filter is its own
 
 
+def stuck(readings: np.ndarray) -> np.ndarray:
+    return np.where(np.arange(len(readings))[:, None] < 10, readings, readings[10])
+
+
+def noisy(readings: np.ndarray) -> np.ndarray:
+    return readings + np.random.default_rng(0).normal(0, 0.5, readings.shape)
+
+
 @pytest.mark.slow
-def test_a_sensor_without_causes_in_the_catalog_is_named_before_its_effects() -> None:
+@pytest.mark.parametrize(
+    ("change", "cause", "headline"),
+    [(stuck, "near.stuck", "Near stuck from step 11 (1.1 s), probability"), (noisy, "near.noise", "Near noisy, prob")],
+)
+def test_a_sensor_of_a_users_task_has_causes(
+    change: Callable[[np.ndarray], np.ndarray], cause: str, headline: str
+) -> None:
     record = profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
-    episodes = {}
-    for seed in range(100, 106):
-        episode = ride(seed)
-        episode.observations["near"][10:] = episode.observations["near"][10]
-        episodes[seed] = episode
-    headline = diagnose(filter_of(Particles()), episodes, profile=record).headline
-    assert headline.startswith("No cause stands out: share of repeated readings of near is 0.7")
+    episodes = {seed: ride(seed) for seed in range(100, 106)}
+    for episode in episodes.values():
+        episode.observations["near"][:] = change(episode.observations["near"])
+    result = diagnose(filter_of(Particles()), episodes, profile=record)
+    assert (result.state, result.causes[0].cause.name) == ("fault", cause)
+    assert result.headline.startswith(headline)
+
+
+def test_built_in_tasks_have_the_causes_of_the_catalog() -> None:
+    for name in ("door", "push-field", "door-field"):
+        assert causes_of(load_task(name)) == CAUSES
+    own = [cause.name for cause in causes_of(TASK)[len(CAUSES) :]]
+    assert own == [f"{key}.{mechanism}" for key in STD for mechanism in ("stuck", "noise", "saturation")]
