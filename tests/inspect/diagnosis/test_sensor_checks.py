@@ -21,7 +21,7 @@ from beliefscope.inspect.diagnosis.vector_checks import free_motion, saturated
 from beliefscope.inspect.diagnosis.window_checks import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
-TASKS = ("door", "push")
+TASKS = ("door", pytest.param("push", marks=pytest.mark.long))
 
 
 @lru_cache
