@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.fault import Fault, Readings, Span, delay_steps, integer_field, number_field
 from beliefscope.datasets.simulation.simulate import CHANGE
 from beliefscope.datasets.task import Task
@@ -37,8 +38,17 @@ class ControlScaled(ControlFault):
 
     name = "control_scale"
     factor: float = number_field(0.5, "factor", "scale")
+    channel: int | None = integer_field(None, "channel", "index of the only channel that is scaled; default: see above")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        scaled = readings.copy()
-        scaled[:, CHANGE if readings.shape[1] >= CHANGE.stop else slice(None)] *= self.factor
+        scaled, count = readings.copy(), readings.shape[1]
+        columns: int | slice = CHANGE if has_position(count) else slice(None)
+        if self.channel is not None and self.channel >= count:
+            raise BadInput(f"{self} scales a channel that the controls do not have. Available: 0 to {count - 1}.")
+        scaled[:, columns if self.channel is None else self.channel] *= self.factor
         return scaled
+
+
+def has_position(channels: int) -> bool:
+    """Whether controls with this number of channels contain the hand's position and its change."""
+    return channels >= CHANGE.stop

@@ -10,6 +10,7 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.control_faults import has_position
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
@@ -152,7 +153,11 @@ def changes_of(task: Task, modalities: Sequence[str], episode: Episode) -> tuple
                 result += _of_sensor(key, modality, readings[0].size)
         text = f"{display_name(modality)} delayed by {DELAY} steps"
         result.append(Change(text, f"delay={modality}:steps={DELAY}", modality))
-    if episode.controls.shape[-1]:
+    channels = episode.controls.shape[-1]
+    if channels > 1 and not has_position(channels):
+        for i in range(min(channels, MAX_AXES)):
+            result.append(Change(f"the opposite sign of channel {i} of the controls", f"control_scale=-1:channel={i}"))
+    if channels:
         result.append(Change(f"controls delayed by {DELAY} steps", f"control_delay={DELAY}"))
         result += [Change(f"controls times {f:g}", f"control_scale={f:g}") for f in (-1.0, *SCALES)]
     return tuple(change for change in result if _applies(change, task))

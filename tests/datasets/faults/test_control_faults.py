@@ -6,8 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 
 Array = np.ndarray[Any, Any]
@@ -47,6 +49,9 @@ def test_faults_of_controls_follow_those_of_readings(episode: Episode) -> None:
     assert both.digest() == inject(f"{control},{reading}", episode).digest()
     velocity = replace(episode, controls=episode.controls[:, 3:5])
     assert np.array_equal(inject("control_scale=0.5", velocity).controls, 0.5 * velocity.controls)
+    assert np.array_equal(inject("control_scale=-1:channel=1", velocity).controls, velocity.controls * [1, -1])
+    with pytest.raises(BadInput, match="scales a channel that the controls do not have. Available: 0 to 1."):
+        inject("control_scale=-1:channel=2", velocity)
 
 
 def late_index(count: int, steps: int) -> Array:
