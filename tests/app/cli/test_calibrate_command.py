@@ -22,7 +22,7 @@ FILTER = f"{Path(__file__).parents[3] / 'examples' / '04_own_filter.py'}:build"
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "door.h5"
     with open_dataset(sample_path("door")) as sample:
-        write_dataset(path, sample.task, [sample[index] for index in sample.held_out()[:6]])
+        write_dataset(path, sample.task, [sample[index] for index in sample.held_out()[:8]])
     return path
 
 
@@ -61,6 +61,6 @@ def test_slices_of_a_data_set(run: Run, data: Path) -> None:
     code, out, _ = run("slices", "door", "--filter", FILTER, "--data", data, "--alpha", 0.2, "--json", "-")
     assert code == 0
     document = json.loads(out)
-    assert (document["episodes"], document["by"], document["alpha"]) == (6, "error", 0.2)
+    assert (document["episodes"], document["by"], document["alpha"]) == (8, "error", 0.2)
     assert {"contact", "angle speed", "policy"} <= set(document["covariates"])
     assert all(0.0 < s["p_value"] <= 0.2 and s["ratio"] > 1.0 for s in document["slices"])

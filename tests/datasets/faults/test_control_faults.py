@@ -50,7 +50,7 @@ def test_faults_of_controls_follow_those_of_readings(episode: Episode) -> None:
     velocity = replace(episode, controls=episode.controls[:, 3:5])
     assert np.array_equal(inject("control_scale=0.5", velocity).controls, 0.5 * velocity.controls)
     assert np.array_equal(inject("control_scale=-1:channel=1", velocity).controls, velocity.controls * [1, -1])
-    with pytest.raises(BadInput, match="scales a channel that the controls do not have. Available: 0 to 1."):
+    with pytest.raises(BadInput, match=r"scales a channel that the controls do not have\. Available: 0 to 1\."):
         inject("control_scale=-1:channel=2", velocity)
 
 
