@@ -32,7 +32,7 @@ def test_a_wrapped_filter_is_calibrated(run: Run, data: Path, tmp_path: Path) ->
     code, out, _ = run(*line, "--level", 0.7, "-o", path, "--json", "-")
     assert code == 0
     document = json.loads(out)
-    assert (document["fitted"], document["tested"]) == ([0, 2, 4], [1, 3, 5])
+    assert (document["fitted"], document["tested"]) == ([0, 2, 4, 6], [1, 3, 5, 7])
     scale = load_calibration(path).layers["fused"].scale
     assert document["calibration"]["layers"]["fused"]["scale"] == scale
 
@@ -53,7 +53,7 @@ def test_a_wrapped_filter_is_calibrated(run: Run, data: Path, tmp_path: Path) ->
 def test_too_few_episodes_write_no_file(run: Run, data: Path, tmp_path: Path) -> None:
     code, _, err = run("calibrate", "door", "--filter", FILTER, "--data", data, "-o", tmp_path / "calibration.json")
     assert code == 2
-    assert "3 episodes to fit and 3 to test: regions of level 0.95 need at least 19" in err
+    assert "4 episodes to fit and 4 to test: regions of level 0.95 need at least 19" in err
     assert not list(tmp_path.iterdir())
 
 

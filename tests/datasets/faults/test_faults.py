@@ -348,7 +348,7 @@ BAD = {
     "force_stuck=w": r"axis of force_stuck 'w' does not exist\. Available: x, y, z, all\.",
     "force_axes=xyz": r"order of force_axes 'xyz' does not exist\. Available: xzy, yxz, yzx, zxy, zyx\.",
     "contact_stuck=2": r"contact_stuck's 'value' is 2, not a whole number from 0 to 1",
-    "control_scale=0.5:axis=x": r"parameter of control_scale 'axis' does not exist\. Available: factor, channel, from, to\.",
+    "control_scale=0.5:axis=x": r"control_scale 'axis' does not exist\. Available: factor, channel, from, to\.",
     "delay=3": r"delay's 'modality' is 3, not a name",
     "delay:steps=-1": r"delay's 'steps' is -1, not a whole number",
     "[1]": r"faults is \[1\], not a list of objects",
