@@ -210,7 +210,7 @@ export class Diagnosis {
     const isHealthy = result?.state === 'healthy';
     html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;
     html('.gain', this.#host).hidden = !isHealthy || !this.#trace?.fuses;
-    html('.about', this.#host).textContent = result ? aboutOf(result) : '';
+    html('.about', this.#host).replaceChildren(...wholeOptions(result ? aboutOf(result) : ''));
   }
 
   /**
@@ -372,6 +372,15 @@ function aboutOf({
   const missing = listed && ` Not measured: ${listed}${more}.`;
   return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.${missing}${source ? ` Healthy record: ${source}.` : ''}`;
 }
+
+/**
+ * Keeps the options of a command from being broken after their hyphens.
+ * @param {string} text
+ */
+const wholeOptions = (text) =>
+  text
+    .split(/(--[\w-]+)/)
+    .map((part, i) => (i % 2 ? create('span', { className: 'option', textContent: part }) : part));
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */
 export function recoveredText({ error, low, high, nll, measure }) {
