@@ -73,7 +73,7 @@ const METRICS = [
   },
   {
     key: 'seconds',
-    title: 'training s',
+    title: 'training, s',
     help: 'Training time, mean over the seeds',
     format: (/** @type {number | null} */ value) => fixed(value, 0),
   },
