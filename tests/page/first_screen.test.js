@@ -102,7 +102,7 @@ test('an injected fault that the diagnosis does not name comes before an outage'
   assert.equal(result.headline, 'Injected: image frozen, from step 10.');
   assert.equal(
     result.evidence,
-    'Mean position error 0.50 cm before, 2.00 cm from then on. Diagnosis: Healthy: all is normal.',
+    'Mean position error 0.50 cm before, 2.00 cm from then on. The diagnosis does not name it. Healthy: all is normal.',
   );
   assert.deepEqual([result.step, result.tone], [10, 'warn']);
   assert.equal(finding(frozen, 0, FAULT).headline, 'Image frozen from step 31.');
@@ -113,7 +113,7 @@ test('an injected fault that the diagnosis does not name comes before an outage'
   assert.equal(always.headline, 'Injected: image frozen, in all steps.');
   assert.match(
     always.evidence,
-    /^Largest error at step 10\..* Diagnosis: Healthy: all is normal\.$/,
+    /^Largest error at step 10\..* The diagnosis does not name it\. Healthy: all is normal\.$/,
   );
 });
 

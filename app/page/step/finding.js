@@ -33,7 +33,8 @@ export function finding(trace, component, diagnosis) {
   if (fault?.evidence) return fault;
   const injected = trace.header.faults ? injectedFinding(trace, component) : null;
   if (injected) {
-    const diagnosed = diagnosis ? `Diagnosis: ${sentence(diagnosis.headline)}` : '';
+    const lead = fault ? 'Diagnosis:' : 'The diagnosis does not name it.';
+    const diagnosed = diagnosis ? `${lead} ${sentence(diagnosis.headline)}` : '';
     return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
   }
   const worst = worstFinding(trace, component);
