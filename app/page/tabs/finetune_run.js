@@ -107,7 +107,7 @@ export class FinetuneRun {
     const table = element('.slices', HTMLTableElement, this.#host);
     table.hidden = !success;
     if (!success) return;
-    const titles = ['slice', 'before', 'after', 'change', 'limit', ''];
+    const titles = ['slice of held-out episodes', 'before', 'after', 'change', 'limit', ''];
     const head = titles.map((textContent) => create('th', { scope: 'col', textContent }));
     html('thead', table).replaceChildren(create('tr', {}, ...head));
     const rows = success.slices.map((slice, i) => {
@@ -262,7 +262,10 @@ function progressFigures({ losses, validations, steps }, task, settings) {
     y: [null, ...losses.map(([, value]) => value), null],
   };
   const plots = [
-    linePlot('Validation', `change of the ${task.main.name} error, %`, [...errors, ...bounds]),
+    linePlot('Validation episodes', `change of the ${task.main.name} error, %`, [
+      ...errors,
+      ...bounds,
+    ]),
     linePlot('Loss', '', losses.length ? [loss] : []),
   ];
   return {
