@@ -178,8 +178,10 @@ export function changes(validations, slice, key) {
 }
 
 /** @param {Job} job */
-const stateOf = (job) =>
-  job.state === 'running' ? `running, ${percent(job.progress)}` : jobSummary(job);
+function stateOf(job) {
+  if (job.state === 'running') return `running, ${percent(job.progress)}`;
+  return job.state === 'cancelled' ? 'paused' : jobSummary(job); // as in the run itself
+}
 
 /** @param {number} value */
 const signedPercent = (value) => `${value >= 0.005 ? '+' : ''}${percent(value)}`;
