@@ -44,8 +44,30 @@ export function finding(trace, component, diagnosis) {
   if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
   if (!diagnosis) return worst;
   const evidence = `${worst.headline} ${worst.evidence}`.trim();
-  const { tone = healthy, headline = sentence(diagnosis.headline) } = fault ?? {};
+  const { tone = healthy, headline = healthyHeadline(trace, component, diagnosis) } = fault ?? {};
   return { tone, headline, evidence, step: worst.step };
+}
+
+/**
+ * Says how accurate a run without a fault is and which modality it relies on; that a filter is miscalibrated comes first.
+ * @param {Trace} trace
+ * @param {number} component whose effective weights are described
+ * @param {Diagnosis} diagnosis
+ */
+function healthyHeadline(trace, component, { headline, miscalibrated }) {
+  const errors = trace.error('fused', 'main')?.filter(Number.isFinite) ?? [];
+  if (miscalibrated || !errors.length) return sentence(headline);
+  const error = withUnit(fixed(mean(errors), 2), trace.mainUnit);
+  const [most] = trace.modalities
+    .flatMap((name) => {
+      const values = trace.weight('effective', name, component)?.filter(Number.isFinite);
+      return values?.length ? [{ name, share: mean(values) }] : [];
+    })
+    .sort((a, b) => b.share - a.share);
+  const weight = most
+    ? `; ${most.name} has ${percent(most.share)} of the effective weight${weightScope(trace, component)}`
+    : '';
+  return `No fault found: mean ${trace.task.main.name} error ${error}${weight}.`;
 }
 
 /**
