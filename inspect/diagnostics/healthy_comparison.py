@@ -80,8 +80,11 @@ class Deviation:
 
     @property
     def text(self) -> str:
-        """Label, value and healthy range, in the unit for display."""
-        value, healthy, low, high = (_number(self.factor * x) for x in (self.value, self.healthy, self.low, self.high))
+        """Label, value and healthy range, in the unit for display, without digits far below the range's width."""
+        width = abs(self.factor * (self.high - self.low))
+        digits = 1 - math.floor(math.log10(width)) if 0.0 < width < math.inf else 12
+        numbers = (round(self.factor * x, digits) + 0.0 for x in (self.value, self.healthy, self.low, self.high))
+        value, healthy, low, high = map(_number, numbers)
         unit = self.unit and f" {self.unit}"
         return f"{self.label} is {value}{unit}, healthy {healthy}{unit} ({low} to {high})"
 

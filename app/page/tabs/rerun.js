@@ -178,7 +178,10 @@ export class Rerun {
       const { active_store_id: active, recordings } = await viewer.get_state();
       const time = recordings.find((r) => r.store_id === active)?.current_time;
       stable = time?.timeline === 'step' && Number(time.time) === this.#step ? stable + 1 : 0;
-      if (!stable) await viewer.set_time(timeOf(this.#step)).catch(() => frame());
+      // Before the first data arrive, the viewer would report a missing timeline.
+      const hasData = time?.timeline === 'step' || i >= SETTLE_FRAMES / 2;
+      if (!stable)
+        await (hasData ? viewer.set_time(timeOf(this.#step)).catch(() => frame()) : frame());
     }
     if (this.#source === source) this.#settled = source;
   }
