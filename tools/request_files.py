@@ -22,7 +22,6 @@ from typing import Any
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_worker import TraceWorker
 from beliefscope.app.server.main import create_app
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,7 +66,7 @@ def measure(folder: Path) -> Iterator[tuple[str, list[str]]]:
     recorder = CallRecorder()
     url = "/api/trace/door/crossmodal-ekf/9"
     for name, subprocess in (("trace, computed in a worker process", True), ("trace, computed in a thread", False)):
-        app = create_app(Settings(folder / name), warm=False, worker=TraceWorker() if subprocess else None)
+        app = create_app(Settings(folder / name), warm=False, subprocess=subprocess)
         app.state.views._timeout = 3600.0  # s, so that idle views are not looked for during a request
         with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
             client.get("/api/catalog")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.worker import TRACE_WORKER, WorkerDied, WorkerProcess
+from beliefscope.app.runs.worker import WorkerDied, WorkerProcess
 from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
@@ -65,11 +65,10 @@ class TraceWorker:
     Call ``run`` from one thread at a time; ``close`` may be called from any thread.
     """
 
-    def __init__(self, process: WorkerProcess | None = None) -> None:
-        """process: of the module ``TRACE_WORKER``, if it has been started in advance."""
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._closed = False
-        self._process = process
+        self._process: WorkerProcess | None = None
 
     @property
     def started(self) -> bool:
@@ -82,7 +81,7 @@ class TraceWorker:
             if self._closed:
                 raise RuntimeError("the server is stopping")
             if self._process is None or self._process.poll() is not None:
-                self._process = WorkerProcess(TRACE_WORKER)
+                self._process = WorkerProcess(__name__)
             return self._process
 
     def run(self, request: RunRequest, progress: Progress) -> None:

@@ -24,9 +24,6 @@ from typing import IO, Any, TextIO
 
 from beliefscope.datasets.errors import BadInput
 
-TRACE_WORKER = "beliefscope.app.runs.trace_worker"
-"""Module of the process that runs filters."""
-
 REPORT_INTERVAL = 0.1  # s between progress reports
 NICENESS = 5  # lower priority than the server
 

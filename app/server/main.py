@@ -43,7 +43,6 @@ from beliefscope.app.runs.saved_filters import with_saved_filters
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.trace_worker import TraceWorker
-from beliefscope.app.runs.worker import WorkerProcess
 from beliefscope.app.server.auth import LOOPBACK, OPEN, VARIABLE, Access, host_names
 from beliefscope.app.server.logs import is_relevant
 from beliefscope.app.server.plain_pages import POLICY, not_found_page
@@ -66,18 +65,16 @@ STATUS: dict[type[Exception], int] = {QueueFull: 429, NotFound: 404, NameTaken: 
 log = logging.getLogger("beliefscope.app")
 
 
-def create_app(
-    settings: Settings, warm: bool = True, worker: TraceWorker | None = None, access: Access = OPEN
-) -> FastAPI:
+def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, access: Access = OPEN) -> FastAPI:
     """The application. Its threads start and end with its lifespan.
 
-    warm: prepare the first page's trace and Rerun's viewer in the background at startup. worker: process that
-    runs filters; default: a thread. access: required token and permissions.
+    warm: prepare the first page's trace and Rerun's viewer in the background at startup. subprocess: run filters in a
+    subprocess instead of a thread. access: required token and permissions.
     """
     with contextlib.suppress(FileExistsError):  # reported by the code that needs the folder
         settings.workspace.mkdir(mode=0o700, parents=True)
     delete_abandoned_parts(settings.workspace)
-    store = TraceStore(with_saved_filters(settings), worker)
+    store = TraceStore(with_saved_filters(settings), TraceWorker() if subprocess else None)
     views = Views(store, settings.views)
     jobs = Jobs(settings.workspace / "jobs")
     viewer = WebViewer(settings.workspace / "cache")
@@ -141,7 +138,6 @@ def serve(
     port: int = 8000,
     on_start: Callable[[str], None] | None = None,
     access: Access = OPEN,
-    worker: WorkerProcess | None = None,
 ) -> None:
     """Serve on one port until SIGINT, SIGTERM or SIGHUP.
 
@@ -150,7 +146,6 @@ def serve(
         on_start: called with the URL of the page, including the token, once the server accepts connections; prints
             it by default.
         access: see ``create_app``; a token is required if others can reach the host.
-        worker: process of the module ``TRACE_WORKER``, if it has been started in advance.
 
     Raises BadInput if the address is not available or not allowed, or if a file cannot be used.
     """
@@ -159,7 +154,7 @@ def serve(
         raise BadInput(f"Others can reach {host}: a server there needs a token, in Access or in {VARIABLE}.")
     limit_malloc_arenas()
     with listen(host, port) as listener:  # before anything is created
-        app = create_app(settings, worker=TraceWorker(worker), access=access)
+        app = create_app(settings, subprocess=True, access=access)
         problems = app.state.store.problems()
         if problems:
             raise BadInput("; ".join(problems))

@@ -18,13 +18,10 @@ def demo(
     Example:
       beliefscope demo --no-open --port 8000
     """
-    from beliefscope.app.cli.commands.serve import serve_page, start_worker
-
-    worker = start_worker()
-
+    from beliefscope.app.cli.commands.serve import serve_page
     from beliefscope.app.runs.settings import Settings
     from beliefscope.app.server import logs
 
     logs.configure("warning", "text", "")
     with tempfile.TemporaryDirectory(prefix="beliefscope-") as workspace:
-        serve_page(Settings(Path(workspace)), worker, port=port, open_page=open_page)
+        serve_page(Settings(Path(workspace)), port=port, open_page=open_page)

@@ -11,7 +11,6 @@ from beliefscope.app.cli import console, options as opt
 
 if TYPE_CHECKING:
     from beliefscope.app.runs.settings import Settings
-    from beliefscope.app.runs.worker import WorkerProcess
     from beliefscope.app.server.auth import Access
     from beliefscope.filters.checkpoint import Checkpoint
 
@@ -63,15 +62,13 @@ def serve(
       beliefscope serve --task door --filter examples/04_own_filter.py:build
       beliefscope serve --task examples/own_task.py:TASK --data own.h5 --filter own.safetensors
     """
-    opt.check_workspace(workspace)
-    worker = start_worker()
-
     from beliefscope.app.runs.catalog import SAMPLE, short_names
     from beliefscope.app.runs.settings import Settings
     from beliefscope.app.server import logs
     from beliefscope.app.server.auth import Access, host_names, token_for
     from beliefscope.app.workspace.studies import SHIPPED, Study
 
+    opt.check_workspace(workspace)
     access = Access(token_for(host, token, os.environ), read_only)
     logs.configure(log_level, log_format, access.token)
     settings = Settings(
@@ -91,26 +88,11 @@ def serve(
         from beliefscope.recordings.sweep_table import Experiments  # DuckDB is slow to import
 
         Experiments(settings.sweeps.values())
-    serve_page(settings, worker, port, open_page, host, access)
-
-
-def start_worker() -> WorkerProcess:
-    """Start the process that runs filters: it imports PyTorch, for seconds, while this process imports the server.
-
-    It ends with this process.
-    """
-    from beliefscope.app.runs.worker import TRACE_WORKER, WorkerProcess
-
-    return WorkerProcess(TRACE_WORKER)
+    serve_page(settings, port, open_page, host, access)
 
 
 def serve_page(
-    settings: Settings,
-    worker: WorkerProcess,
-    port: int,
-    open_page: bool,
-    host: str = "127.0.0.1",
-    access: Access | None = None,
+    settings: Settings, port: int, open_page: bool, host: str = "127.0.0.1", access: Access | None = None
 ) -> None:
     """Serve until a signal; prints the address once the server listens, and opens it in a browser if requested."""
     from beliefscope.app.server.auth import LOOPBACK, OPEN
@@ -126,7 +108,7 @@ def serve_page(
             if open_page:
                 open_in_browser(url)
 
-        serve_until_signal(settings, host=host, port=port, on_start=listening, access=access, worker=worker)
+        serve_until_signal(settings, host=host, port=port, on_start=listening, access=access)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the server has stopped; do not interrupt interpreter shutdown
 
