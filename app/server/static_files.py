@@ -75,7 +75,7 @@ class PageFiles:
 def modules(folder: Path, lazy: bool = False) -> list[str]:
     """The page's entry module and the modules it imports, in breadth-first order.
 
-    lazy: with those that are imported by a call, when the page needs them.
+    lazy: also modules that are imported by a call, when the page needs them.
     """
     names = [ENTRY]
     for name in names:
