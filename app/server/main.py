@@ -62,6 +62,7 @@ __all__ = ["Settings", "create_app", "serve"]
 PAGE = Path(__file__).parents[1] / "page"
 ERRORS: tuple[type[Exception], ...] = (InProgress, BadInput, RequestValidationError, HTTPException, OSError)
 STATUS: dict[type[Exception], int] = {QueueFull: 429, NotFound: 404, NameTaken: 409}
+FIRST_PAGE = 4.0  # s from the first run until Rerun's viewer is prepared
 log = logging.getLogger("beliefscope.app")
 
 
@@ -238,6 +239,7 @@ def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> No
     for prepare in (
         store.catalog,  # the page's first request; a run at the same time would delay it
         lambda: store.request(store.default_selection()).encoded_maps(0, MAP_SIZES[0]),
+        lambda: stopping.wait(FIRST_PAGE),  # a page that opens now needs the processor
         lambda: viewer.prepare(stopping.is_set),
         freeze_heap,
     ):
