@@ -110,8 +110,8 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
     architecture = Architecture.from_json(header["architecture"], task)
     with torch.device("meta"), _Uninitialised():  # allocates no memory, whatever the header's sizes
         filter_ = build(architecture)
-    kinds = {key: value.dtype for key, value in filter_.state_dict().items()}
-    expected = {key: tuple(value.shape) for key, value in filter_.state_dict().items()}
+    empty = filter_.state_dict()
+    expected = {key: tuple(value.shape) for key, value in empty.items()}
     shapes = {key: tuple(value.shape) for key, value in tensors.items()}
     if expected != shapes:
         key = min(expected.items() ^ shapes.items())[0]
@@ -123,7 +123,7 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
         if not (value.is_floating_point() and _is_finite(value)):
             raise BadInput(f"{str(path)!r}: tensor {key!r} contains values that are not finite numbers ({value.dtype})")
     # Copies: the tensors may be views of the file.
-    filter_.load_state_dict({key: value.to(kinds[key], copy=True) for key, value in tensors.items()}, assign=True)
+    filter_.load_state_dict({key: value.to(empty[key].dtype, copy=True) for key, value in tensors.items()}, assign=True)
     filter_.eval().requires_grad_(False)
     return Checkpoint(
         filter_,

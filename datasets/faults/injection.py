@@ -154,16 +154,17 @@ RENAMED_FAULTS = {
 """Fault name in files of earlier versions -> current name."""
 
 
+def apply_to(text: str, task: Task) -> bool:
+    """Whether faults as text are valid and apply to the sensors of a task."""
+    with suppress(BadInput):
+        Faults.parse(text).check(task)
+        return True
+    return False
+
+
 def available_presets(task: Task) -> dict[str, str]:
     """``FAULT_PRESETS`` that apply to the sensors of the task, and faults of its other sensors and modalities."""
-
-    def fits(text: str) -> bool:
-        with suppress(BadInput):
-            Faults.parse(text).check(task)
-            return True
-        return False
-
-    presets = {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
+    presets = {name: text for name, text in FAULT_PRESETS.items() if apply_to(text, task)}
     common = {key for text in presets.values() for key in Faults.parse(text).sequence[0].keys(task)}
     for key in (key for key in task.observations if key not in common):
         if key in task.images:

@@ -86,9 +86,9 @@ def failing(scores: Sequence[Mapping[str, Any]], filter_: Filter) -> Iterator[We
 def untrained(checkpoint: Checkpoint) -> Iterator[Weakness]:
     """The sensor fault that the training data of a filter lack, if its default fine-tuning addresses one."""
     settings = default_settings(checkpoint.filter)
-    learned = checkpoint.record.get("base", {}).get("settings", {}).get("mix", ())
-    known = [item["slice"]["faults"] for item in learned]
-    if (why := reason(checkpoint.filter)) and settings.mix[0][0].faults.to_json() not in known:
+    base = checkpoint.record.get("base")
+    known = [slice_.faults for slice_, _ in FineTune.from_json(base["settings"]).mix] if base else []
+    if (why := reason(checkpoint.filter)) and settings.mix[0][0].faults not in known:
         name = settings.mix[0][0].name
         title = f"Sensor fault \u201c{name}\u201d, which the training data lack"
         yield Weakness("default", title, why, None, None, replace(settings, success=Criterion(name)))

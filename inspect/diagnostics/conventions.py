@@ -9,14 +9,14 @@ from itertools import combinations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.control_faults import has_position
-from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.faults.injection import Faults, apply_to
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.shapley import run_subsets
+from beliefscope.inspect.diagnostics.standalone_modalities import of_standalone_run
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table
 from beliefscope.inspect.statistics.intervals import LEVEL, MIN_TRAJECTORIES, jackknife, too_few
 from beliefscope.inspect.statistics.measures import error_names, means, removed_share, squared_errors, starts_at_truth
@@ -160,7 +160,7 @@ def changes_of(task: Task, modalities: Sequence[str], episode: Episode) -> tuple
     if channels:
         result.append(Change(f"controls delayed by {DELAY} steps", f"control_delay={DELAY}"))
         result += [Change(f"controls times {f:g}", f"control_scale={f:g}") for f in (-1.0, *SCALES)]
-    return tuple(change for change in result if _applies(change, task))
+    return tuple(change for change in result if apply_to(change.faults, task))
 
 
 def _of_sensor(key: str, modality: str, channels: int) -> list[Change]:
@@ -172,14 +172,6 @@ def _of_sensor(key: str, modality: str, channels: int) -> list[Change]:
         text = f"channels {i} and {j} of {name} exchanged"
         result.append(Change(text, f"sensor_swapped={key}:first={i}:second={j}", modality))
     return result
-
-
-def _applies(change: Change, task: Task) -> bool:
-    try:
-        Faults.parse(change.faults).check(task)
-    except BadInput:
-        return False
-    return True
 
 
 def conventions(
@@ -221,8 +213,8 @@ def _with_change(checkpoint: Checkpoint, traces: Sequence[Trace], change: Faults
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
-    if "standalone" in trace.settings:
-        return f"the trace is of a standalone run of {trace.settings['standalone']}"
+    if why := of_standalone_run(trace):
+        return why
     if not np.isfinite(trace.episode.states).all():
         return "the episode has no ground truth at some steps"
     if checkpoint is not None and not changes_of(trace.task, modalities_of(checkpoint), trace.episode):

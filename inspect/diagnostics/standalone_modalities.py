@@ -139,10 +139,16 @@ class StandaloneModalities(Diagnostic):
         return {"contact": self.contact, "blackout": self.blackout} if len(self.fused) else {}
 
 
+def of_standalone_run(trace: Trace) -> str | None:
+    """Reason against a trace of a single modality, or None."""
+    name = trace.settings.get("standalone")
+    return None if name is None else f"the trace is of a standalone run of {name}"
+
+
 def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
-    if "standalone" in trace.settings:
-        return f"the trace is of a standalone run of {trace.settings['standalone']}"
+    if why := of_standalone_run(trace):
+        return why
     if checkpoint is not None and len(modalities_of(checkpoint)) < 2:
         return f"{trace.filter} has one modality: it is the standalone filter"
     return None

@@ -240,8 +240,9 @@ def squared_errors(trace: Trace, estimates: NDArray[Any] | None = None) -> Array
 
     estimates: (T, ..., n) other estimates than those of the trace.
     """
-    error = errors(trace)[:, -1]
-    if estimates is not None:
+    if estimates is None:
+        error = errors(trace)[:, -1]
+    else:
         shape = (len(trace), *(1,) * (estimates.ndim - 2), estimates.shape[-1])
         error = wrapped(trace.task, estimates - trace.episode.states.reshape(shape))
     columns = [0, *(1 + i for i in _others(trace.task))]

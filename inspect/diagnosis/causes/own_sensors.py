@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS
@@ -12,36 +10,29 @@ KNOWN = ("image", "force", "torque", "effector_position", "contact")
 """Observations that have their own causes."""
 
 VECTOR = (
-    ("stuck", "stuck", "Restart the sensor and check its connection."),
-    ("noise", "noisy", "Check the cable and the filter of the sensor."),
-    ("saturation", "saturated", "Extend the measuring range of the sensor."),
+    ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
+    ("noise", "noise", "noisy", "Check the cable and the filter of the sensor."),
+    ("saturation", "saturation", "saturated", "Extend the measuring range of the sensor."),
 )
-"""Mechanism, which is the kind of the statistic as well; word of the title; next action."""
+"""Kind of the statistic, mechanism, word of the title, next action."""
 
 IMAGE = (
     ("black", "blackout", "blacked out", "Check the camera and its driver."),
     ("frozen", "frozen", "frozen", "Check the camera and its driver."),
     ("noise", "noise", "noisy", "Light the scene better, or correct the exposure and gain of the camera."),
 )
-"""Kind of the statistic, mechanism, word of the title, next action."""
-
-
-@cache
-def causes_in(observations: tuple[tuple[str, str, bool], ...]) -> tuple[Cause, ...]:
-    """Causes in sensors. observations: key, modality and whether it is an image."""
-    result = []
-    for key, modality, is_image in observations:
-        mechanisms = IMAGE if is_image else tuple((kind, kind, word, action) for kind, word, action in VECTOR)
-        changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
-        name = display_name(key)
-        for kind, mechanism, word, action in mechanisms:
-            symptom = Symptom(f"{kind}/{key}/*|{kind}/{key} */*")
-            title = f"{name[0].upper()}{name[1:]} {word}"
-            result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
-    return tuple(result)
+"""As ``VECTOR``, of images."""
 
 
 def own_causes(task: Task) -> tuple[Cause, ...]:
     """Causes in the sensors of a task that have none in the catalog."""
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in KNOWN}
-    return causes_in(tuple((key, modality, key in task.images) for key, modality in keys.items()))
+    result = []
+    for key, modality in keys.items():
+        changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
+        name = display_name(key)
+        for kind, mechanism, word, action in IMAGE if key in task.images else VECTOR:
+            symptom = Symptom(f"{kind}/{key}/*|{kind}/{key} */*")
+            title = f"{name[0].upper()}{name[1:]} {word}"
+            result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
+    return tuple(result)
