@@ -1,6 +1,6 @@
 /** Minimal replacements for the browser interfaces that the state uses. */
 
-/** @type {Map<number, () => void>} */
+/** @type {Map<number, (now: number) => void>} */
 const frames = new Map();
 let handle = 0;
 
@@ -8,7 +8,7 @@ let handle = 0;
 export const history = [''];
 
 Object.assign(globalThis, {
-  /** @param {() => void} callback */
+  /** @param {(now: number) => void} callback */
   requestAnimationFrame(callback) {
     frames.set(++handle, callback);
     return handle;
@@ -23,9 +23,12 @@ Object.assign(globalThis, {
   },
 });
 
-/** Runs the requested animation frames. */
-export function runFrames() {
+/**
+ * Runs the requested animation frames.
+ * @param {number} [now] ms
+ */
+export function runFrames(now = 0) {
   const callbacks = [...frames.values()];
   frames.clear();
-  for (const callback of callbacks) callback();
+  for (const callback of callbacks) callback(now);
 }

@@ -145,9 +145,16 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.match(plain.evidence, /error 1\.23 cm; largest deviation 5\.0σ in x: overconfident/);
   assert.deepEqual([plain.tone, plain.step], ['bad', 10]);
   const healthy = finding(run(11), 0, HEALTHY);
-  assert.match(healthy.headline, /^No fault found: mean position error 0\.54 cm; image has 38 % of/);
+  assert.match(
+    healthy.headline,
+    /^No fault found: mean position error 0\.54 cm; image has 38 % of/,
+  );
   const poor = finding(run(11), 0, { ...HEALTHY, miscalibrated: true });
-  assert.equal(poor.headline, 'Healthy: all is normal.', 'the record, which the diagnosis describes');
+  assert.equal(
+    poor.headline,
+    'Healthy: all is normal.',
+    'the record, which the diagnosis describes',
+  );
   assert.match(healthy.evidence, /^Largest error at step 10\. /);
 });
 

@@ -1,9 +1,12 @@
-/** Playback: advances the step at the speed of the episode. */
+/** Playback: advances the step at the speed of the episode, and repeats the visible steps of a zoomed timeline. */
 
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Store } from './state.js' */
 
+import { parseWindow } from '../timeline/step_window.js';
 import { SPEEDS } from './state.js';
+
+const MIN_DURATION = 1e-3; // s of a step
 
 export class Clock {
   /** @type {Store} */
@@ -44,6 +47,12 @@ export class Clock {
     return (this.#trace?.steps ?? 1) - 1;
   }
 
+  /** The first and last visible step. */
+  get #visible() {
+    const [from, to] = parseWindow(this.#store.state.window, [0, this.#last]);
+    return [Math.ceil(from), Math.min(Math.floor(to), this.#last)];
+  }
+
   /**
    * Returns the s from a step to the next one.
    * @param {number} step
@@ -53,7 +62,9 @@ export class Clock {
   }
 
   #start() {
-    if (this.#store.state.step >= this.#last) this.#store.set({ step: 0 }, { origin: 'clock' });
+    const [from, to] = this.#visible;
+    const { step } = this.#store.state;
+    if (step < from || step >= to) this.#store.set({ step: from }, { origin: 'clock' });
     this.#lastFrame = performance.now();
     this.#pending = 0;
     requestAnimationFrame((now) => this.#tick(now));
@@ -65,14 +76,18 @@ export class Clock {
     if (!playing) return;
     this.#pending += ((now - this.#lastFrame) / 1000) * speed;
     this.#lastFrame = now;
+    const [from, to] = this.#visible;
+    const repeats = Boolean(this.#store.state.window);
     let next = step;
-    for (; next < this.#last; next += 1) {
-      const duration = this.#duration(next);
-      if (this.#pending < duration) break;
+    while (next < to || repeats) {
+      // The bound keeps equal times from repeating without end.
+      const duration = Math.max(this.#duration(Math.min(next, to - 1)), MIN_DURATION);
+      if (!(this.#pending >= duration)) break;
       this.#pending -= duration;
+      next = next < to ? next + 1 : from;
     }
     this.#store.set(
-      { step: next, playing: next < this.#last },
+      { step: next, playing: repeats || next < to },
       { origin: 'clock', inputTime: null },
     );
     this.#store.flush();
