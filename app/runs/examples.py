@@ -50,11 +50,6 @@ EXAMPLES = (
         "A Kalman filter in plain PyTorch that uses no camera, compared with an included filter.",
         "?task=door&filter=hand-on-arc&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
     ),
-    Example(
-        "40 % image blackout",
-        "Random single images are black, the fault of the paper.",
-        "?task=door&filter=crossmodal-pf&step=25&faults=blackout%3D0.4&weights=effective",
-    ),
 )
 """The first is what an address without a selection opens."""
 
