@@ -164,6 +164,8 @@ OVERVIEW = {
     "worst_time": "arg_max_null(r.worst_time, r.worst)",
     "checkpoint": "r.checkpoint",
     "data": "r.data",
+    "training": "any_value(json_object('data', c.training->>'data_hash', 'plan', c.training->'plan', 'blackouts', "
+    "c.training->'blackouts', 'faults', c.training->'faults', 'finetuned', c.training->'base'->'settings'))",
     "provenance": "any_value(c.provenance)",
 }
 """Column of the overview -> its expression."""

@@ -43,6 +43,14 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any) -> None:
         order = ",".join(row["name"] for row in sorted(worst, key=lambda row: -row["nees"]))
         page.until(f"() => ({names})().join() === '{order}'")
         assert page.state["sort"] == "-nees"
+        panel.locator("select.rows").select_option("seeds")
+        panel.locator("select.x").select_option("level:blackout")
+        page.until("() => document.querySelectorAll('#experiments .curve').length === 2")  # one for each filter
+        panel.locator("tbody button").first.click()
+        page.until("() => document.querySelectorAll('#experiments .episodes li').length === 1")  # the only seed
+        panel.locator(".episodes li button").click()
+        page.until("() => document.querySelectorAll('#experiments .episodes li').length === 3")
+        assert page.state["rows"] == "checkpoints"
         panel.locator("input.match").fill("haptics blackout")
         page.until("() => document.querySelectorAll('#experiments tbody tr').length === 1")
         panel.locator("tbody button").click()

@@ -2,6 +2,12 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import {
+  cellOf,
+  faultKinds,
+  faultLevel,
+  seedGroups,
+} from '../../app/page/tabs/experiment_groups.js';
+import {
   comparedWith,
   matching,
   NUMBER_KEYS,
@@ -26,8 +32,10 @@ const ROW = {
   worst: 1.5,
   worst_episode: 2,
   worst_step: 40,
+  worst_time: 4,
   checkpoint: 'a'.repeat(64),
   data: 'b'.repeat(64),
+  training: '{}',
   provenance: '{"lr": 0.001}',
   catalog_name: null,
   data_name: null,
@@ -79,4 +87,62 @@ test('steps of ticks are 1, 2 or 5 times a power of ten, and at least as large a
     assert.ok(nice >= step * (1 - 1e-12) && nice <= 2.5 * step);
     assert.match(nice.toExponential(6), /^[125]\.000000e/);
   }
+});
+
+/** @param {object[]} changes of `ROW`, each with another checkpoint */
+const rowsOf = (...changes) =>
+  changes.map((change, i) => ({ ...ROW, checkpoint: String(i).repeat(64), ...change }));
+
+test('checkpoints that differ by their seed are one group with mean and standard deviation', () => {
+  const rows = rowsOf(
+    { error: 1, nees: null, provenance: '{"lr": 1, "seed": 0}' },
+    { error: 3, nees: null, provenance: '{"seed": 1, "lr": 1}' },
+    { error: 9, provenance: '{"lr": 2}' },
+    { error: 5, provenance: '{"lr": 1}', faults: '' },
+  );
+  const groups = seedGroups(rows);
+  assert.deepEqual(
+    groups.map(({ name, members, error }) => [name, members.length, error]),
+    [
+      ['crossmodal-ekf, lr 1', 2, 2],
+      ['crossmodal-ekf, lr 2', 1, 9],
+      ['crossmodal-ekf, lr 1', 1, 5],
+    ],
+  );
+  assert.ok(Math.abs(Number(groups[0].spread.error) - Math.SQRT2) < 1e-12, 'sample deviation');
+  assert.deepEqual([groups[0].nees, groups[1].spread], [null, {}]);
+  assert.equal(seedGroups([...rows].reverse()).length, 3);
+  assert.equal(new Set(groups.map(cellOf)).size, 3);
+  assert.equal(cellOf(seedGroups([rows[1], rows[0]])[0]), cellOf(groups[0]), 'whatever the order');
+});
+
+test('a fine-tuned checkpoint is no seed of its base', () => {
+  const training = { data: 'c'.repeat(64), finetuned: null };
+  const tuned = (/** @type {number} */ seed) =>
+    JSON.stringify({ ...training, finetuned: { seed, faults: 'blackout=0.8' } });
+  const rows = rowsOf(
+    { training: JSON.stringify(training) },
+    { training: tuned(0) },
+    { training: tuned(1) },
+  );
+  const groups = seedGroups(rows).map(({ name, members }) => [name, members.length]);
+  assert.deepEqual(groups, [
+    ['crossmodal-ekf', 1],
+    ['crossmodal-ekf, fine-tuned', 2],
+  ]);
+});
+
+test('faults of one kind have levels, and no fault has level 0', () => {
+  const texts = [
+    '',
+    'blackout=0.4',
+    'blackout=0.8',
+    'force_bias:x=8',
+    'contact_flipped',
+    'a=1,b=2',
+  ];
+  const rows = rowsOf(...texts.map((faults) => ({ faults })));
+  assert.deepEqual(faultKinds(rows), ['blackout', 'force_bias:x']);
+  const levels = rows.map((row) => faultLevel(row, 'blackout'));
+  assert.deepEqual(levels, [0, 0.4, 0.8, null, null, null]);
 });

@@ -67,6 +67,9 @@ def test_pooled_results_equal_the_evaluation(inputs: Inputs, sweep: Path) -> Non
     assert row["nees"] == pytest.approx(expected.nees, rel=1e-3)
     assert row["coverage95"] == pytest.approx(expected.coverage95, abs=2e-3)
     assert (row["unit"], row["episodes"]) == ("cm", EPISODES)
+    training = json.loads(row["training"])
+    assert training["blackouts"] == [0.0, 0.4, 0.8]
+    assert (len(training["data"]), training["finetuned"]) == (64, None)
     components = Experiments([sweep]).query(
         "SELECT sqrt(sum(steps * angle_deg ** 2) / sum(steps)) AS angle FROM results "
         "WHERE phase = 'all' AND faults = '' AND checkpoint = ?",

@@ -25,7 +25,8 @@ class ExperimentRow(Reply):
 
     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
     ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
-    timestamps. provenance: JSON of the file beside the checkpoint.
+    timestamps. training: JSON of the hash of its data, plan, blackouts, faults and the settings of a fine-tuning.
+    provenance: JSON of the file beside the checkpoint.
     """
 
     name: str
@@ -44,6 +45,7 @@ class ExperimentRow(Reply):
     worst_time: Number
     checkpoint: str
     data: str
+    training: str
     provenance: str
     catalog_name: str | None
     data_name: str | None

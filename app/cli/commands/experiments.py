@@ -39,5 +39,5 @@ def experiments(
     document = {"rows": shown.to_pylist(), "count": len(rows)}
     if sql:
         return console.Result(document, console.arrow("Results", shown) + more, output)
-    text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(["provenance"]))
+    text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(["training", "provenance"]))
     return console.Result(document, text + more, output)

@@ -65,5 +65,7 @@ def sweep(
     document = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
     document |= {"overview": overview.to_pylist()}
     return console.Result(
-        document, console.arrow("Checkpoints", overview.drop_columns(["provenance"])), output / "results.parquet"
+        document,
+        console.arrow("Checkpoints", overview.drop_columns(["training", "provenance"])),
+        output / "results.parquet",
     )

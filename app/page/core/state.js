@@ -59,6 +59,7 @@ import { displayName } from './units.js';
  * @property {string} sort column of the results, with a minus for descending
  * @property {string} x quantity of the x axis of the results. @property {string} y of the y axis
  * @property {string} cell selected result
+ * @property {string} rows of the results: each of the `checkpoints`, or their mean over `seeds`
  * @property {string} pin step whose maps are the reference of the displayed ones, URL-encoded; empty for none
  * @property {boolean} playing
  * @property {number} speed
@@ -99,6 +100,7 @@ const CHOICES = {
   beside: ['alone', 'gain'],
   tiles: ['one', 'several'],
   start: ['offset', 'truth'],
+  rows: ['checkpoints', 'seeds'],
 };
 /** Keys with any text, and their defaults. */
 const TEXTS = {

@@ -2,6 +2,7 @@
 
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Catalog, EpisodeResult, ExperimentRow, SweepInfo } from '../types/server.js' */
+/** @import { SeedGroup } from './experiment_groups.js' */
 
 import { create, element, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
@@ -22,7 +23,8 @@ import {
   unknownConditions,
   comparedWith,
 } from './experiment_rows.js';
-import { drawScatter, seriesOf } from './scatter.js';
+import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
+import { drawScatter, levelName, seriesOf } from './scatter.js';
 
 const EMPTY = {
   title: 'No sweep yet',
@@ -37,11 +39,20 @@ const EMPTY = {
     'beliefscope serve --sweep sweep',
   ],
 };
+/** @type {Column} */
+const SEEDS = {
+  key: 'seeds',
+  title: 'seeds',
+  help: 'Number of checkpoints; their standard deviation is behind ±',
+  number: true,
+  content: (row) => String('members' in row ? row.members.length : 1),
+};
 const EPISODES = 50; // listed for a checkpoint, the worst first
 
 const BODY = `
   <div class="top">
     <label class="picker">Sweep <select class="sweep" aria-label="Sweep"></select></label>
+    <label class="picker" title="Mean over seeds: of the checkpoints whose training and provenance differ by the seed only, with their standard deviation">Rows <select class="rows" aria-label="Rows"><option value="checkpoints">each checkpoint</option><option value="seeds">mean over seeds</option></select></label>
     <label class="picker">Steps <select class="steps" aria-label="Steps"></select></label>
     <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees>2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions such as nees&gt;2"></label>
     <a class="csv" download>CSV</a>
@@ -69,7 +80,7 @@ export class Experiments {
   #sweeps = null;
   /** Rows of the sweep and steps in `#loaded`. @type {ExperimentRow[]} */
   #rows = [];
-  /** Displayed rows, in order. @type {ExperimentRow[]} */
+  /** Displayed rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
   #matching = [];
   #count = 0;
   #loaded = '';
@@ -107,9 +118,12 @@ export class Experiments {
     );
     store.listen((_, changed) => {
       if (!this.#open) return;
-      if (['sweep', 'steps'].some((key) => changed.has(key))) this.#load();
-      else if (['match', 'sort', 'x', 'y'].some((key) => changed.has(key))) this.#draw();
-      else if (changed.has('cell')) this.#showSelected();
+      if (['sweep', 'steps'].some((key) => changed.has(key))) {
+        this.#load();
+        return;
+      }
+      if (['match', 'sort', 'x', 'y', 'rows'].some((key) => changed.has(key))) this.#draw();
+      if (changed.has('cell') || changed.has('rows')) this.#showSelected();
     });
   }
 
@@ -132,6 +146,7 @@ export class Experiments {
       picker.addEventListener('change', () => store.set({ [key]: picker.value }));
     };
     pick('sweep', '.sweep');
+    pick('rows', '.rows');
     pick('steps', '.steps');
     pick('x', '.x');
     pick('y', '.y');
@@ -179,6 +194,8 @@ export class Experiments {
     const { state } = this.#store;
     /** @type {Record<string, string>} */
     const titles = Object.fromEntries(NUMBER_KEYS.map((key) => [key, NUMBERS[key].title]));
+    const kinds = faultKinds(this.#rows);
+    for (const kind of kinds) titles[levelName(kind)] = `level of ${kind}`;
     const fill = (
       /** @type {string} */ selector,
       /** @type {string[]} */ names,
@@ -193,8 +210,9 @@ export class Experiments {
     const picker = fill('.sweep', names, sweep.name);
     if (picker.parentElement) picker.parentElement.hidden = names.length < 2;
     fill('.steps', ['all', ...sweep.phases.filter((name) => name !== 'all')], this.#steps);
-    fill('.x', NUMBER_KEYS, state.x);
+    fill('.x', [...NUMBER_KEYS, ...kinds.map(levelName)], state.x);
     fill('.y', NUMBER_KEYS, state.y);
+    element('.rows', HTMLSelectElement, this.#host).value = state.rows;
     element('.match', HTMLInputElement, this.#host).value = state.match;
     element('.csv', HTMLAnchorElement, this.#host).href = api.experimentsCsv(
       sweep.name,
@@ -205,16 +223,14 @@ export class Experiments {
   #draw() {
     const { state } = this.#store;
     const sort = parseSort(state.sort);
-    const rows = sortRows(
-      matching(this.#rows, state.match),
-      (row) => valueOf(row, sort.name),
-      sort.down,
-    );
+    const matched = matching(this.#rows, state.match);
+    const groups = state.rows === 'seeds' ? seedGroups(matched) : matched;
+    const rows = sortRows(groups, (row) => valueOf(row, sort.name), sort.down);
     const more = this.#count > this.#rows.length ? `, ${this.#rows.length} are listed` : '';
     html('.about', this.#host).textContent =
       unknownConditions(state.match) ||
-      `${rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
-    const columns = columnsOf(this.#rows);
+      `${matched.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
+    const columns = columnsOf(this.#rows, state.rows === 'seeds');
     const heads = columns.map(({ key, title, help, number }) =>
       sortHeading(
         { name: key, title, help, number },
@@ -233,8 +249,14 @@ export class Experiments {
 
   #drawChart() {
     const { x, y, cell } = this.#store.state;
-    const select = (/** @type {ExperimentRow} */ row) => this.#select(row);
-    drawScatter(html('.chart', this.#host), this.#matching, x, y, this.#filters, cell, select);
+    drawScatter(html('.chart', this.#host), this.#matching, {
+      x,
+      y,
+      kinds: faultKinds(this.#rows),
+      filters: this.#filters,
+      selected: cell,
+      select: (row) => this.#select(row),
+    });
   }
 
   /** Names of all filters; their order sets the colours. */
@@ -243,7 +265,7 @@ export class Experiments {
   }
 
   /**
-   * @param {ExperimentRow} row
+   * @param {ExperimentRow | SeedGroup} row
    * @param {Column[]} columns
    */
   #tableRow(row, columns) {
@@ -251,7 +273,7 @@ export class Experiments {
     button.title = `${row.name}: its worst episodes`;
     const dot = create('span', { className: `dot ${seriesOf(row, this.#filters)}` });
     const line = create('tr', {}, create('th', { scope: 'row' }, dot, button));
-    line.dataset.cell = rowKey(row);
+    line.dataset.cell = cellOf(row);
     line.addEventListener('click', () => this.#select(row)); // also clicks on the button, which serves the keyboard
     for (const { content, number } of columns.slice(1)) {
       const cell = line.insertCell();
@@ -261,9 +283,9 @@ export class Experiments {
     return line;
   }
 
-  /** @param {ExperimentRow} row */
+  /** @param {ExperimentRow | SeedGroup} row */
   #select(row) {
-    const cell = rowKey(row);
+    const cell = cellOf(row);
     this.#store.set({ cell: cell === this.#store.state.cell ? '' : cell });
   }
 
@@ -281,12 +303,17 @@ export class Experiments {
     this.#drawChart();
   }
 
-  /** Lists the episodes of the selected checkpoint. */
+  /** Lists the episodes of the selected checkpoint, or the checkpoints of the selected group. */
   async #showSelected() {
     this.#mark();
+    const { cell } = this.#store.state;
+    const group = this.#matching.find((row) => cellOf(row) === cell);
     const row = this.#selected;
     const [sweep, section] = [this.#sweep, html('.episodes', this.#host)];
-    section.hidden = !row;
+    const members = group && 'members' in group ? group.members : null;
+    section.hidden = !row && !members;
+    for (const button of ['.compare', '.diagnose']) html(button, section).hidden = Boolean(members);
+    if (group && members) this.#showMembers(group.name, members);
     if (!row || !sweep) return;
     try {
       const { episodes } = await api.experimentEpisodes(sweep.name, row, this.#steps);
@@ -302,6 +329,26 @@ export class Experiments {
     const items = this.#episodes
       .slice(0, EPISODES)
       .map((episode) => this.#episodeItem(row, episode));
+    html('.episodes ol', this.#host).replaceChildren(...items);
+  }
+
+  /**
+   * Lists the checkpoints of a group.
+   * @param {string} name
+   * @param {ExperimentRow[]} members
+   */
+  #showMembers(name, members) {
+    const faults = members[0].faults && `, ${members[0].faults}`;
+    html('.episodes h4', this.#host).textContent =
+      `${name}${faults}: mean of ${members.length} checkpoints, the worst first`;
+    const items = sortRows(members, ({ error }) => error, true).map((row) => {
+      const button = create('button', { type: 'button', className: 'text' }, row.name);
+      button.addEventListener('click', () =>
+        this.#store.set({ rows: 'checkpoints', cell: rowKey(row) }),
+      );
+      const values = `RMSE ${fixed(row.error, 2)} ${row.unit}, NEES ${significant(row.nees)}`;
+      return create('li', {}, button, create('span', { textContent: values }));
+    });
     html('.episodes ol', this.#host).replaceChildren(...items);
   }
 
@@ -374,23 +421,24 @@ export class Experiments {
   }
 }
 
-/** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow) => string}} Column */
+/** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow | SeedGroup) => string}} Column */
 
 /**
  * Columns of the table; texts that are equal in all rows are left out.
  * @param {ExperimentRow[]} rows
+ * @param {boolean} areGroups whether each displayed row is a mean over checkpoints
  * @returns {Column[]}
  */
-function columnsOf(rows) {
+function columnsOf(rows, areGroups) {
   const units = [...new Set(rows.map(({ unit }) => unit))];
   const texts = /** @type {const} */ (['filter', 'task', 'faults']).filter(
-    (key) => new Set(rows.map((row) => row[key])).size > 1,
+    (key) => new Set(rows.map((row) => row[key])).size > 1 && !(areGroups && key === 'filter'),
   );
   return [
     {
       key: 'name',
-      title: 'checkpoint',
-      help: 'Name of the file',
+      title: areGroups ? 'filter' : 'checkpoint',
+      help: areGroups ? 'Checkpoints that differ by their seed' : 'Name of the file',
       number: false,
       content: ({ name }) => name,
     },
@@ -401,14 +449,18 @@ function columnsOf(rows) {
       number: false,
       content: (/** @type {ExperimentRow} */ row) => row[key] || 'none',
     })),
+    ...(areGroups ? [SEEDS] : []),
     ...NUMBER_KEYS.map((key) => ({ key, ...NUMBERS[key] })).map(
       ({ key, title, help, hasUnit, format }) => ({
         key,
         title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
         help,
         number: true,
-        content: (/** @type {ExperimentRow} */ row) =>
-          `${format(row[key])}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`,
+        content: (/** @type {ExperimentRow | SeedGroup} */ row) => {
+          const spread = 'spread' in row ? row.spread[key] : undefined;
+          const more = spread === undefined ? '' : ` ± ${format(spread)}`;
+          return `${format(row[key])}${more}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`;
+        },
       }),
     ),
   ];

@@ -1,12 +1,14 @@
-/** Scatter plot of two quantities of the rows of a sweep, as SVG; each point selects its row. */
+/** Scatter plot of two quantities of the rows of a sweep, or curves over the level of faults, as SVG; each point selects its row. */
 
 /** @import { ExperimentRow } from '../types/server.js' */
+/** @import { SeedGroup } from './experiment_groups.js' */
 /** @import { NumberKey } from './experiment_rows.js' */
 
 import { scaled } from '../core/palette.js';
 import { fixed, significant } from '../core/units.js';
 import { extent, padded } from '../widgets/plots.js';
-import { NUMBERS, rowKey } from './experiment_rows.js';
+import { cellOf, faultLevel } from './experiment_groups.js';
+import { NUMBERS } from './experiment_rows.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
 const MARGIN = { left: scaled(44), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
@@ -15,17 +17,23 @@ const COLOURS = 6; // in experiments.css
 const RADIUS = scaled(4);
 const SMALLEST = scaled(80); // px
 
+/** @typedef {ExperimentRow | SeedGroup} Row */
+/**
+ * x, y: names of the quantities; x can be `levelName` of one of the kinds of faults, whose levels are joined by lines. filters: their
+ * order sets the colours. selected: cell of the selected row.
+ * @typedef {{x: string, y: string, kinds: string[], filters: string[], selected: string, select: (row: Row) => void}} Choices
+ */
+
 /**
  * @param {HTMLElement} host
- * @param {ExperimentRow[]} rows
- * @param {string} xKey
- * @param {string} yKey
- * @param {string[]} filters their order sets the colours
- * @param {string} selected key of the selected row
- * @param {(row: ExperimentRow) => void} select
+ * @param {Row[]} rows
+ * @param {Choices} choices
  */
-export function drawScatter(host, rows, xKey, yKey, filters, selected, select) {
-  const [x, y] = [axis(rows, xKey), axis(rows, yKey)];
+export function drawScatter(host, rows, choices) {
+  const { kinds, filters, selected, select } = choices;
+  const kind = kinds.find((name) => levelName(name) === choices.x);
+  const x = kind === undefined ? axis(rows, choices.x) : levelAxis(rows, kind);
+  const y = axis(rows, choices.y);
   const [width, height] = [host.clientWidth, host.clientHeight];
   host.replaceChildren();
   if (!rows.length || width < SMALLEST || height < SMALLEST) return;
@@ -40,43 +48,61 @@ export function drawScatter(host, rows, xKey, yKey, filters, selected, select) {
   );
   for (const value of x.ticks)
     svg.append(
-      node('line', {
-        class: 'grid',
-        x1: right(value),
-        x2: right(value),
-        y1: MARGIN.top,
-        y2: height - MARGIN.bottom,
-      }),
+      line('grid', right(value), MARGIN.top, right(value), height - MARGIN.bottom),
       text(fixed(value, x.decimals), right(value), height - MARGIN.bottom + scaled(13), 'middle'),
     );
   for (const value of y.ticks)
     svg.append(
-      node('line', {
-        class: 'grid',
-        x1: MARGIN.left,
-        x2: width - MARGIN.right,
-        y1: up(value),
-        y2: up(value),
-      }),
+      line('grid', MARGIN.left, up(value), width - MARGIN.right, up(value)),
       text(fixed(value, y.decimals), MARGIN.left - scaled(5), up(value) + scaled(4), 'end'),
     );
   svg.append(text(x.title, (MARGIN.left + width) / 2, height - scaled(4), 'middle'));
   const side = text(y.title, 0, 0, 'middle');
   side.setAttribute('transform', `translate(${scaled(10)} ${height / 2}) rotate(-90)`);
   svg.append(side);
-  for (const row of rows) {
-    const [a, b] = [row[x.key], row[y.key]];
-    if (a === null || b === null) continue;
-    const point = node('circle', { cx: right(a), cy: up(b), r: RADIUS, 'data-cell': rowKey(row) });
-    point.setAttribute('class', seriesOf(row, filters));
-    point.classList.toggle('here', rowKey(row) === selected);
+  const points = rows
+    .map((row) => ({ row, a: x.value(row), b: y.value(row), dx: x.spread(row), dy: y.spread(row) }))
+    .filter((point) => point.a !== null && point.b !== null)
+    .map((point) => ({ ...point, a: Number(point.a), b: Number(point.b) }));
+  if (kind !== undefined) {
+    for (const curve of curves(points)) {
+      const path = curve.map(({ a, b }) => `${right(a)},${up(b)}`).join(' ');
+      const series = seriesOf(curve[0].row, filters);
+      svg.append(node('polyline', { points: path, class: `curve ${series}` }));
+    }
+  }
+  for (const { row, a, b, dx, dy } of points) {
+    const series = seriesOf(row, filters);
+    if (dx) svg.append(line(`spread ${series}`, right(a - dx), up(b), right(a + dx), up(b)));
+    if (dy) svg.append(line(`spread ${series}`, right(a), up(b - dy), right(a), up(b + dy)));
+    const point = node('circle', { cx: right(a), cy: up(b), r: RADIUS, 'data-cell': cellOf(row) });
+    point.setAttribute('class', series);
+    point.classList.toggle('here', cellOf(row) === selected);
     const label = document.createElementNS(SVG, 'title');
-    label.textContent = `${row.name}${row.faults && `, ${row.faults}`}: ${significant(a)}, ${significant(b)}`;
+    const [spreadX, spreadY] = [dx, dy].map((spread) =>
+      spread ? ` ± ${significant(spread)}` : '',
+    );
+    label.textContent = `${row.name}${row.faults && `, ${row.faults}`}: ${significant(a)}${spreadX}, ${significant(b)}${spreadY}`;
     point.append(label);
     point.addEventListener('click', () => select(row));
     svg.append(point);
   }
   host.replaceChildren(svg);
+}
+
+/**
+ * Points of the same checkpoints and data over the levels of the faults.
+ * @template {{row: Row, a: number}} Point
+ * @param {Point[]} points
+ */
+function curves(points) {
+  /** @type {Map<string, Point[]>} */
+  const result = new Map();
+  for (const point of points) {
+    const key = cellOf({ ...point.row, faults: '' });
+    result.set(key, [...(result.get(key) ?? []), point]);
+  }
+  return [...result.values()].map((curve) => curve.sort((p, q) => p.a - q.a));
 }
 
 /**
@@ -87,24 +113,62 @@ export function drawScatter(host, rows, xKey, yKey, filters, selected, select) {
 export const seriesOf = ({ filter }, filters) => `series-${filters.indexOf(filter) % COLOURS}`;
 
 /**
- * Range, ticks and title of an axis.
- * @param {ExperimentRow[]} rows
+ * A quantity as an axis.
+ * @param {Row[]} rows
  * @param {string} name
  */
 function axis(rows, name) {
   const key = /** @type {NumberKey} */ (name in NUMBERS ? name : 'error');
-  const [low, high] = padded(extent(rows.map((row) => row[key])));
-  const step = niceStep((high - low) / TICKS);
-  const first = Math.ceil(low / step);
-  const count = Math.floor(high / step) - first + 1;
   const { title, hasUnit } = NUMBERS[key];
   const units = [...new Set(rows.map(({ unit }) => unit))];
   return {
-    key,
     title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
+    ...scale(
+      rows,
+      (row) => row[key],
+      (row) => ('spread' in row ? (row.spread[key] ?? 0) : 0),
+    ),
+  };
+}
+
+/**
+ * The level of a kind of faults as an axis.
+ * @param {Row[]} rows
+ * @param {string} kind
+ */
+const levelAxis = (rows, kind) => ({
+  title: `level of ${kind}`,
+  ...scale(
+    rows,
+    (row) => faultLevel(row, kind),
+    () => 0,
+  ),
+});
+
+/** Name of the level of a kind of faults as the x axis. @param {string} kind */
+export const levelName = (kind) => `level:${kind}`;
+
+/**
+ * Values, range and ticks of an axis.
+ * @param {Row[]} rows
+ * @param {(row: Row) => number | null} value
+ * @param {(row: Row) => number} spread standard deviation
+ */
+function scale(rows, value, spread) {
+  const ends = rows.flatMap((row) => {
+    const centre = value(row);
+    return centre === null ? [] : [centre - spread(row), centre + spread(row)];
+  });
+  const [low, high] = padded(extent(ends));
+  const step = niceStep((high - low) / TICKS);
+  const first = Math.ceil(low / step);
+  const count = Math.floor(high / step) - first + 1;
+  return {
+    value,
+    spread,
     ticks: Array.from({ length: count }, (_, i) => (first + i) * step),
     decimals: Math.max(0, -Math.floor(Math.log10(step))),
-    share: (/** @type {number} */ value) => (value - low) / (high - low),
+    share: (/** @type {number} */ point) => (point - low) / (high - low),
   };
 }
 
@@ -123,6 +187,15 @@ function node(name, attributes) {
   for (const [key, value] of Object.entries(attributes)) result.setAttribute(key, String(value));
   return result;
 }
+
+/**
+ * @param {string} className
+ * @param {number} x1
+ * @param {number} y1
+ * @param {number} x2
+ * @param {number} y2
+ */
+const line = (className, x1, y1, x2, y2) => node('line', { class: className, x1, y1, x2, y2 });
 
 /**
  * @param {string} content

@@ -443,7 +443,8 @@ export interface components {
          *
          *     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
          *     ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
-         *     timestamps. provenance: JSON of the file beside the checkpoint.
+         *     timestamps. training: JSON of the hash of its data, plan, blackouts, faults and the settings of a fine-tuning.
+         *     provenance: JSON of the file beside the checkpoint.
          */
         ExperimentRow: {
             /** Name */
@@ -478,6 +479,8 @@ export interface components {
             checkpoint: string;
             /** Data */
             data: string;
+            /** Training */
+            training: string;
             /** Provenance */
             provenance: string;
             /** Catalog Name */

@@ -1,0 +1,145 @@
+/** Groups of the rows of a sweep: mean and spread over training seeds, and the level of their sensor faults. */
+
+/** @import { ExperimentRow } from '../types/server.js' */
+/** @import { NumberKey } from './experiment_rows.js' */
+
+import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
+
+/**
+ * A row for several checkpoints: its numbers are means over them.
+ * @typedef {ExperimentRow & {members: ExperimentRow[], spread: Partial<Record<NumberKey, number>>}} SeedGroup
+ */
+
+/** The numbers whose spread over seeds is displayed. @type {NumberKey[]} */
+const SPREAD_KEYS = ['error', 'nees', 'coverage95', 'worst'];
+
+/**
+ * Joins the checkpoints that differ by their seed only: same filter, training and provenance apart from their keys `seed`.
+ * Numbers are means over the checkpoints, and `spread` their sample standard deviations.
+ * @param {ExperimentRow[]} rows
+ * @returns {SeedGroup[]}
+ */
+export function seedGroups(rows) {
+  /** @type {Map<string, ExperimentRow[]>} */
+  const groups = new Map();
+  for (const row of rows) {
+    const key = JSON.stringify([settingsOf(row), row.task, row.data, row.faults]);
+    groups.set(key, [...(groups.get(key) ?? []), row]);
+  }
+  const names = namesOf(rows);
+  return [...groups.values()].map((unsorted) => {
+    // The first checkpoint identifies the group, whatever the order of the rows.
+    const members = unsorted.sort((a, b) => a.checkpoint.localeCompare(b.checkpoint));
+    const [first] = members;
+    /** @type {Partial<Record<NumberKey, number | null>>} */
+    const means = {};
+    /** @type {Partial<Record<NumberKey, number>>} */
+    const spread = {};
+    for (const key of NUMBER_KEYS) {
+      const moments = meanAndSpread(members, key);
+      means[key] = moments.mean;
+      if (SPREAD_KEYS.includes(key) && members.length > 1) spread[key] = moments.spread;
+    }
+    const name = names.get(settingsOf(first)) ?? first.filter;
+    return { ...first, .../** @type {ExperimentRow} */ (means), name, spread, members };
+  });
+}
+
+/** Identifies a displayed row: a checkpoint, or a group by its first one. @param {ExperimentRow | SeedGroup} row */
+export const cellOf = (row) => `${'members' in row ? 'seeds.' : ''}${rowKey(row)}`;
+
+/**
+ * Kinds of the sensor faults that have levels: those of `blackout=0.4` and `blackout=0.8` are of the kind `blackout`.
+ * @param {ExperimentRow[]} rows
+ */
+export const faultKinds = (rows) =>
+  [...new Set(rows.map(({ faults }) => levelOf(faults)?.kind))].filter(
+    (kind) => kind !== undefined,
+  );
+
+/**
+ * Level of a row's sensor faults: 0.4 for `blackout=0.4`, 0 without faults; null for faults of another kind.
+ * @param {ExperimentRow} row
+ * @param {string} kind
+ */
+export function faultLevel({ faults }, kind) {
+  if (!faults) return 0;
+  const found = levelOf(faults);
+  return found?.kind === kind ? found.level : null;
+}
+
+/** Splits a single fault at its last number. @param {string} faults */
+function levelOf(faults) {
+  const [, kind, level] = faults.match(/^([^,]*?)=?(-?\d+(?:\.\d+)?)$/) ?? [];
+  return kind === undefined ? undefined : { kind, level: Number(level) };
+}
+
+/**
+ * Filter, and the settings of its training without the seed, as text.
+ * @param {ExperimentRow} row
+ */
+function settingsOf({ filter, training, provenance }) {
+  const { finetuned, plan, ...trained } = entriesOf(training);
+  const { seed: _, ...tuning } = finetuned ?? {};
+  // In the order of the names of groups, which mention the first differences.
+  const settings = [
+    ...Object.entries(entriesOf(provenance)).sort(),
+    ...(finetuned ? [['fine-tuning', tuning]] : []),
+    ...Object.entries(trained).sort(),
+    ...Object.entries(plan ?? {}).sort(),
+  ];
+  const isSet = (/** @type {any} */ value) => value !== null && value?.length !== 0;
+  return JSON.stringify([
+    filter,
+    settings.filter(([key, value]) => key !== 'seed' && isSet(value)),
+  ]);
+}
+
+/** @param {string} text JSON of an object @returns {Record<string, any>} */
+const entriesOf = (text) => JSON.parse(text || '{}');
+
+/**
+ * Names of the groups by their settings: the filter, and the values in which groups of the same filter differ.
+ * @param {ExperimentRow[]} rows
+ */
+function namesOf(rows) {
+  const settings = [...new Set(rows.map(settingsOf))].map(
+    (text) => /** @type {[string, [string, unknown][]]} */ (JSON.parse(text)),
+  );
+  return new Map(
+    settings.map(([filter, values]) => {
+      const others = settings.filter(([name]) => name === filter).map(([, pairs]) => pairs);
+      const differs = (/** @type {string} */ key) =>
+        new Set(others.map((pairs) => JSON.stringify(pairs.find(([name]) => name === key)))).size >
+        1;
+      const labels = values
+        .filter(([key]) => differs(key))
+        .map(labelOf)
+        .slice(0, MOST_LABELS);
+      return [JSON.stringify([filter, values]), [filter, ...labels].join(', ')];
+    }),
+  );
+}
+
+const MOST_LABELS = 3;
+const LONGEST_VALUE = 24; // characters of a setting in the name of a group
+
+/** @param {[string, unknown]} setting */
+function labelOf([key, value]) {
+  if (key === 'fine-tuning') return 'fine-tuned';
+  const text = typeof value === 'string' ? value : JSON.stringify(value);
+  return `${key} ${key === 'data' ? text.slice(0, 8) : text.slice(0, LONGEST_VALUE)}`;
+}
+
+/**
+ * Mean and sample standard deviation of the known values; null without any, spread 0 of a single one.
+ * @param {ExperimentRow[]} rows
+ * @param {NumberKey} key
+ */
+function meanAndSpread(rows, key) {
+  const values = rows.map((row) => row[key]).filter((value) => value !== null);
+  if (!values.length) return { mean: null, spread: 0 };
+  const mean = values.reduce((sum, value) => sum + value, 0) / values.length;
+  const squares = values.reduce((sum, value) => sum + (value - mean) ** 2, 0);
+  return { mean, spread: values.length > 1 ? Math.sqrt(squares / (values.length - 1)) : 0 };
+}
