@@ -53,7 +53,7 @@ def blueprint(
     scene = rrb.Vertical(
         _scene(trace, task),
         rrb.Horizontal(*observed) if observed else rrb.TextDocumentView(origin="about"),
-        row_shares=[3, 2] if len(observed) < 4 else [5, 2],
+        row_shares=[3, 2],
     )
     series = _time_series(trace, task, growing)
     if diagnostics:
@@ -139,7 +139,7 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     shares: list[float] = []
     if "contact" in task.covariates:
         rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=_linked()))
-        shares.append(1.2)
+        shares.append(2.2)  # title, axis and states have a fixed height
     titles = {"weights": "Beta", "effective_weights": "Effective weights"}
     # A legend would hide the lines of a low plot: the first title names the colors, if they have common names.
     named = set(trace.modalities) <= COLOR_NAMES.keys()

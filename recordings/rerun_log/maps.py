@@ -32,7 +32,7 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
                 yield f"maps/{layer}{path}", rr.LineStrips2D.from_fields(colors=hue, radii=rr.Radius.ui_points(1.2))
         return
     side = len(first.offsets_x)
-    pixels = rr.EncodedDepthImage.from_fields(media_type="image/png", colormap="Inferno", depth_range=[0.0, 255.0])
+    pixels = rr.EncodedDepthImage.from_fields(media_type="image/png", colormap="Viridis", depth_range=[0.0, 255.0])
     for layer in first.layers:
         yield f"maps/{layer}", pixels
         yield f"maps/{layer}/truth", _frame(colour("truth", trace.modalities), side / 18)
@@ -43,7 +43,7 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
     gray = rr.components.ImageFormat(width=len(cells), height=len(cells), channel_datatype="U8", color_model="L")
     yield (
         "world/plane/map",
-        rr.GridMap.from_fields(format=gray, cell_size=float(cells[1] - cells[0]), opacity=0.8, colormap="Inferno"),
+        rr.GridMap.from_fields(format=gray, cell_size=float(cells[1] - cells[0]), opacity=0.8, colormap="Viridis"),
     )
 
 
