@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,10 @@ import sensor_rigs
 from playwright.sync_api import Page, sync_playwright
 from served import serving
 
-from beliefscope.datasets.store import sample_path
+from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import shipped
+from beliefscope.inspect.sweep import Inputs
+from beliefscope.recordings.sweep_table import run_sweep
 
 SIZES = ("900x700", "1024x768", "1280x720", "1440x900", "1920x1080", "3840x2160")
 THEMES = ("light", "dark")
@@ -41,6 +44,8 @@ LINKS = {
     "comparison": "?task=door&filter=crossmodal-pf&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
     "no-weights": "?task=push&filter=feature-ekf",
     "no-study": "?task=push-field&tab=study",
+    "no-sweep": "?tab=experiments",
+    "experiments-curves": "?tab=experiments&rows=seeds&x=level%3Ablackout&y=error",
     "one-sensor": "?task=well&step=40",
     "three-sensors": "?task=cart&step=40",
     "six-sensors": "?task=submarine&step=40",
@@ -49,12 +54,12 @@ LINKS = {
     "live": "?data=live:go",
     "bad-link": "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp",
 }
-"""View -> address that opens it: the first visit, an injected fault on each task, a comparison run, a
-filter without weights, a task without a study, external filters of other tasks, one without a healthy record, a run in
-progress, and a selection that does not exist."""
+"""View -> address that opens it: the first visit, an injected fault on each task, a comparison run, a filter without
+weights, a task without a study, no sweep, a sweep as curves, external filters of other tasks, one without a healthy
+record, a run in progress, and a selection that does not exist."""
 
-FIRST_VISIT = ("first",)
-"""Views of a server without filters or data of the user: only this one has an introduction with examples."""
+FIRST_VISIT = ("first", "no-sweep")
+"""Views of a server without files of the user, which has an introduction with examples and no sweep."""
 
 PENDING = {
     "loading": lambda route: None,
@@ -141,7 +146,11 @@ VIEWS: dict[str, Callable[[Page], None]] = {
 USEFUL = "() => window.beliefscope?.stats.useful || document.querySelector('#finding').dataset.source === 'error'"
 """Condition: a run is displayed, or why there is none."""
 
-READY = {"comparison": state("#compare .result")}
+READY = {
+    "comparison": state("#compare .result"),
+    "no-sweep": "experiments.dataset.state === 'empty'",
+    "experiments-curves": state("#experiments"),
+}
 """View in ``LINKS`` -> further condition."""
 
 READ_ONLY_VIEWS = ("first", "diagnosis", "diagnostics", "finetune", "rerun", "recordings", "bad-link")
@@ -190,6 +199,15 @@ def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, wanted: C
             page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
             page.unroute("**/api/trace/**")
     page.close()
+
+
+def run_small_sweep(folder: Path) -> None:
+    """Filters of one task over a few episodes, with two levels of blackout and a force bias."""
+    paths = tuple(shipped("door", name) for name in ("crossmodal-ekf", "image-ekf", "haptics-ekf", "unimodal-ekf"))
+    faults = ("", "blackout=0.4", "blackout=0.8", "force_bias:x=8")
+    with open_dataset(sample_path("door")) as data:
+        episodes = tuple(data.held_out()[:6])
+    run_sweep([replace(cell, episodes=episodes) for cell in Inputs(paths, faults=faults).cells()], folder)
 
 
 @contextmanager
@@ -241,7 +259,16 @@ def main() -> None:
         filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(files) / f"{LONG}.safetensors")
         data = shutil.copy(sample_path("door"), Path(files) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
         workspace = Path(files) / "workspace"
-        options = ["--filter", str(filter_), "--data", str(data), *sensor_rigs.options(Path(files))]
+        run_small_sweep(sweep := Path(files) / "sweep-of-doors")
+        options = [
+            "--filter",
+            str(filter_),
+            "--data",
+            str(data),
+            *sensor_rigs.options(Path(files)),
+            "--sweep",
+            str(sweep),
+        ]
         with live_run(workspace), serving(*options, workspace=workspace) as server:
             shoot_all(server.url, lambda name: name not in FIRST_VISIT and (not args.view or name in args.view))
         if not args.view or set(FIRST_VISIT) & set(args.view):

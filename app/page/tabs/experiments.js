@@ -24,7 +24,7 @@ import {
   comparedWith,
 } from './experiment_rows.js';
 import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
-import { drawScatter, levelName, seriesOf } from './scatter.js';
+import { coloured, drawScatter, levelName } from './scatter.js';
 
 const EMPTY = {
   title: 'No sweep yet',
@@ -271,7 +271,7 @@ export class Experiments {
   #tableRow(row, columns) {
     const button = create('button', { type: 'button', className: 'quiet', textContent: row.name });
     button.title = `${row.name}: its worst episodes`;
-    const dot = create('span', { className: `dot ${seriesOf(row, this.#filters)}` });
+    const dot = coloured(create('span', { className: 'dot' }), row, this.#filters);
     const line = create('tr', {}, create('th', { scope: 'row' }, dot, button));
     line.dataset.cell = cellOf(row);
     line.addEventListener('click', () => this.#select(row)); // also clicks on the button, which serves the keyboard

@@ -6,6 +6,7 @@
 
 import { scaled } from '../core/palette.js';
 import { fixed, significant } from '../core/units.js';
+import { colourOf, estimatorOf } from '../widgets/filter_colours.js';
 import { extent, padded } from '../widgets/plots.js';
 import { cellOf, faultLevel } from './experiment_groups.js';
 import { NUMBERS } from './experiment_rows.js';
@@ -13,7 +14,6 @@ import { NUMBERS } from './experiment_rows.js';
 const SVG = 'http://www.w3.org/2000/svg';
 const MARGIN = { left: scaled(44), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
 const TICKS = 5;
-const COLOURS = 6; // in experiments.css
 const RADIUS = scaled(4);
 const SMALLEST = scaled(80); // px
 
@@ -67,16 +67,15 @@ export function drawScatter(host, rows, choices) {
   if (kind !== undefined) {
     for (const curve of curves(points)) {
       const path = curve.map(({ a, b }) => `${right(a)},${up(b)}`).join(' ');
-      const series = seriesOf(curve[0].row, filters);
-      svg.append(node('polyline', { points: path, class: `curve ${series}` }));
+      const stroke = node('polyline', { points: path, class: 'curve' });
+      svg.append(coloured(stroke, curve[0].row, filters));
     }
   }
   for (const { row, a, b, dx, dy } of points) {
-    const series = seriesOf(row, filters);
-    if (dx) svg.append(line(`spread ${series}`, right(a - dx), up(b), right(a + dx), up(b)));
-    if (dy) svg.append(line(`spread ${series}`, right(a), up(b - dy), right(a), up(b + dy)));
+    const mark = (/** @type {SVGElement} */ shape) => svg.append(coloured(shape, row, filters));
+    if (dx) mark(line('spread', right(a - dx), up(b), right(a + dx), up(b)));
+    if (dy) mark(line('spread', right(a), up(b - dy), right(a), up(b + dy)));
     const point = node('circle', { cx: right(a), cy: up(b), r: RADIUS, 'data-cell': cellOf(row) });
-    point.setAttribute('class', series);
     point.classList.toggle('here', cellOf(row) === selected);
     const label = document.createElementNS(SVG, 'title');
     const [spreadX, spreadY] = [dx, dy].map((spread) =>
@@ -85,7 +84,7 @@ export function drawScatter(host, rows, choices) {
     label.textContent = `${row.name}${row.faults && `, ${row.faults}`}: ${significant(a)}${spreadX}, ${significant(b)}${spreadY}`;
     point.append(label);
     point.addEventListener('click', () => select(row));
-    svg.append(point);
+    mark(point);
   }
   host.replaceChildren(svg);
 }
@@ -106,11 +105,18 @@ function curves(points) {
 }
 
 /**
- * Class of the points of a filter.
- * @param {ExperimentRow} row
+ * Gives a mark the colour of its row's filter; particle filters are hollow.
+ * @template {HTMLElement | SVGElement} Mark
+ * @param {Mark} mark
+ * @param {Row} row
  * @param {string[]} filters
+ * @returns {Mark}
  */
-export const seriesOf = ({ filter }, filters) => `series-${filters.indexOf(filter) % COLOURS}`;
+export function coloured(mark, { filter }, filters) {
+  mark.style.setProperty('--series', `var(${colourOf(filter, filters)})`);
+  mark.classList.toggle('hollow', estimatorOf(filter, ['pf']) !== '');
+  return mark;
+}
 
 /**
  * A quantity as an axis.

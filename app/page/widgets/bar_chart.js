@@ -2,21 +2,10 @@
 
 import { scaled } from '../core/palette.js';
 import { fixed } from '../core/units.js';
+import { colourOf, estimatorOf } from './filter_colours.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
-/**
- * Colour by fusion rule, texture by estimator, as in the paper's figure (recordings/rerun_log/figures.py).
- * @type {Record<string, string>}
- */
-const COLOURS = {
-  crossmodal: '--fused',
-  unimodal: '--spare-2',
-  feature: '--spare-1',
-  lstm: '--spare-0',
-  image: '--image',
-  haptics: '--haptics',
-};
-/** @type {Record<string, string>} */
+/** Texture by estimator. @type {Record<string, string>} */
 const TEXTURES = { pf: 'M-1 5 5-1M1 7 7 1', ukf: 'M1 2h2M4 5h2', lstm: 'M0 1.5h6M0 4.5h6' };
 const TEXTURE_SIZE = 6; // px
 const MARGIN = { left: scaled(34), right: scaled(6), top: scaled(16), bottom: scaled(22) }; // px
@@ -286,12 +275,7 @@ export function navigateLinks(host) {
 }
 
 /** @param {string} filter */
-const fusionRule = (filter) => filter.replace(/-?(ekf|ukf|pf)$/, '');
-/** @param {string} filter */
-const texture = (filter) =>
-  Object.keys(TEXTURES).find((kind) => `-${filter}`.endsWith(`-${kind}`)) ?? '';
-/** @param {string} filter */
-const colourOf = (filter) => COLOURS[fusionRule(filter)] ?? '--ink';
+const texture = (filter) => estimatorOf(filter, Object.keys(TEXTURES));
 
 /**
  * @param {string} filter
