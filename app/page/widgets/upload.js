@@ -10,6 +10,8 @@ export class Uploads {
   #host;
   #done;
   #last = Promise.resolve();
+  /** Names of uploads that have not ended. @type {Set<string>} */
+  #pending = new Set();
 
   /**
    * @param {HTMLElement} host a list
@@ -22,14 +24,16 @@ export class Uploads {
 
   /**
    * @param {File[]} files
-   * @param {Set<string>} names names in use, which the new ones are added to
+   * @param {Set<string>} names names in use
    * @param {number} limit bytes
    */
   add(files, names, limit) {
     for (const file of files) {
-      const name = unusedName(file.name, names);
-      names.add(name);
-      this.#last = this.#upload(file, name, limit, this.#last);
+      const name = unusedName(file.name, new Set([...names, ...this.#pending]));
+      this.#pending.add(name);
+      this.#last = this.#upload(file, name, limit, this.#last).finally(() =>
+        this.#pending.delete(name),
+      );
     }
   }
 
@@ -81,8 +85,8 @@ export class Uploads {
  * @param {string} name
  * @param {Set<string>} names names in use
  */
-function unusedName(name, names) {
-  const stem = name.replace(/\.rrd$/, '');
+export function unusedName(name, names) {
+  const stem = name.normalize('NFC').replace(/\.rrd$/i, ''); // the server stores normal form C
   let candidate = `${stem}.rrd`;
   for (let n = 2; names.has(candidate); n++) candidate = `${stem}-${n}.rrd`;
   return candidate;
@@ -111,6 +115,7 @@ function send(request, file, name, progress) {
         );
     });
     request.addEventListener('error', () => reject(new ServerError('the server does not respond')));
+    request.addEventListener('abort', () => reject(new ServerError('it was cancelled'))); // the next upload waits for this one
     request.send(file);
   });
 }
