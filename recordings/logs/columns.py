@@ -109,6 +109,8 @@ ABSENT = (None, "", "None")
 
 def _not_numbers(values: NDArray[Any]) -> str:
     """Why values (T, ...) are no numbers: the first text that is none, and its row."""
+    if values.dtype.kind == "c":
+        return "has complex values"
     for row, value in enumerate(values.reshape(len(values), -1)[:, 0]) if values.size else ():
         if value in ABSENT:
             continue

@@ -113,6 +113,8 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
     for name, array in estimate.items():
         if len(array) != rows:
             raise BadInput(f"{display_name(name)} has {len(array)} rows and the state {rows}")
+        if len(unknown := at[~np.isfinite(array[at]).reshape(len(at), -1).all(axis=1)]):
+            raise BadInput(f"{display_name(name)} has no finite value in row {unknown[0]}, episode {index}")
     values = {name: torch.from_numpy(array[at]) for name, array in estimate.items()}
     weights = mapping.estimate.get("weights", {})
     check_values(values, (len(at),), {"n": n}, source)
@@ -146,11 +148,14 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
         if covariance.shape[1] != n * n:
             raise BadInput(f"covariance of [estimate] has {covariance.shape[1]} numbers per row, expected {n * n}")
         values["estimate_covariance"] = covariance.reshape(-1, n, n) * factors * factors[:, None]
+        _check_not_negative(covariance[:, :: n + 1], "covariance of [estimate] has the variance")
     elif "std" in estimate:
         std = joined(columns, estimate["std"], "estimate")
         if std.shape[1] != n:
             raise BadInput(f"std of [estimate] has {std.shape[1]} columns, expected {n}: {_names(mapping)}")
-        values["estimate_covariance"] = np.square(std * factors)[:, :, None] * np.eye(n)
+        _check_not_negative(std, "std of [estimate] has the value")  # squares would hide a sign
+        with np.errstate(invalid="ignore"):  # infinite ones are reported with their row
+            values["estimate_covariance"] = np.square(std * factors)[:, :, None] * np.eye(n)
     if "particles" in estimate:
         values["particles"] = _particles(columns, estimate["particles"], n) * factors
         values["log_weights"] = np.full(values["particles"].shape[:2], -np.log(values["particles"].shape[1]))
@@ -159,6 +164,13 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
     if weights := estimate.get("weights"):
         values["weights"] = joined(columns, list(weights.values()), "weights")[:, :, None]
     return values
+
+
+def _check_not_negative(values: Array, what: str) -> None:
+    """Raise BadInput for the first row of (T, d) values with a negative one."""
+    if (negative := values < 0.0).any():
+        row = int(np.argwhere(negative)[0][0])
+        raise BadInput(f"{what} {values[negative][0]:g} in row {row}, expected zero or more")
 
 
 def _names(mapping: ColumnMap) -> str:
@@ -264,6 +276,9 @@ def _episodes(columns: Columns, mapping: ColumnMap, count: int) -> dict[str, NDA
         return {"0": np.arange(count)}
     if mapping.episode not in columns:
         column(columns, mapping.episode, "episode")  # raises the error with similar names
+    numbers = columns[mapping.episode]
+    if numbers.dtype.kind == "f" and len(unknown := np.flatnonzero(np.isnan(numbers))):
+        raise BadInput(f"the episode, column {mapping.episode!r}, has no value in row {unknown[0]}")
     names, first, inverse = np.unique(columns[mapping.episode], return_index=True, return_inverse=True)
     return {str(names[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.logs.arrays import Wanted
 
 
 def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     """All columns of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays."""
     if path.suffix.lower() == ".npz":
+        if not is_zipfile(path):  # NumPy would suggest to load the file as a pickle
+            raise BadInput(f"{path.name} is no complete NumPy archive, as written by np.savez")
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     from pyarrow import csv, parquet

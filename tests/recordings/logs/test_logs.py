@@ -294,10 +294,45 @@ def test_estimates_need_as_many_rows_as_the_state(tmp_path: Path) -> None:
         recorded_trace(columns, mapping, episodes, 0, "log")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("est_y", np.nan, "estimate mean has no finite value in row 6, episode 0"),
+        ("sd_x", np.inf, "estimate covariance has no finite value in row 6, episode 0"),
+        ("sd_x", -0.5, "std of .estimate. has the value -0.5 in row 6, expected zero or more"),
+        ("run", np.nan, "the episode, column 'run', has no value in row 6"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_row(tmp_path: Path, name: str, value: float, message: str) -> None:
+    columns = table() | {"run": np.tile([1.0, 0.0], 20)}
+    columns[name][6] = value
+    mapping = read_map(map_file(tmp_path))
+    with pytest.raises(BadInput, match=message):
+        recorded_trace(columns, mapping, read_log(columns, mapping, "log"), 0, "log")
+
+
+def test_negative_variances_are_refused(tmp_path: Path) -> None:
+    columns = {"x": np.arange(5.0), "y": np.arange(5.0), "P": np.tile(np.diag([1.0, -2.0]).ravel(), (5, 1))}
+    text = 'dt = 0.1\n[state]\nx = "x"\ny = "y"\n[estimate]\nmean = ["x", "y"]\ncovariance = "P"\n'
+    mapping = read_map(map_file(tmp_path, text))
+    with pytest.raises(BadInput, match="has the variance -2 in row 0"):
+        recorded_trace(columns, mapping, read_log(columns, mapping, "log"), 0, "log")
+
+
 def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", a=np.array([{"x": 1}], dtype=object))
     with pytest.raises(BadInput, match="cannot be read"):
         read_columns(tmp_path / "log.npz")
+
+
+def test_files_that_are_no_archives_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.npz"
+    for data in (b"", b"t,x", b"\x93NUMPY\x01\x00"):
+        path.write_bytes(data)
+        with pytest.raises(BadInput, match="is no complete NumPy archive"):
+            read_columns(path)
+    with pytest.raises(BadInput, match="column 'x' of state x has complex values, expected numbers"):
+        column({"x": np.ones(3, complex)}, "x", "state x")
 
 
 def test_a_published_ensemble_filter(tmp_path: Path) -> None:
