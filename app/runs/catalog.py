@@ -40,25 +40,30 @@ DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 class TaskCatalog:
     """Filters and data sets of one task by name. The included ones are loaded on first use.
 
-    paths: filter -> checkpoint file; external filters have none.
+    paths: filter -> checkpoint file; external filters have none. secondary: filters of the user that do not replace the
+    default filter: they are listed after it, and after the user's other filters.
     """
 
     task: Task
     user_filters: dict[str, Checkpoint] = field(default_factory=dict)
     user_data: dict[str, Dataset] = field(default_factory=dict)
     paths: dict[str, Path] = field(default_factory=dict)
+    secondary: set[str] = field(default_factory=set)
 
     @cached_property
     def filters(self) -> dict[str, Checkpoint]:
-        filters = dict(self.user_filters)
+        filters = {name: filter_ for name, filter_ in self.user_filters.items() if name not in self.secondary}
+        first = max(1, len(filters))
         for name in dict.fromkeys((*DEFAULT_FILTERS, *filters_of(self.task))):
-            if name not in filters:
+            if name not in self.user_filters:
                 with suppress(BadInput):  # no pretrained checkpoint ships
                     self.paths[name] = shipped(self.task, name)
                     filters[name] = _included(self.paths[name])
         for name, source in EXTERNAL.get(self.task.name, {}).items():
             filters.setdefault(name, _external(source, self.task))
-        return filters
+        listed = list(filters.items())
+        last = [(name, filter_) for name, filter_ in self.user_filters.items() if name in self.secondary]
+        return dict([*listed[:first], *last, *listed[first:]])
 
     @cached_property
     def data(self) -> dict[str, Dataset]:
@@ -69,8 +74,9 @@ class TaskCatalog:
         return data
 
     def add_filter(self, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
-        """Add a filter before all others, or after the user's other filters."""
+        """Add a filter as the default, or after the default and the user's other filters."""
         self.paths[name] = path
+        (self.secondary.discard if first else self.secondary.add)(name)
         others = {key: value for key, value in self.user_filters.items() if key != name}
         self.user_filters = {name: checkpoint, **others} if first else {**others, name: checkpoint}
         vars(self).pop("filters", None)
@@ -78,6 +84,7 @@ class TaskCatalog:
     def remove_filter(self, name: str) -> None:
         """Remove one of the user's filters, if it exists."""
         self.user_filters.pop(name, None)
+        self.secondary.discard(name)
         vars(self).pop("filters", None)
 
     def filter(self, name: str) -> Checkpoint:
@@ -143,12 +150,16 @@ _external = cache(load_external)
 
 
 def task_catalogs(
-    checkpoints: Mapping[str, Path | Checkpoint], data: Mapping[str, Path], tasks: Sequence[Task] = ()
+    checkpoints: Mapping[str, Path | Checkpoint],
+    data: Mapping[str, Path],
+    tasks: Sequence[Task] = (),
+    secondary: Collection[str] = (),
 ) -> tuple[dict[str, TaskCatalog], list[str]]:
     """Catalogs of all tasks, those with filters or data of the user first; and one line for each unusable input.
 
     checkpoints: displayed name -> checkpoint file, or a loaded filter. data: displayed name -> file or folder of
-    episodes. tasks: user-defined tasks, as for ``stored_task``.
+    episodes. tasks: user-defined tasks, as for ``stored_task``. secondary: the checkpoints that are not listed
+    first, and whose task is not either.
     """
     catalogs: dict[str, TaskCatalog] = {}
     problems: list[str] = []
@@ -157,6 +168,8 @@ def task_catalogs(
             checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source, tasks)
             catalog = _catalog_of(catalogs, checkpoint.task, name)
             catalog.user_filters[name] = checkpoint
+            if name in secondary:
+                catalog.secondary.add(name)
             if isinstance(source, Path):
                 catalog.paths[name] = source
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
@@ -177,7 +190,13 @@ def task_catalogs(
     for catalog in catalogs.values():
         if catalog.problem and (catalog.user_filters or catalog.user_data.keys() - displayed):
             problems.append(catalog.problem)
-    return catalogs | {name: TaskCatalog(task) for name, task in TASKS.items() if name not in catalogs}, problems
+    own = {
+        name: catalog
+        for name, catalog in catalogs.items()
+        if name not in TASKS or catalog.user_data or catalog.user_filters.keys() - catalog.secondary
+    }
+    included = {name: catalogs.get(name, TaskCatalog(task)) for name, task in TASKS.items()}
+    return own | {name: catalog for name, catalog in included.items() if name not in own}, problems
 
 
 def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, source: str) -> TaskCatalog:

@@ -8,6 +8,7 @@ from pydantic import TypeAdapter
 
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.app.workspace.json_files import read_record, write_record
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import load_checkpoint
@@ -17,7 +18,7 @@ FILE = "kept.json"
 
 @dataclass(frozen=True)
 class SavedFilter:
-    """A saved filter. path: its checkpoint file. default: whether it is listed first for its task."""
+    """A saved filter. path: its checkpoint file. default: whether it is the default filter of its task."""
 
     task: str
     name: str
@@ -40,7 +41,8 @@ def with_saved_filters(settings: Settings) -> Settings:
     filters = read_saved_filters(settings.workspace)
     first = {saved.name: Path(saved.path) for saved in filters if saved.default}
     last = {saved.name: Path(saved.path) for saved in filters if not saved.default}
-    return replace(settings, checkpoints={**first, **settings.checkpoints, **last}) if filters else settings
+    checkpoints, secondary = {**first, **settings.checkpoints, **last}, last.keys() - settings.checkpoints.keys()
+    return replace(settings, checkpoints=checkpoints, secondary=frozenset(secondary)) if filters else settings
 
 
 def save_filter(store: TraceStore, new: SavedFilter) -> None:
@@ -68,10 +70,18 @@ def _read(workspace: Path) -> list[SavedFilter]:
     """Raises BadInput for a list that cannot be read, such as a later version's, so that it is not overwritten."""
     path = workspace / FILE
     try:
-        return [saved for saved in read_record(RECORDS, path) if Path(saved.path).is_file()]
+        saved = [_located(saved, workspace) for saved in read_record(RECORDS, path)]
+        return [filter_ for filter_ in saved if Path(filter_.path).is_file()]
     except FileNotFoundError:
         return []
     except (OSError, ValueError, TypeError):
         raise BadInput(
             f"{str(path)!r} is damaged or was written by another version: move it away to start a new list"
         ) from None
+
+
+def _located(saved: SavedFilter, workspace: Path) -> SavedFilter:
+    """With the path of the run in this workspace: the stored one may be relative, or of a place it was moved from."""
+    path = Path(saved.path)
+    own = FineTuneRuns(workspace).folder(path.parent.name) / path.name
+    return replace(saved, path=str(own)) if own.is_file() else saved

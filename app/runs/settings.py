@@ -23,6 +23,7 @@ class Settings:
         data: displayed name -> file or folder of episodes, listed before the sample sets.
         checkpoints: displayed name -> checkpoint file or external filter; listed before the pretrained filters, of
             which it replaces those with the same name.
+        secondary: names of checkpoints that are listed after the default filter of their task.
         hosts: additional host names that the server answers to.
         views: maximum number of pages open at a time.
         tasks: user-defined tasks, as accepted by ``load_task``.
@@ -39,6 +40,7 @@ class Settings:
     tasks: tuple[str, ...] = ()
     studies: Mapping[str, Path] = field(default_factory=dict)
     sweeps: Mapping[str, Path] = field(default_factory=dict)
+    secondary: frozenset[str] = frozenset()
 
     @property
     def definitions(self) -> list[Task]:

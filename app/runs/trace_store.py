@@ -61,7 +61,8 @@ class TraceStore:
 
     @cached_property
     def _catalogs(self) -> tuple[dict[str, TaskCatalog], list[str]]:
-        return task_catalogs(self.settings.checkpoints, self.settings.data, self.settings.definitions)
+        settings = self.settings
+        return task_catalogs(settings.checkpoints, settings.data, settings.definitions, settings.secondary)
 
     def problems(self) -> list[str]:
         """One line for each filter or data set of the settings that cannot be used."""

@@ -1,0 +1,53 @@
+"""Saved filters of a workspace: order in the catalog, and moved workspaces."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, save_filter, with_saved_filters
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.datasets.simulation.push import PUSH
+from beliefscope.filters.checkpoint import shipped
+
+pytestmark = pytest.mark.slow
+
+
+def saved(workspace: Path, default: bool) -> SavedFilter:
+    """A copy of a shipped filter as the result of a run."""
+    path = workspace / "finetune" / "0123" / "finetuned.safetensors"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(shipped(PUSH, "crossmodal-ekf"), path)
+    return SavedFilter("push", "tuned", str(path), default)
+
+
+def names(settings: Settings) -> list[str]:
+    return [*TraceStore(settings).filters("push")]
+
+
+def test_a_saved_filter_is_listed_after_the_default_one(tmp_path: Path) -> None:
+    settings = Settings(tmp_path)
+    before, store = names(settings), TraceStore(settings)
+    save_filter(store, saved(tmp_path, default=False))
+    expected = [before[0], "tuned", *before[1:]]
+    assert [*store.filters("push")] == names(with_saved_filters(settings)) == expected
+    assert TraceStore(with_saved_filters(settings)).tasks() == TraceStore(settings).tasks()
+    save_filter(store, saved(tmp_path, default=True))
+    assert [*store.filters("push")] == names(with_saved_filters(settings)) == ["tuned", *before]
+    save_filter(store, saved(tmp_path, default=False))
+    assert [*store.filters("push")] == names(with_saved_filters(settings)) == expected
+
+
+def test_a_workspace_may_be_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one that was given as a relative path, as `serve` does by default."""
+    monkeypatch.chdir(tmp_path)
+    before = Path("before")
+    save_filter(TraceStore(Settings(before)), saved(before, default=True))
+    before.rename("after")
+    monkeypatch.chdir("after")
+    assert names(with_saved_filters(Settings(tmp_path / "after")))[0] == "tuned"
+    (record,) = read_saved_filters(tmp_path / "after")
+    assert Path(record.path) == tmp_path / "after" / "finetune" / "0123" / "finetuned.safetensors"
