@@ -67,8 +67,17 @@ def _context(function: Callable[..., object]) -> BaseContext:
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
+    from multiprocessing import forkserver, resource_tracker  # not on Windows
+
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(sorted(_modules(function)))
+    # Ctrl-C is for this process, which stops the others: it must not interrupt their imports with a traceback.
+    resource_tracker.ensure_running()  # unblocks the signal
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     return context
 
 

@@ -329,6 +329,21 @@ def test_a_signal_prints_one_line_and_exits_with_the_code_of_the_shell(
     assert (last, process.returncode) == (line, code)
 
 
+def test_ctrl_c_during_the_imports_prints_one_line() -> None:
+    program = """
+import sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+from beliefscope.__main__ import main
+main()
+"""
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stdout, process.stderr) == (130, "", "error: interrupted\n")
+
+
 def test_unexpected_errors_exit_with_1_and_a_traceback_on_request(
     run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

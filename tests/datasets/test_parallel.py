@@ -34,6 +34,17 @@ def process_of(number: int) -> int:
     return os.getpid()
 
 
+def blocked_signals(number: int) -> set[int]:
+    return signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_ctrl_c_does_not_interrupt_the_imports_of_the_processes() -> None:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    ((_, blocked),) = run_in_processes(blocked_signals, [0], workers=1)
+    assert signal.SIGINT in blocked
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
+
+
 def test_items_of_killed_processes_run_again(tmp_path: Path) -> None:
     results = list(run_in_processes(partial(square_once_killed, tmp_path), range(9), workers=2))
     assert sorted(results) == [(i, i**2) for i in range(9)]
