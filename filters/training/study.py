@@ -238,8 +238,10 @@ def run_cell(cell: Cell, folder: Path, report: Report | None = None, wait: bool 
 
 
 def _failure(cell: Cell, error: Exception) -> Document:
-    message = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    return cell.inputs() | {"error": message, "traceback": "".join(traceback.format_exception(error))}
+    is_input, text = isinstance(error, BadInput), " ".join(str(error).split())
+    message = text if is_input else f"{type(error).__name__}: {text}"
+    trace = "".join(traceback.format_exception(error))
+    return cell.inputs() | {"error": message, "invalid_input": is_input, "traceback": trace}
 
 
 def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:

@@ -62,6 +62,7 @@ def study(
     cells = study_cells(preset, tasks or [], filters or [], seeds, files, skip_bad, console.note)
     folder = output.resolve()
     folder.mkdir(exist_ok=True)
+    invalid: set[str] = set()
     finished = [cell for cell in cells if cell.finished(folder) is not None]
     remaining, done, total = [cell for cell in cells if cell not in finished], len(finished), len(cells)
     with console.bars() as update:
@@ -79,10 +80,13 @@ def study(
             update("Cells", done / total, f"{done} of {total}: {cell}")
             if "error" in document:
                 console.note(f"failed: {cell}: {document['error']}")
+                if document.get("invalid_input"):
+                    invalid.add(str(cell))
             rows, overview = write_study(folder, cells, preset)
     failed = {name: state for name, state in overview["cells"].items() if state != "finished"}
     title = f"{folder / 'table.md'}: {total - len(failed)} of {total} cells finished"
     for name, state in list(failed.items())[:1]:
         console.note(f"error: {len(failed)} of {total} cells failed; the first: {name}: {state}")
     document = overview | {"path": str(output)}
-    return console.Result(document, f"{title}\n\n{to_markdown(rows)}", code=min(1, len(failed)))
+    code = 0 if not failed else 2 if failed.keys() <= invalid else 1
+    return console.Result(document, f"{title}\n\n{to_markdown(rows)}", code=code)

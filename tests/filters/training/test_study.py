@@ -19,6 +19,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -275,7 +276,7 @@ def test_failed_cell_is_reported_and_the_others_run(
     obstacle = tmp_path / "study" / "cells" / "door" / "lstm" / "seed0.safetensors"
     obstacle.unlink()
     obstacle.mkdir()
-    assert run(arguments(data, tmp_path / "study")) == 1
+    assert run(arguments(data, tmp_path / "study")) == 2
     out, err = capsys.readouterr()
     assert "error: 1 of 4 cells failed; the first: door/lstm/seed0: " in err
     assert "3 of 4 cells finished" in out
@@ -286,6 +287,17 @@ def test_failed_cell_is_reported_and_the_others_run(
     # Only the failed cell runs again.
     obstacle.rmdir()
     assert run(arguments(data, tmp_path / "study")) == 0
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_unusable_data_is_invalid_input(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = shutil.copy(data, tmp_path / "nan.h5")
+    with h5py.File(damaged, "r+") as file:
+        states = file["trajectory0/states"]
+        states[...] = states[()] * np.nan
+    options = f"--task door --filter lstm --data door={damaged} --preset smoke --seeds 1"
+    assert run(["study", *options.split(), "-o", str(tmp_path / "study")]) == 2
+    assert "first: door/lstm/seed0: " + str(damaged) in capsys.readouterr().err
 
 
 def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -> None:
