@@ -54,7 +54,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
             def on_step(step: int, steps: int, loss: float) -> None:
                 log.add_step(step, loss)
-                report(share("training", step / steps), f"step {step} of {steps}, loss {loss:.3g}; {log.errors}")
+                message = f"training step {step} of {steps}, loss {loss:.3g}; {log.errors}"
+                report(share("training", step / steps), message)
 
             result = finetune(
                 base,
