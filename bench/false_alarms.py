@@ -86,7 +86,7 @@ def planted(checkpoint: Checkpoint, fault: str) -> Checkpoint | None:
             return replace(evidence, noise=evidence.noise / 3.0)
 
         filter_.encode = confident
-    return replace(checkpoint, filter=filter_)
+    return checkpoint.with_filter(filter_)
 
 
 def statistics(path: Path, folder: Path) -> dict[str, Rows]:

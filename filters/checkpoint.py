@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,10 @@ class Checkpoint:
     def kind(self) -> Kind:
         return self.filter.architecture.kind
 
+    def with_filter(self, filter_: Filter) -> Checkpoint:
+        """The same checkpoint with another filter."""
+        return Checkpoint(filter_, self.name, self.hash, self.record, self.healthy_profile)
+
     def check_task(self, episode: Episode) -> None:
         """Raise BadInput for an episode of another task, or of one with the same name and other arrays."""
         if other := difference(self.task, episode.task):
@@ -90,6 +95,33 @@ def save_checkpoint(
     return hashlib.sha256(data).hexdigest()
 
 
+class DeferredCheckpoint(Checkpoint):
+    """A checkpoint whose networks are read when ``filter`` is first used; until then only its header was checked."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises BadInput like ``load_checkpoint``, except for damaged tensors."""
+        header, _ = _read(path, with_tensors=False)
+        architecture = _architecture(header)
+        values = _description(path, header) | {"_path": path, "_architecture": architecture}
+        for key, value in values.items():
+            object.__setattr__(self, key, value)  # a checkpoint is frozen
+
+    _path: Path
+    _architecture: Architecture
+
+    @cached_property
+    def filter(self) -> Filter:
+        return load_checkpoint(self._path).filter
+
+    @property
+    def task(self) -> Task:
+        return self._architecture.task
+
+    @property
+    def kind(self) -> Kind:
+        return self._architecture.kind
+
+
 def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
     """Reads a checkpoint. Raises BadInput if it is missing, damaged, or not a checkpoint of this package.
 
@@ -97,17 +129,8 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
         given: user-defined tasks, as for ``stored_task``.
     """
     path = Path(path)
-    if not path.is_file():
-        raise BadInput(f"checkpoint {str(path)!r} does not exist")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise BadInput(f"{str(path)!r} is not a readable safetensors file: {reason_unreadable(path, error)}") from None
-    header = _header(path, metadata)
-    task = stored_task(header.get("task", header["architecture"].get("task")), given)
-    architecture = Architecture.from_json(header["architecture"], task)
+    header, tensors = _read(path)
+    architecture = _architecture(header, given)
     with torch.device("meta"), _Uninitialised():  # allocates no memory, whatever the header's sizes
         filter_ = build(architecture)
     empty = filter_.state_dict()
@@ -125,13 +148,36 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
     # Copies: the tensors may be views of the file.
     filter_.load_state_dict({key: value.to(empty[key].dtype, copy=True) for key, value in tensors.items()}, assign=True)
     filter_.eval().requires_grad_(False)
-    return Checkpoint(
-        filter_,
-        header["name"],
-        hashlib.sha256(path.read_bytes()).hexdigest(),
-        training_record(header["record"]),
-        header.get("healthy_profile"),
-    )
+    return Checkpoint(filter_, **_description(path, header))
+
+
+def _read(path: Path, with_tensors: bool = True) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Header and tensors of a file."""
+    if not path.is_file():
+        raise BadInput(f"checkpoint {str(path)!r} does not exist")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            names = file.keys() if with_tensors else ()
+            tensors = {key: file.get_tensor(key) for key in names}
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+        raise BadInput(f"{str(path)!r} is not a readable safetensors file: {reason_unreadable(path, error)}") from None
+    return _header(path, metadata), tensors
+
+
+def _architecture(header: Mapping[str, Any], given: Iterable[Task] = ()) -> Architecture:
+    task = stored_task(header.get("task", header["architecture"].get("task")), given)
+    return Architecture.from_json(header["architecture"], task)
+
+
+def _description(path: Path, header: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes of a checkpoint other than its filter."""
+    return {
+        "name": header["name"],
+        "hash": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "record": training_record(header["record"]),
+        "healthy_profile": header.get("healthy_profile"),
+    }
 
 
 def _is_finite(value: torch.Tensor) -> bool:

@@ -19,7 +19,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, DeferredCheckpoint, load_checkpoint, shipped
 from beliefscope.filters.external.load import load_external
 from beliefscope.filters.names import is_path
 
@@ -144,7 +144,7 @@ class TaskCatalog:
 
 
 # Included files do not change: the catalogs of a process share them.
-_included = cache(load_checkpoint)
+_included = cache(DeferredCheckpoint)
 _sample = cache(open_dataset)
 _external = cache(load_external)
 

@@ -66,7 +66,7 @@ def _copy(checkpoint: Checkpoint) -> Filter:
 
 
 def _with_filter(setting: Setting, filter_: Filter) -> Setting:
-    return replace(setting, checkpoint=replace(setting.checkpoint, filter=filter_))
+    return replace(setting, checkpoint=setting.checkpoint.with_filter(filter_))
 
 
 def _with_evidence(setting: Setting, change: Callable[[Evidence], Evidence]) -> Setting:

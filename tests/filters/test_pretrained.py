@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
+from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, DeferredCheckpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.trace import trace
 
@@ -87,3 +90,22 @@ def test_blackout_reduces_the_weight_of_the_image(checkpoint: Checkpoint, held_o
     blackout = ~images.any(axis=(1, 2))
     image = traces[0].modalities.index("image")
     assert beta[blackout, image].mean() < beta[~blackout, image].mean()
+
+
+def test_a_deferred_checkpoint_equals_the_loaded_one() -> None:
+    path = shipped("door", "crossmodal-ekf")
+    deferred, loaded = DeferredCheckpoint(path), load_checkpoint(path)
+    for name in ("name", "hash", "record", "healthy_profile", "task", "kind"):
+        assert getattr(deferred, name) == getattr(loaded, name), name
+    assert "filter" not in vars(deferred)  # the networks were not read
+    expected = loaded.filter.state_dict()
+    assert deferred.filter.state_dict().keys() == expected.keys()
+    assert all(torch.equal(value, expected[key]) for key, value in deferred.filter.state_dict().items())
+    assert deferred.filter is deferred.filter
+
+
+def test_a_deferred_checkpoint_checks_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "damaged.safetensors"
+    path.write_bytes(shipped("door", "crossmodal-ekf").read_bytes()[:1000])
+    with pytest.raises(BadInput, match="not a readable safetensors file"):
+        DeferredCheckpoint(path)
