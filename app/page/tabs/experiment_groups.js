@@ -24,7 +24,7 @@ export function seedGroups(rows) {
   const groups = new Map();
   for (const row of rows) {
     const key = JSON.stringify([settingsOf(row), row.task, row.data, row.faults]);
-    groups.set(key, [...(groups.get(key) ?? []), row]);
+    if (!groups.get(key)?.push(row)) groups.set(key, [row]);
   }
   const names = namesOf(rows);
   return [...groups.values()].map((unsorted) => {
@@ -103,20 +103,32 @@ const entriesOf = (text) => JSON.parse(text || '{}');
  * @param {ExperimentRow[]} rows
  */
 function namesOf(rows) {
-  const settings = [...new Set(rows.map(settingsOf))].map(
-    (text) => /** @type {[string, [string, unknown][]]} */ (JSON.parse(text)),
+  const all = new Map(
+    rows.map((row) => {
+      const text = settingsOf(row);
+      return [text, /** @type {[string, [string, unknown][]]} */ (JSON.parse(text))];
+    }),
   );
+  /** Values by filter and key. @type {Map<string, Set<string>>} */
+  const values = new Map();
+  /** Number of settings by filter, and by filter and key. @type {Map<string, number>} */
+  const counts = new Map();
+  const count = (/** @type {string} */ name) => counts.set(name, (counts.get(name) ?? 0) + 1);
+  for (const [filter, settings] of all.values()) {
+    count(filter);
+    for (const [key, value] of settings) {
+      const place = `${filter} ${key}`;
+      count(place);
+      values.set(place, (values.get(place) ?? new Set()).add(JSON.stringify(value)));
+    }
+  }
+  const differs = (/** @type {string} */ filter, /** @type {string} */ key) =>
+    Number(values.get(`${filter} ${key}`)?.size) > 1 ||
+    counts.get(`${filter} ${key}`) !== counts.get(filter);
   return new Map(
-    settings.map(([filter, values]) => {
-      const others = settings.filter(([name]) => name === filter).map(([, pairs]) => pairs);
-      const differs = (/** @type {string} */ key) =>
-        new Set(others.map((pairs) => JSON.stringify(pairs.find(([name]) => name === key)))).size >
-        1;
-      const labels = values
-        .filter(([key]) => differs(key))
-        .map(labelOf)
-        .slice(0, MOST_LABELS);
-      return [JSON.stringify([filter, values]), [filter, ...labels].join(', ')];
+    [...all].map(([text, [filter, settings]]) => {
+      const labels = settings.filter(([key]) => differs(filter, key)).map(labelOf);
+      return [text, [filter, ...labels.slice(0, MOST_LABELS)].join(', ')];
     }),
   );
 }
