@@ -14,7 +14,6 @@ from beliefscope.app.protocol.messages import SceneLayers
 from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies
 from beliefscope.datasets.task import Task, display_name
-from beliefscope.inspect.figures.floor_shadow import FloorShadow
 from beliefscope.inspect.figures.force_arrow import MAX_RINGS, DrawnForce
 from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
 from beliefscope.inspect.figures.scene_shapes import (
@@ -41,15 +40,13 @@ TRANSLUCENT_GRAY = 150  # minimum of each color channel; darker surfaces would v
 
 GRAY = (125, 125, 125)
 _TICKS = np.arange(-1.0, 1.01, 0.25)
-FLOOR_CENTRE = (0.4, 0.0)  # m
-SHADOW_HEIGHT = 0.0015  # m above the floor, below the map
 FLOOR_LINES = np.array(
     [[(-1.0, a, 0.0), (1.0, a, 0.0)] for a in _TICKS] + [[(a, -1.0, 0.0), (a, 1.0, 0.0)] for a in _TICKS], np.float32
 )
 
 
 def set_png(handle: Any, prop: str, pixels: NDArray[np.uint8]) -> None:
-    """Set the image of a viser handle to (H, W) gray, (H, W, 2) gray and opaque, or (H, W, 3) pixels.
+    """Set the image of a viser handle to (H, W) gray or (H, W, 3) pixels.
 
     Sets the private property behind viser's ``image``, whose setter takes five times as long and accepts no gray
     images.
@@ -196,27 +193,13 @@ class RobotScene:
             if movable[part.body]:
                 self._movable.append((mesh, part))
         server.scene.add_line_segments(
-            "/floor", FLOOR_LINES, GRAY, thickness=1.0, thickness_units="screen", position=(*FLOOR_CENTRE, 0.0)
+            "/floor", FLOOR_LINES, GRAY, thickness=1.0, thickness_units="screen", position=(0.4, 0.0, 0.0)
         )
-        self._shadow = FloorShadow(parts, FLOOR_CENTRE, side=float(np.ptp(_TICKS))) if parts else None
-        if self._shadow is not None:
-            self._shadow_image: Any = server.scene.add_image(
-                "/bodies/shadow",
-                np.zeros((1, 1, 3), np.uint8),
-                self._shadow.side,
-                self._shadow.side,
-                format="png",
-                receive_shadow=False,
-                position=(*FLOOR_CENTRE, SHADOW_HEIGHT),
-            )
 
     def move(self, positions: Array, rotations: Array) -> None:
         """Move all bodies: (B, 3) m and (B, 3, 3), one step of ``Replay``."""
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = positions[body], SO3.from_matrix(rotations[body]).wxyz
-        if self._shadow is not None:
-            opacity = np.round(255.0 * self._shadow.opacity(positions, rotations)).astype(np.uint8)
-            set_png(self._shadow_image, "_data", np.stack([np.zeros_like(opacity), opacity], axis=-1))
 
     def set_translucent(self, translucent: bool) -> None:
         """Make the hand and the objects translucent, or as opaque as in the model."""
