@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-EXAMPLES = 6
+EXAMPLES = 5
 
 VISIBLE = """(selectors) => selectors.filter((selector) => {
   const { left, top, right, bottom } = document.querySelector(selector).getBoundingClientRect();
