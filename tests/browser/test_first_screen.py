@@ -88,6 +88,12 @@ def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
     before = size("#timeline")["height"]
     page.page.keyboard.press("Shift+ArrowUp")
     assert abs(size("#timeline")["height"] - before - 72) < 3
+    chosen = size("#timeline")["height"]
+    page.page.keyboard.press("2")  # Rerun, whose smaller timeline yields to the chosen height
+    page.until("() => beliefscope.state().tab === 'rerun'")
+    assert size("#timeline")["height"] == chosen
+    page.page.keyboard.press("1")
+    page.until("() => beliefscope.state().tab === 'scene'")
     second = open_page("?step=20", size=(1280, 720))
     assert second.page.locator("#maps").bounding_box()["width"] == narrower, "sizes are not remembered"
 
