@@ -111,7 +111,7 @@ class DeferredCheckpoint(Checkpoint):
 
     @cached_property
     def filter(self) -> Filter:
-        return load_checkpoint(self._path).filter
+        return _filter(self._path, _read(self._path)[1], self._architecture)
 
     @property
     def task(self) -> Task:
@@ -130,7 +130,12 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
     """
     path = Path(path)
     header, tensors = _read(path)
-    architecture = _architecture(header, given)
+    filter_ = _filter(path, tensors, _architecture(header, given))
+    return Checkpoint(filter_, **_description(path, header))
+
+
+def _filter(path: Path, tensors: Mapping[str, torch.Tensor], architecture: Architecture) -> Filter:
+    """The filter of a file. Raises BadInput for tensors of other shapes or with values that are not finite."""
     with torch.device("meta"), _Uninitialised():  # allocates no memory, whatever the header's sizes
         filter_ = build(architecture)
     empty = filter_.state_dict()
@@ -147,8 +152,7 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
             raise BadInput(f"{str(path)!r}: tensor {key!r} contains values that are not finite numbers ({value.dtype})")
     # Copies: the tensors may be views of the file.
     filter_.load_state_dict({key: value.to(empty[key].dtype, copy=True) for key, value in tensors.items()}, assign=True)
-    filter_.eval().requires_grad_(False)
-    return Checkpoint(filter_, **_description(path, header))
+    return filter_.eval().requires_grad_(False)
 
 
 def _read(path: Path, with_tensors: bool = True) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

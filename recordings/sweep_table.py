@@ -170,6 +170,9 @@ OVERVIEW = {
 }
 """Column of the overview -> its expression."""
 
+DOCUMENTS = ["training", "provenance"]
+"""Columns of the overview with JSON documents, which a table for reading leaves out."""
+
 _OVERVIEW_QUERY = (
     f"SELECT {', '.join(f'{expression} AS {name}' for name, expression in OVERVIEW.items())} "
     f"FROM {RESULTS} r JOIN (SELECT DISTINCT ON (checkpoint) * FROM {CHECKPOINTS}) c USING (checkpoint) "

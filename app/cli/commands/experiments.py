@@ -26,7 +26,7 @@ def experiments(
       beliefscope experiments sweep --sql "SELECT phase, avg(coverage95) FROM results GROUP BY phase"
       beliefscope experiments sweep-a sweep-b -o all.csv
     """
-    from beliefscope.recordings.sweep_table import Experiments, write_rows
+    from beliefscope.recordings.sweep_table import DOCUMENTS, Experiments, write_rows
 
     tables = Experiments(sweeps)
     rows = tables.query(sql) if sql else tables.overview(phase, sort)
@@ -39,5 +39,5 @@ def experiments(
     document = {"rows": shown.to_pylist(), "count": len(rows)}
     if sql:
         return console.Result(document, console.arrow("Results", shown) + more, output)
-    text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(["training", "provenance"]))
+    text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(DOCUMENTS))
     return console.Result(document, text + more, output)

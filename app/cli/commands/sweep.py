@@ -38,7 +38,7 @@ def sweep(
       beliefscope sweep --checkpoints '/lab/**/*.safetensors' --data /lab/door.h5 --engine ray -o /lab/sweep
     """
     from beliefscope.inspect.sweep import Inputs, find_checkpoints
-    from beliefscope.recordings.sweep_table import Experiments, run_sweep
+    from beliefscope.recordings.sweep_table import DOCUMENTS, Experiments, run_sweep
 
     opt.check_folder(output, "output")
     inputs = Inputs(
@@ -66,6 +66,6 @@ def sweep(
     document |= {"overview": overview.to_pylist()}
     return console.Result(
         document,
-        console.arrow("Checkpoints", overview.drop_columns(["training", "provenance"])),
+        console.arrow("Checkpoints", overview.drop_columns(DOCUMENTS)),
         output / "results.parquet",
     )

@@ -59,3 +59,20 @@ export const messageOf = (error) => (error instanceof Error ? error.message : St
  * @param {unknown} error
  */
 export const isAbort = (error) => error instanceof Error && error.name === 'AbortError';
+
+const SVG = 'http://www.w3.org/2000/svg';
+
+/**
+ * @template {keyof SVGElementTagNameMap} K
+ * @param {K} tag
+ * @param {Record<string, string | number>} attributes
+ * @param {...(Node | string)} children
+ * @returns {SVGElementTagNameMap[K]}
+ */
+export function svgElement(tag, attributes, ...children) {
+  const node = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes))
+    node.setAttribute(name, typeof value === 'number' ? String(Number(value.toFixed(2))) : value);
+  node.append(...children);
+  return node;
+}

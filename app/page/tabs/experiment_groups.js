@@ -22,11 +22,12 @@ const SPREAD_KEYS = ['error', 'nees', 'coverage95', 'worst'];
 export function seedGroups(rows) {
   /** @type {Map<string, ExperimentRow[]>} */
   const groups = new Map();
-  for (const row of rows) {
-    const key = JSON.stringify([settingsOf(row), row.task, row.data, row.faults]);
+  const settings = new Map(rows.map((row) => [row, settingsOf(row)]));
+  for (const [row, text] of settings) {
+    const key = JSON.stringify([text, row.task, row.data, row.faults]);
     if (!groups.get(key)?.push(row)) groups.set(key, [row]);
   }
-  const names = namesOf(rows);
+  const names = namesOf([...settings.values()]);
   return [...groups.values()].map((unsorted) => {
     // The first checkpoint identifies the group, whatever the order of the rows.
     const members = unsorted.sort((a, b) => a.checkpoint.localeCompare(b.checkpoint));
@@ -40,7 +41,7 @@ export function seedGroups(rows) {
       means[key] = moments.mean;
       if (SPREAD_KEYS.includes(key) && members.length > 1) spread[key] = moments.spread;
     }
-    const name = names.get(settingsOf(first)) ?? first.filter;
+    const name = names.get(settings.get(first) ?? '') ?? first.filter;
     return { ...first, .../** @type {ExperimentRow} */ (means), name, spread, members };
   });
 }
@@ -100,14 +101,14 @@ const entriesOf = (text) => JSON.parse(text || '{}');
 
 /**
  * Names of the groups by their settings: the filter, and the values in which groups of the same filter differ.
- * @param {ExperimentRow[]} rows
+ * @param {string[]} texts of the settings
  */
-function namesOf(rows) {
+function namesOf(texts) {
   const all = new Map(
-    rows.map((row) => {
-      const text = settingsOf(row);
-      return [text, /** @type {[string, [string, unknown][]]} */ (JSON.parse(text))];
-    }),
+    [...new Set(texts)].map((text) => [
+      text,
+      /** @type {[string, [string, unknown][]]} */ (JSON.parse(text)),
+    ]),
   );
   /** Values by filter and key. @type {Map<string, Set<string>>} */
   const values = new Map();

@@ -4,6 +4,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 /** @import { NumberKey } from './experiment_rows.js' */
 
+import { svgElement } from '../core/dom.js';
 import { scaled } from '../core/palette.js';
 import { fixed, significant } from '../core/units.js';
 import { colourOf, estimatorOf } from '../widgets/filter_colours.js';
@@ -11,7 +12,6 @@ import { extent, padded } from '../widgets/plots.js';
 import { cellOf, faultLevel } from './experiment_groups.js';
 import { NUMBERS } from './experiment_rows.js';
 
-const SVG = 'http://www.w3.org/2000/svg';
 const MARGIN = { left: scaled(44), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
 const TICKS = 5;
 const RADIUS = scaled(4);
@@ -41,7 +41,7 @@ export function drawScatter(host, rows, choices) {
     MARGIN.left + (width - MARGIN.left - MARGIN.right) * x.share(value);
   const up = (/** @type {number} */ value) =>
     height - MARGIN.bottom - (height - MARGIN.top - MARGIN.bottom) * y.share(value);
-  const svg = node('svg', { width, height, role: 'img' });
+  const svg = svgElement('svg', { width, height, role: 'img' });
   svg.setAttribute(
     'aria-label',
     `${y.title} over ${x.title} of ${rows.length} results; the table has the values`,
@@ -67,7 +67,7 @@ export function drawScatter(host, rows, choices) {
   if (kind !== undefined) {
     for (const curve of curves(points)) {
       const path = curve.map(({ a, b }) => `${right(a)},${up(b)}`).join(' ');
-      const stroke = node('polyline', { points: path, class: 'curve' });
+      const stroke = svgElement('polyline', { points: path, class: 'curve' });
       svg.append(coloured(stroke, curve[0].row, filters));
     }
   }
@@ -75,14 +75,23 @@ export function drawScatter(host, rows, choices) {
     const mark = (/** @type {SVGElement} */ shape) => svg.append(coloured(shape, row, filters));
     if (dx) mark(line('spread', right(a - dx), up(b), right(a + dx), up(b)));
     if (dy) mark(line('spread', right(a), up(b - dy), right(a), up(b + dy)));
-    const point = node('circle', { cx: right(a), cy: up(b), r: RADIUS, 'data-cell': cellOf(row) });
+    const point = svgElement('circle', {
+      cx: right(a),
+      cy: up(b),
+      r: RADIUS,
+      'data-cell': cellOf(row),
+    });
     point.classList.toggle('here', cellOf(row) === selected);
-    const label = document.createElementNS(SVG, 'title');
     const [spreadX, spreadY] = [dx, dy].map((spread) =>
       spread ? ` ± ${significant(spread)}` : '',
     );
-    label.textContent = `${row.name}${row.faults && `, ${row.faults}`}: ${significant(a)}${spreadX}, ${significant(b)}${spreadY}`;
-    point.append(label);
+    point.append(
+      svgElement(
+        'title',
+        {},
+        `${row.name}${row.faults && `, ${row.faults}`}: ${significant(a)}${spreadX}, ${significant(b)}${spreadY}`,
+      ),
+    );
     point.addEventListener('click', () => select(row));
     mark(point);
   }
@@ -185,23 +194,14 @@ export function niceStep(step) {
 }
 
 /**
- * @param {string} name
- * @param {Record<string, string | number>} attributes
- */
-function node(name, attributes) {
-  const result = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) result.setAttribute(key, String(value));
-  return result;
-}
-
-/**
  * @param {string} className
  * @param {number} x1
  * @param {number} y1
  * @param {number} x2
  * @param {number} y2
  */
-const line = (className, x1, y1, x2, y2) => node('line', { class: className, x1, y1, x2, y2 });
+const line = (className, x1, y1, x2, y2) =>
+  svgElement('line', { class: className, x1, y1, x2, y2 });
 
 /**
  * @param {string} content
@@ -209,8 +209,5 @@ const line = (className, x1, y1, x2, y2) => node('line', { class: className, x1,
  * @param {number} y
  * @param {string} anchor
  */
-function text(content, x, y, anchor) {
-  const result = node('text', { x, y, 'text-anchor': anchor });
-  result.textContent = content;
-  return result;
-}
+const text = (content, x, y, anchor) =>
+  svgElement('text', { x, y, 'text-anchor': anchor }, content);

@@ -1,10 +1,10 @@
 /** Grouped bars with error bars and dots as SVG, each bar a link; colours and textures of filters, also for legends. */
 
+import { svgElement } from '../core/dom.js';
 import { scaled } from '../core/palette.js';
 import { fixed } from '../core/units.js';
 import { colourOf, estimatorOf } from './filter_colours.js';
 
-const SVG = 'http://www.w3.org/2000/svg';
 /** Texture by estimator. @type {Record<string, string>} */
 const TEXTURES = { pf: 'M-1 5 5-1M1 7 7 1', ukf: 'M1 2h2M4 5h2', lstm: 'M0 1.5h6M0 4.5h6' };
 const TEXTURE_SIZE = 6; // px
@@ -335,19 +335,4 @@ function scaleTop(bars, level) {
 function tickStep(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return power * ([1, 2, 5].find((factor) => factor * power >= value) ?? 10);
-}
-
-/**
- * @template {keyof SVGElementTagNameMap} K
- * @param {K} tag
- * @param {Record<string, string | number>} attributes
- * @param {...(Node | string)} children
- * @returns {SVGElementTagNameMap[K]}
- */
-function svgElement(tag, attributes, ...children) {
-  const node = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes))
-    node.setAttribute(name, typeof value === 'number' ? String(Number(value.toFixed(2))) : value);
-  node.append(...children);
-  return node;
 }
