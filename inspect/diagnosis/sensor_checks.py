@@ -14,6 +14,7 @@ from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
     axis_index,
+    contact_changes,
     contact_distance_statistics,
     free_motion,
     saturated,
@@ -40,7 +41,10 @@ def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference)
     values |= vector_statistics(episode) | contact_distance_statistics(episode, reference)
-    return values | window_statistics(episode, reference)
+    values |= window_statistics(episode, reference)
+    # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
+    ambiguous = contact_changes(episode) == 1
+    return {name: np.nan if ambiguous and name.startswith("opposition/") else value for name, value in values.items()}
 
 
 def localise(statistic: str, episode: Episode, reference: Reference | None) -> tuple[int, int] | None:

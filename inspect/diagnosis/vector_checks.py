@@ -185,6 +185,11 @@ def in_contact(episode: Episode) -> Mask:
     return np.asarray(episode.observations[CONTACT][:, 0] > 0.5)
 
 
+def contact_changes(episode: Episode) -> int:
+    """Number of changes of the contact flag; 0 without one."""
+    return int(np.abs(np.diff(in_contact(episode).astype(int))).sum())
+
+
 def free_motion(episode: Episode) -> Mask:
     """(T,): steps without the contact flag, and their neighbours without it, since readings are means over a step."""
     touched = in_contact(episode) if CONTACT in episode.observations else np.zeros(len(episode), dtype=bool)
