@@ -1,13 +1,17 @@
-"""Appearance of the Panda in replays: rounded, tapered housings with dark seams at the joints.
+"""Appearance of the Panda in replays: installed meshes, or rounded, tapered housings with dark seams at the joints.
 
 The camera never sees it, and nothing collides with it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from beliefscope.datasets.simulation.panda_meshes import Surface, link_surfaces, mesh_folder
 
 HIDDEN_GROUP = 3
 """Geoms of this group and above are not drawn by MuJoCo's viewers and the page."""
@@ -19,9 +23,10 @@ _TURN = np.linspace(0.0, 2.0 * np.pi, 18, endpoint=False)
 _FILLETS = {False: np.linspace(0.0, np.pi / 2, 4), True: np.linspace(0.0, np.pi / 2, 2)}
 
 Point = tuple[float, float, float]
+Housing = tuple[Point, Point, float, float, bool]
 
 # Housings of each link: from, to (m, in the link's frame, along the axis), radius at both ends, m; dark or white.
-_HOUSINGS: tuple[tuple[tuple[Point, Point, float, float, bool], ...], ...] = (
+_HOUSINGS: tuple[tuple[Housing, ...], ...] = (
     (
         ((0, 0, 0), (0, 0, 0.14), 0.085, 0.07, False),
         ((-0.15, 0, 0.035), (0, 0, 0.05), 0.035, 0.065, False),
@@ -66,15 +71,17 @@ _HOUSINGS: tuple[tuple[tuple[Point, Point, float, float, bool], ...], ...] = (
 
 
 def add_appearance(spec: mujoco.MjSpec) -> None:
-    """Hide the capsules of the arm, and draw its housings."""
+    """Hide the capsules of the arm, and draw its meshes if they are installed, otherwise its housings."""
+    folder = mesh_folder()
     for link, housings in enumerate(_HOUSINGS):
         body = spec.body(f"link{link}")
         for geom in body.geoms:
             geom.group = HIDDEN_GROUP
-        for i, (start, end, first, last, dark) in enumerate(housings):
+        surfaces = _housing_surfaces(housings) if folder is None else link_surfaces(folder / f"link{link}.stl")
+        for i, ((vertices, faces), dark) in enumerate(surfaces):
             name = f"housing{link}_{i}"
-            vertices, faces = housing(np.array(start, float), np.array(end, float), first, last, _FILLETS[dark])
-            spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
+            shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # installed meshes are not closed
+            spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_MESH,
                 meshname=name,
@@ -84,6 +91,11 @@ def add_appearance(spec: mujoco.MjSpec) -> None:
                 conaffinity=0,
                 mass=0,
             )
+
+
+def _housing_surfaces(housings: tuple[Housing, ...]) -> Iterator[tuple[Surface, bool]]:
+    for start, end, first, last, dark in housings:
+        yield housing(np.array(start, float), np.array(end, float), first, last, _FILLETS[dark]), dark
 
 
 def housing(
