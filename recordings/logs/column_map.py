@@ -28,6 +28,13 @@ UNITS = (
 )
 """Unit of a column -> internal unit, and its factor. Others are internal units."""
 
+SPELLINGS = {
+    **dict.fromkeys(("degree", "degrees", "°"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+}
+"""Names of units that are refused in favour of their symbols: as other units, degrees would be no angle."""
+
 ELEMENTS = re.compile(r"(.*)\[(\d{1,9}(?:,\d{1,9})*)\]")
 """``NAME[I]`` or ``NAME[I,J,...]``: elements of the rows of an array."""
 
@@ -190,6 +197,8 @@ def _component(name: str, value: Any) -> StateColumn:
     column, unit = settings["column"], settings.get("unit", "m")
     if not isinstance(unit, str):
         raise BadInput(f"unit of state {name!r} is {unit!r:.100}, expected a text such as m, cm, rad, deg or m/s")
+    if symbol := SPELLINGS.get(unit.strip().lower()):
+        raise BadInput(f"unit of state {name!r} is {unit!r}, expected {symbol!r}")
     quaternions = (QUATERNION, *ROTATIONS)
     if not isinstance(column, str) and not (unit in quaternions and _texts(column) and len(column) == 4):
         raise BadInput(f"column of state {name!r} is {column!r:.100}, expected a name, or four of a quaternion")

@@ -108,16 +108,20 @@ ABSENT = (None, "", "None")
 
 
 def _not_numbers(values: NDArray[Any]) -> str:
-    """Why values (T, ...) are no numbers: the first text that is none, and its row."""
+    """Why values (T, ...) are no numbers: the first text that is none, or else the first value, and its row."""
     if values.dtype.kind == "c":
         return "has complex values"
+    numbers: list[str] = []
     for row, value in enumerate(values.reshape(len(values), -1)[:, 0]) if values.size else ():
         if value in ABSENT:
             continue
         try:
             float(value)
+            numbers.append(f"has numbers stored as text, such as {str(value)!r:.50} in row {row}")
         except (TypeError, ValueError):
             return f"has text, such as {str(value)!r:.50} in row {row}"
+    if numbers:
+        return numbers[0]
     return "has no value" if all(value in ABSENT for value in values.flat) else "has text"
 
 
@@ -134,6 +138,8 @@ def column(columns: Columns, reference: str, purpose: str) -> NDArray[np.float64
     values = columns[name]
     if values.dtype.kind == "M":  # dates as s since 1970
         values = np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) / 1e9)
+    elif values.dtype.kind == "m":  # durations in s
+        values = np.where(np.isnat(values), np.nan, values.astype("timedelta64[ns]").astype(np.int64) / 1e9)
     if values.dtype.kind not in "fiub":
         raise BadInput(f"column {name!r} of {purpose} {_not_numbers(values)}, expected numbers")
     if not elements:

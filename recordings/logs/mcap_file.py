@@ -36,13 +36,15 @@ class McapLog:
 
         try:
             summary = make_reader(self.stream).get_summary()
-        except (McapError, struct.error) as error:
+        except (McapError, struct.error, OSError) as error:
             reason = str(error)[:100] or type(error).__name__
             raise BadInput(
                 f"not a complete MCAP file ({reason:.100}); `mcap recover` repairs a truncated one"
             ) from None
-        if summary is None or not summary.channels:
+        if summary is None or not (summary.channels or summary.statistics):
             raise BadInput("the file has no summary of its topics; `mcap recover` adds it")
+        if not summary.channels:
+            raise BadInput("the file has no topics")
         self.topics = tuple(sorted({channel.topic for channel in summary.channels.values()}))
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:

@@ -192,6 +192,10 @@ def _ends(ticks: Mapping[str, NDArray[np.int64]], required: set[str], truth: set
     last = min((int(ticks[topic].max()) for topic in truth), default=max(int(t.max()) for t in ticks.values()))
     if last < first:
         raise BadInput(f"the topics of state and sensors do not overlap in time: {', '.join(sorted(required))}")
+    for topic in sorted(required):  # the only message of a topic may be a constant
+        if ticks[topic].min() < ticks[topic].max() < first:
+            later = max(required, key=lambda other: int(ticks[other].min()))
+            raise BadInput(f"topic {topic!r} ends before {later!r} begins: they do not overlap in time")
     return first, last
 
 
@@ -213,7 +217,8 @@ def _stacked(name: str, values: Sequence[Any]) -> NDArray[Any]:
         raise BadInput(f"column {name!r} has values of the shapes {', '.join(map(str, shapes[:4]))}, expected one")
     array = np.asarray(values)
     if array.dtype.kind not in "fiubU":
-        raise BadInput(f"column {name!r} has neither numbers nor text, such as {values[0]!r:.50}")
+        wrong = next((value for value in values if np.asarray(value).dtype.kind not in "fiubU"), values[0])
+        raise BadInput(f"column {name!r} has neither numbers nor text, such as {str(wrong)!r:.50}")
     return array
 
 

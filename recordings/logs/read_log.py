@@ -54,6 +54,7 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
     control = joined(columns, mapping.control, "control") if mapping.control else np.zeros((len(states), 0))
     controls = _float32(control, "the control")
     contact = column(columns, mapping.contact, "contact") if mapping.contact else np.zeros(len(states))
+    _check_rows(contact, f"contact, column {mapping.contact!r},", len(states))
     covariates = {name: _covariate(columns, name, entry) for name, entry in mapping.covariates.items()}
     values = {name: numbers for name, (_, numbers) in covariates.items()}
     arrays: dict[str, NDArray[Any]] = {"state": states, "control": controls, "contact": contact, **sensors, **values}
@@ -61,6 +62,9 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
         if len(array) != len(states):
             raise BadInput(f"{name} has {len(array)} rows and the state {len(states)}")
     rows = _episodes(columns, mapping, len(states))
+    if max(map(len, rows.values())) < 2:
+        step = f" of {mapping.dt:g} s" if mapping.dt else ""
+        raise BadInput(f"{source} has one step{step} per episode, expected two or more")
     dt, times = _times(columns, mapping, rows)
     declared = {name: covariate for name, (covariate, _) in covariates.items()}
     present = {name: _present(columns, mapping, name, array) for name, array in sensors.items()}
@@ -277,10 +281,17 @@ def _episodes(columns: Columns, mapping: ColumnMap, count: int) -> dict[str, NDA
     if mapping.episode not in columns:
         column(columns, mapping.episode, "episode")  # raises the error with similar names
     numbers = columns[mapping.episode]
+    _check_rows(numbers, f"the episode, column {mapping.episode!r},", count)
     if numbers.dtype.kind == "f" and len(unknown := np.flatnonzero(np.isnan(numbers))):
         raise BadInput(f"the episode, column {mapping.episode!r}, has no value in row {unknown[0]}")
     names, first, inverse = np.unique(columns[mapping.episode], return_index=True, return_inverse=True)
     return {str(names[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
+
+
+def _check_rows(values: NDArray[Any], what: str, count: int) -> None:
+    """Raise BadInput unless there is one value per row."""
+    if values.shape != (count,):
+        raise BadInput(f"{what} has the shape {values.shape}, expected one value in each of {count} rows")
 
 
 def _times(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp]]) -> tuple[float, list[Array | None]]:
@@ -292,14 +303,12 @@ def _times(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp
         return float(mapping.dt), [None] * len(rows)
     name = CLOCK if mapping.clock else mapping.time
     column_times = column(columns, name, "time")
+    _check_rows(column_times, f"time {name!r}", sum(map(len, rows.values())))
     times = [column_times[at] - column_times[at[0]] for at in rows.values()]
     for episode, time in zip(rows, times, strict=True):
         if error := time_error(time):
             raise BadInput(f"time {name!r} of episode {episode} {error}, counted from its first row")
-    steps = np.concatenate([np.diff(time) for time in times])
-    if not len(steps):
-        raise BadInput(f"time {name!r} has one row per episode, expected two or more")
-    dt = float(np.median(steps))
+    dt = float(np.median(np.concatenate([np.diff(time) for time in times])))
     regular = [np.abs(time - dt * np.arange(len(time))).max() <= IRREGULAR * dt for time in times]
     return dt, [None if same else time for same, time in zip(regular, times, strict=True)]
 

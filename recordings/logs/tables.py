@@ -12,6 +12,15 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.logs.arrays import Wanted
 
+MAX_HEADER = 1 << 20
+"""Bytes of the first line of a CSV file that are checked."""
+
+SEPARATORS = (";", "\t")
+"""Separators of CSV files that are recognised, to name them in the error."""
+
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+"""First bytes of files in UTF-16."""
+
 
 def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     """All columns of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays."""
@@ -22,8 +31,30 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
             return {name: archive[name] for name in archive.files}
     from pyarrow import csv, parquet
 
-    table = csv.read_csv(path) if path.suffix.lower() == ".csv" else parquet.read_table(path)
+    if path.suffix.lower() == ".csv":
+        check_csv(path)
+        table = csv.read_csv(path)
+        table = table.rename_columns([name.strip() for name in table.column_names])
+    else:
+        table = parquet.read_table(path)
+    for name in table.column_names:
+        if table.column_names.count(name) > 1:
+            raise BadInput(f"{path.name} has {table.column_names.count(name)} columns {name!r}, expected unique names")
     return {name: from_arrow(table.column(name)) for name in table.column_names}
+
+
+def check_csv(path: Path) -> None:
+    """Raise BadInput for another encoding than UTF-8, and for separators other than commas in the first line."""
+    with path.open("rb") as file:
+        first = file.readline(MAX_HEADER)
+    try:
+        header = first.decode("utf-8-sig", "strict" if len(first) < MAX_HEADER else "ignore")
+    except UnicodeDecodeError as error:
+        code = "UTF-16" if first[:2] in UTF_16 else f"no UTF-8, with the byte 0x{first[error.start]:02x} in line 1"
+        raise BadInput(f"{path.name} is {code}: expected a CSV file in UTF-8") from None
+    separator = max(SEPARATORS, key=header.count)
+    if "," not in header and separator in header:
+        raise BadInput(f"{path.name} has columns separated by {separator!r}, expected ',' and decimal points")
 
 
 def from_arrow(column: Any) -> NDArray[Any]:
@@ -34,6 +65,8 @@ def from_arrow(column: Any) -> NDArray[Any]:
     if isinstance(column, pa.ChunkedArray):
         column = column.combine_chunks()
     kind = column.type
+    if pa.types.is_decimal(kind):
+        column = column.cast(pa.float64())
     if not (pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)):
         values = column.to_numpy(zero_copy_only=False)
         return values if values.dtype != object else values.astype(str)

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
+    from beliefscope.datasets.episode import Episode
     from beliefscope.inspect.trace import Trace
 
 RECORDINGS = (".rrd", ".live")
@@ -70,12 +72,37 @@ def import_(
     if output.suffix != ".h5":
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
-        return _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
+        result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
+        imported = [episodes[episode]]
+        return replace(
+            result, document={**result.document, **_ranges(imported)}, text=f"{result.text}, {_values(imported)}"
+        )
     check_complete(episodes)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
-    document = {"task": mapping.task, "episodes": len(episodes), "steps": steps}
-    return console.Result(document, f"{len(episodes)} episodes of {mapping.task}, {steps} steps", output)
+    document = {"task": mapping.task, "episodes": len(episodes), "steps": steps} | _ranges(episodes)
+    count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
+    return console.Result(document, f"{count} of {mapping.task}, {steps} steps, {_values(episodes)}", output)
+
+
+def _ranges(episodes: list[Episode]) -> dict[str, Any]:
+    """Duration of a step, and the smallest and largest value of each component: they show wrong units."""
+    import numpy as np
+
+    states = np.concatenate([episode.states for episode in episodes])
+    ranges = {
+        component.name: {"unit": component.unit, "min": float(known.min()), "max": float(known.max())}
+        for component, values in zip(episodes[0].task.components, states.T, strict=True)
+        if len(known := values[np.isfinite(values)])
+    }
+    return {"dt": episodes[0].dt, "ranges": ranges}
+
+
+def _values(episodes: list[Episode]) -> str:
+    """``_ranges`` as text."""
+    document = _ranges(episodes)
+    parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in document["ranges"].items()]
+    return "; ".join([f"{document['dt']:.4g} s each", *parts])
 
 
 def _written(trace: Trace, output: Path) -> console.Result:
