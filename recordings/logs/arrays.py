@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from beliefscope.datasets.readers.hdf5_limits import MAX_BYTES
 
 Columns = Mapping[str, NDArray[Any]]
 """Name -> (T, ...) values of a column of a log."""
+
+POINTER = b"version https://git-lfs"
+"""First bytes of the file that Git LFS leaves in place of one that is not downloaded."""
 
 Wanted = Callable[[str], bool]
 """Whether the values of a column are used."""
@@ -29,3 +33,10 @@ def check_size(name: str, shape: Sequence[int], dtype: DTypeLike) -> None:
 def unread(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
     """Zeros without memory, for the shape and the type of a column that the map does not use."""
     return np.broadcast_to(np.zeros((), dtype), tuple(shape))
+
+
+def check_downloaded(path: Path) -> None:
+    """Raise BadInput for a file that Git LFS has not downloaded."""
+    with path.open("rb") as file:
+        if file.read(len(POINTER)) == POINTER:
+            raise BadInput(f"{path.name} is a pointer of Git LFS, expected the file: `git lfs pull` downloads it")

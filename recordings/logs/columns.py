@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.recordings.logs.arrays import Columns
+from beliefscope.recordings.logs.arrays import Columns, check_downloaded
 from beliefscope.recordings.logs.column_map import ELEMENTS, ColumnMap, base_name
 from beliefscope.recordings.logs.messages import Preview, on_clock, preview
 
@@ -21,6 +21,8 @@ SUFFIXES = {
     **{".rrd": "rerun_file", ".zip": "zarr_buffer"},
 }
 """Suffix of a file -> its reader, a module of this package."""
+
+HDF5 = (".h5", ".hdf5")
 
 FOLDERS = {
     **{"metadata.yaml": "ros_bag", "meta/info.json": "lerobot"},
@@ -77,11 +79,13 @@ def _reader(path: Path) -> str:
         raise BadInput(f"folder {path.name} has none of {', '.join(FOLDERS)}: not a ROS 2 bag, LeRobot or Zarr data")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
+        other = "; HDF5 files are read by `beliefscope convert`" if suffix in HDF5 else ""
         raise BadInput(
-            f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder"
+            f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder{other}"
         )
     if not path.is_file():
         raise BadInput(f"{path} does not exist")
+    check_downloaded(path)
     return SUFFIXES[suffix]
 
 
@@ -98,6 +102,8 @@ def _reading(path: Path) -> Iterator[None]:
             raise
         extra = f"pip install 'beliefscope[{PACKAGES[package]}]'"
         raise BadInput(f"{path.name} needs the package {package}: {extra}") from None
+    except KeyError as error:
+        raise BadInput(f"{path.name} has no {error!s:.200}, which its format requires") from None
     except Exception as error:
         reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         raise BadInput(f"{path.name} cannot be read: {reason:.200}") from None

@@ -13,14 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.recordings.logs.arrays import Wanted, check_size, unread
+from beliefscope.recordings.logs.arrays import Wanted, check_downloaded, check_size, unread
 from beliefscope.recordings.logs.images import decoded
 from beliefscope.recordings.logs.tables import from_arrow
 
 VERSION = "v3."
 LARGEST_INDEX = 10**6
+
+INFO = {
+    "codebase_version": ((str,), "a text such as v3.0"),
+    "fps": ((int, float), "a number above 0"),
+    "features": ((dict,), "a table"),
+}
+"""Key of the metadata -> its types, and what is expected."""
 
 
 def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
@@ -28,19 +36,43 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
 
     Raises BadInput for another version, missing files, and frames that the videos do not have.
     """
-    info = read_json((path / "meta" / "info.json").read_bytes())
+    info = _info(path / "meta" / "info.json")
     features, fps = info["features"], float(info["fps"])
     if not str(info["codebase_version"]).startswith(VERSION):
         raise BadInput(f"the data set has the version {info['codebase_version']!r:.50}, expected v3: convert it first")
     if not 0.0 < fps < 1e6:
         raise BadInput(f"fps in info.json is {fps}, expected a number above 0")
     table = _table(path / "data")
+    total = info.get("total_frames", table.num_rows)
+    if total != table.num_rows:
+        raise BadInput(
+            f"data has {table.num_rows} frames and info.json {total!r:.20}, expected the same: download the missing "
+            "files, or correct total_frames"
+        )
     columns = {name: _column(table.column(name), name, wanted(name)) for name in table.column_names}
     for name, feature in features.items():
         if feature["dtype"] == "video":
             shape = (table.num_rows, *_size(name, feature), 3)
             columns[name] = _Videos(path, name, fps).frames(columns, shape) if wanted(name) else unread(shape, "u1")
     return columns
+
+
+def _info(path: Path) -> Mapping[str, Any]:
+    """The metadata. Raises BadInput for damaged ones and those without a key."""
+    try:
+        info = read_json(path.read_bytes())
+    except ValueError as error:
+        raise BadInput(f"meta/{path.name} is damaged: {error!s:.150}") from None
+    entries = info if isinstance(info, dict) else {}
+    for key, (kinds, expected) in INFO.items():
+        if type(value := entries.get(key)) not in kinds:
+            raise BadInput(f"{key} in {path.name} is {value!r:.50}, expected {expected}")
+    for name, feature in entries["features"].items():
+        if not isinstance(feature, dict) or "dtype" not in feature:
+            raise BadInput(
+                f"feature {name!r:.50} in {path.name} is {feature!r:.50}, expected a table with dtype and shape"
+            )
+    return entries
 
 
 def _table(folder: Path) -> Any:
@@ -51,7 +83,15 @@ def _table(folder: Path) -> Any:
     files = sorted(folder.glob("chunk-*/file-*.parquet"), key=lambda file: (len(file.parent.name), file))
     if not files:
         raise BadInput(f"{folder.name} has no chunk-*/file-*.parquet")
-    return pa.concat_tables([parquet.ParquetFile(file).read() for file in files])
+    tables = []
+    for file in files:
+        check_downloaded(file)
+        tables.append(parquet.ParquetFile(file).read())
+        schemas = [{f"{field.name}: {field.type}" for field in table.schema} for table in (tables[0], tables[-1])]
+        if different := schemas[0] ^ schemas[1]:
+            name = file.relative_to(folder).as_posix()
+            raise BadInput(f"{name} has other columns than the first file: {', '.join(sorted(different)):.150}")
+    return pa.concat_tables(tables)
 
 
 def _column(column: Any, name: str, wanted: bool) -> NDArray[Any]:
@@ -106,6 +146,8 @@ class _Videos:
             if not (type(chunk) is type(file) is int and 0 <= chunk < LARGEST_INDEX and 0 <= file < LARGEST_INDEX):
                 raise BadInput(f"video of {self.camera!r} has the numbers {chunk!r:.20} and {file!r:.20}")
             rows = np.flatnonzero(episodes == entry["episode_index"])
+            if error := time_error(times[rows]):
+                raise BadInput(f"timestamp of episode {entry['episode_index']} {error}")
             numbers = np.rint((start + times[rows]) * self.fps).astype(np.int64)
             wanted.setdefault((chunk, file), {}).update(zip(numbers.tolist(), rows.tolist(), strict=True))
         missing = set(range(len(frames))) - {row for rows in wanted.values() for row in rows.values()}
@@ -126,6 +168,9 @@ class _Videos:
                 "out of the map"
             ) from None
         left = dict(rows)
+        if not (self.path / name).is_file():
+            raise BadInput(f"{name} does not exist")
+        check_downloaded(self.path / name)
         with av.open(str(self.path / name)) as container:
             for frame in container.decode(video=0):
                 row = left.pop(round(float(frame.time or 0.0) * self.fps), None)

@@ -38,11 +38,16 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     """The arrays of a folder or zip archive in format 2 or 3. Raises BadInput for another layout and other types."""
     import zarr
 
+    if path.is_file() and not zipfile.is_zipfile(path):
+        raise BadInput(f"{path.name} is no complete zip archive")
+    names = _nodes(path)
+    if ENDS not in names:
+        raise BadInput(f"the store has no array {ENDS!r}: not a replay buffer{_elsewhere(path)}")
     storage = zarr.storage
     store = storage.ZipStore(path, mode="r") if path.is_file() else storage.LocalStore(path, read_only=True)
     with closing(store), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about unknown files
-        nodes = {name: zarr.open(store, path=name, mode="r") for name in _nodes(path)}
+        nodes = {name: zarr.open(store, path=name, mode="r") for name in names}
         arrays = {name: node for name, node in nodes.items() if isinstance(node, zarr.Array)}
         if ENDS not in arrays:
             raise BadInput(f"the store has no array {ENDS!r}: not a replay buffer")
@@ -67,13 +72,22 @@ def _ascends(ends: NDArray[Any]) -> bool:
 
 def _nodes(path: Path) -> list[str]:
     """Paths of the arrays and groups in ``data``, and of the episodes' ends."""
+    return sorted(node for node in _all_nodes(path) if node.startswith(DATA) or node == ENDS)
+
+
+def _all_nodes(path: Path) -> set[str]:
     if path.is_file():
         with zipfile.ZipFile(path) as archive:
             files = archive.namelist()
     else:
         files = [file.relative_to(path).as_posix() for file in path.rglob("*") if file.name in METADATA]
-    nodes = {file.rpartition("/")[0] for file in files if file.endswith(METADATA)}
-    return sorted(node for node in nodes if node.startswith(DATA) or node == ENDS)
+    return {file.rpartition("/")[0] for file in files if file.endswith(METADATA)}
+
+
+def _elsewhere(path: Path) -> str:
+    """Where the episodes' ends are in an archive or folder of a whole store."""
+    found = sorted(node for node in _all_nodes(path) if node.endswith(f"/{ENDS}"))
+    return f"; it is in the folder {found[0].removesuffix(f'/{ENDS}')!r}, expected at the top" if found else ""
 
 
 def _values(path: Path, node: str, array: Any, wanted: bool) -> NDArray[Any]:

@@ -91,7 +91,7 @@ def _ranges(episodes: list[Episode]) -> dict[str, Any]:
 
     states = np.concatenate([episode.states for episode in episodes])
     ranges = {
-        component.name: {"unit": component.unit, "min": float(known.min()), "max": float(known.max())}
+        component.name: {"unit": component.unit, "min": float(known.min()) + 0.0, "max": float(known.max()) + 0.0}
         for component, values in zip(episodes[0].task.components, states.T, strict=True)
         if len(known := values[np.isfinite(values)])
     }

@@ -6,7 +6,10 @@ import json
 import shutil
 import sys
 import tomllib
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,7 +156,11 @@ def test_objects_are_refused(tmp_path: Path) -> None:
     [
         ("codebase_version", "v2.1", "version 'v2.1', expected v3"),
         ("fps", 0, "fps in info.json is 0"),
+        ("fps", "ten", "fps in info.json is 'ten', expected a number above 0"),
+        ("fps", None, "fps in info.json is None, expected a number above 0"),
         ("features", {}, "'observation.images.top' does not exist"),
+        ("features", {"a": "b"}, "feature 'a' in info.json is 'b', expected a table with dtype and shape"),
+        ("total_frames", 21, "data has 20 frames and info.json 21, expected the same"),
     ],
 )
 def test_wrong_metadata_of_lerobot(lerobot: Path, tmp_path: Path, key: str, value: object, message: str) -> None:
@@ -178,7 +185,7 @@ def test_short_chunks_of_blosc_are_refused(tmp_path: Path, name: str) -> None:
         read_columns(tmp_path / name, read_map(map_file(tmp_path, ZARR)))
 
 
-@pytest.mark.parametrize(("frames", "message"), [(8, "has no frame at 0.8 s"), (0, "cannot be read")])
+@pytest.mark.parametrize(("frames", "message"), [(8, "has no frame at 0.8 s"), (0, "does not exist")])
 def test_short_videos_are_refused(lerobot: Path, tmp_path: Path, frames: int, message: str) -> None:
     video = lerobot / "videos" / "observation.images.top" / "chunk-000" / "file-001.mp4"
     video.unlink()
@@ -208,3 +215,68 @@ def test_wrong_ends_of_episodes(tmp_path: Path, ends: list[int], message: str) -
 def test_folders_of_other_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"none of metadata\.yaml, meta/info\.json"):
         read_columns(tmp_path)
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("meta/info.json", "", "meta/info.json is damaged: Expecting value"),
+        ("meta/info.json", "[]", "codebase_version in info.json is None"),
+        ("data/chunk-000/file-001.parquet", None, "data has 11 frames and info.json 20"),
+        ("data/chunk-000/file-000.parquet", POINTER, "file-000.parquet is a pointer of Git LFS"),
+        ("videos/observation.images.top/chunk-000/file-001.mp4", POINTER, "file-001.mp4 is a pointer of Git LFS"),
+        ("videos/observation.images.top/chunk-000/file-001.mp4", None, "file-001.mp4 does not exist"),
+    ],
+)
+def test_missing_files_of_lerobot(lerobot: Path, tmp_path: Path, file: str, content: str | None, message: str) -> None:
+    (lerobot / file).unlink()
+    if content is not None:
+        (lerobot / file).write_text(content)
+    with pytest.raises(BadInput, match=message):
+        read_columns(lerobot, read_map(map_file(tmp_path, LEROBOT)))
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "message"),
+    [
+        ("timestamp", None, "has other columns than the first file: timestamp: float"),
+        ("timestamp", lambda values: [None] * len(values), "timestamp of episode 0 is nan at step 0, expected finite"),
+        (
+            "timestamp",
+            lambda values: [0.0] * len(values),
+            "timestamp of episode 0 is 0 s at step 1, after 0 s; expected",
+        ),
+    ],
+    ids=["missing", "empty", "constant"],
+)
+def test_damaged_tables_of_lerobot(
+    lerobot: Path, tmp_path: Path, column: str, change: Callable[[Any], list[Any]] | None, message: str
+) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    path = lerobot / "data" / "chunk-000" / "file-000.parquet"
+    table = parquet.read_table(path)
+    place, kind = table.column_names.index(column), table.schema.field(column).type
+    changed = table.drop([column])
+    if change is not None:
+        changed = table.set_column(place, column, pa.array(change(table.column(column)), kind))
+    parquet.write_table(changed, path)
+    with pytest.raises(BadInput, match=message):
+        read_columns(lerobot, read_map(map_file(tmp_path, LEROBOT)))
+
+
+def test_archives_that_are_no_replay_buffers(tmp_path: Path) -> None:
+    path, copy = tmp_path / "buffer.zip", tmp_path / "copy.zip"
+    logs.write_zarr(path)
+    copy.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(BadInput, match=r"copy\.zip is no complete zip archive"):
+        read_columns(copy)
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(copy, "w") as target:
+        for name in source.namelist():
+            target.writestr(f"folder/{name}", source.read(name))
+    with pytest.raises(BadInput, match=r"no array 'meta/episode_ends'.* in the folder 'folder', expected at the top"):
+        read_columns(copy)
