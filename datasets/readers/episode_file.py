@@ -124,7 +124,11 @@ class EpisodeFile(Dataset):
         try:
             definition = self._file.attrs.get("definition")
             name = str(self._file.attrs.get("task"))
-            return stored_task(name if definition is None else read_json(definition), given)
+            document = name if definition is None else read_json(definition)
+        except (TypeError, ValueError) as error:
+            raise BadInput(f"{self.path}: the attribute 'definition' is not the JSON of a task: {error}") from None
+        try:
+            return stored_task(document, given)
         except (TypeError, ValueError) as error:
             raise BadInput(f"{self.path}: {error}") from None
 

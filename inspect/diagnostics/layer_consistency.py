@@ -93,4 +93,4 @@ def inconsistency(entry: LayerConsistency) -> float:
 
 
 def number(value: float) -> str:
-    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    return f"{value:.0f}" if 10 <= value < 1e6 else f"{value:.2g}"

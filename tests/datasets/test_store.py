@@ -215,7 +215,7 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
         (no_attribute("/", "format"), r"not a dataset: its attribute 'format' is None, expected 'beliefscope-"),
         (attribute("/", "format", 3), "not a dataset"),
         (attribute("/", "version", 9), "version 9 of the layout; this release reads version 1"),
-        (attribute("/", "definition", "{"), "property name"),
+        (attribute("/", "definition", "{"), "attribute 'definition' is not the JSON of a task: Expecting property"),
         (attribute("/", "definition", "{}"), "incomplete definition of a task: KeyError: 'name'"),
         (lambda f: [f.__delitem__(k) for k in list(f)], "has no trajectory"),
         (without("trajectory0"), r"has 1 trajectories, but no group 'trajectory0'"),

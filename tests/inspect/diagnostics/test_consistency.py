@@ -13,6 +13,7 @@ import pytest
 
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.consistency import Consistency, consistency
+from beliefscope.inspect.diagnostics.layer_consistency import number
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
     gaussian_crps,
@@ -258,3 +259,8 @@ def test_few_correlated_trajectories_of_a_healthy_filter_are_white_enough() -> N
     result = consistency(plant.simulated(3, memory=0.3))
     assert "Innovations" not in result.verdict
     assert min(test.p_value for test in result.whiteness) < 0.05
+
+
+def test_large_numbers_are_in_scientific_notation() -> None:
+    """NEES of an imported estimate whose covariance is zero."""
+    assert [number(value) for value in (0.00667, 3.14, 123.4, 3.33e25)] == ["0.0067", "3.1", "123", "3.3e+25"]
