@@ -97,17 +97,21 @@ def wrench_statistics(episode: Episode) -> dict[str, float]:
     """Laws of a rigid contact: torque = lever x force + constant, and a force that opposes the hand's motion.
 
     A gain g of the force divides the lever by g; a sign inverts lever and motion; an exchange of axes breaks both laws.
-    A bias of force or torque changes only the constant.
+    A bias of force or torque changes only the constant. The roughness, noise relative to the standard deviation, tells
+    noise from a gain, which does not change it.
     """
     observations = episode.observations
     values: dict[str, float] = {}
     if FORCE not in observations:
         return values
     at = in_contact(episode)
-    force = observations[FORCE].astype(np.float64)[at]
+    readings = observations[FORCE].astype(np.float64)
+    force = readings[at]
     if len(force) < MIN_STEPS or force.shape[1] != 3:
         return values
-    values[f"size/{FORCE}/contact"] = float(np.sqrt(np.square(force - force.mean(0)).sum(1).mean()))
+    size = float(np.sqrt(np.square(force - force.mean(0)).sum(1).mean()))
+    rough = float(np.linalg.norm(noise_level(readings, at)))
+    values |= {f"size/{FORCE}/contact": size, f"roughness/{FORCE}/contact": rough / size if size > 0.0 else np.nan}
     if TORQUE in observations and observations[TORQUE].shape[1] == 3:
         torque = observations[TORQUE].astype(np.float64)[at]
         values[f"size/{TORQUE}/contact"] = float(np.sqrt(np.square(torque - torque.mean(0)).sum(1).mean()))

@@ -39,6 +39,7 @@ SUMMARIES: dict[str, tuple[str, Callable[[Array], float]]] = {
     "position noise": (EXTREME, np.max),
     "occlusion": (EXTREME, np.max),
     "opposition": (EXTREME, np.max),
+    "roughness": (EXTREME, np.max),
     "sharpness": (EXTREME, np.min),
     "brightness": (RANGE, _ratio),
     "shift": (RANGE, _difference),

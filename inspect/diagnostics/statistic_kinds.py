@@ -67,6 +67,7 @@ KINDS = {
     "opposition": ("negative correlation{of} with the force", False, 0.05),
     "unflagged force": ("force without the flag{of}", True, 0.2),
     "size": ("standard deviation", True, 0.1),
+    "roughness": ("noise{of} relative to its standard deviation", True, 0.05),
     "lever": ("lever of the torque{axis}", False, 0.01),
     "axes": ("evidence for the order of the axes", False, 0.3),
     "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),

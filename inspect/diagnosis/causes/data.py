@@ -13,7 +13,7 @@ BY_LABELS = "|".join(f"module {kind}/*" for kind in ("bias", "error", "nis", "sp
 
 CONTACTS = (
     "|".join(f"{kind}/*" for kind in ("size", "lever", "direction", "axes", "change", "noise", "saturation"))
-    + "|*/contact/*"
+    + "|roughness/*|*/contact/*"
 )
 """Statistics of forces and torques in contact, which depend on the physics; in free motion these say nothing."""
 

@@ -9,7 +9,8 @@ CONTACT = "agreement/contact/*|opposition/contact/*|unflagged force/contact/*|la
 """Relations of the force and the contact flag."""
 
 READINGS = (
-    "level/force*|drift/force*|change/force*|noise/force*|size/force/*|lever/force*|axes/force/*|direction/force/*"
+    "level/force*|drift/force*|change/force*|noise/force*|size/force/*|roughness/force/*|lever/force*|axes/force/*"
+    "|direction/force/*"
 )
 """Statistics of the values of the force."""
 
@@ -26,7 +27,7 @@ CAUSES = (
         "force.drift",
         "Force drifting",
         (Symptom("drift/force*", 0),),
-        f"level/force*|direction/force/*|size/force/*|axes/force/*|lever/force*|{CONTACT}|{HAPTICS}",
+        f"level/force*|direction/force/*|size/force/*|roughness/force/*|axes/force/*|lever/force*|{CONTACT}|{HAPTICS}",
         "Tare the force sensor before each run and check its temperature.",
         "detrend force",
     ),
@@ -57,7 +58,7 @@ CAUSES = (
     Cause(
         "force.noise",
         "Force noisy",
-        (Symptom("noise/force*"),),
+        (Symptom("noise/force*"), Symptom("roughness/force/*|change/force*", optional=True)),
         f"{READINGS}|{CONTACT}|{HAPTICS}",
         "Check the cable and the filter of the force sensor.",
         "drop haptics",

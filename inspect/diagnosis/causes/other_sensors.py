@@ -6,7 +6,9 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import CONTACT_DISTANCE, DYNAMICS, HAPTICS
 from beliefscope.inspect.diagnosis.causes.image import HAND, LANDMARKS
 
-IN_PHASES = "|".join(f"{kind}/*" for kind in ("level", "drift", "change", "size", "lever", "axes", "direction"))
+IN_PHASES = "|".join(
+    f"{kind}/*" for kind in ("level", "drift", "change", "size", "roughness", "lever", "axes", "direction")
+)
 """Statistics of force and torque in free motion or in contact."""
 
 LAGS = "lag/contact/*|lag/image/*|lag/dynamics/*"
@@ -58,7 +60,7 @@ CAUSES = (
         "Contact flag delayed",
         (Symptom("lag/contact/*"),),
         f"agreement/contact/*|opposition/contact/*|unflagged force/contact/*|level/*|change/*|size/*|lever/*"
-        f"|direction/*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
+        f"|roughness/*|direction/*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Synchronise the contact sensor with the force sensor.",
         "restore contact|drop haptics",
     ),

@@ -88,6 +88,26 @@ def test_an_inverted_contact_flag_opposes_the_force(task: str) -> None:
     assert change(task, "contact_flipped=1", "opposition/contact/all") > 0.3
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_a_flag_that_changes_once_shows_no_opposition(task: str) -> None:
+    """Stuck from a step in contact and inverted from there, the readings of an episode of contact are the same."""
+    for clean in episodes(task):
+        flag = clean.observations["contact"][:, 0] > 0.5
+        if (touched := np.flatnonzero(flag)).size < 20:
+            continue
+        stuck = Faults.parse(f"contact_stuck=0:from={touched[10]}").apply(clean)
+        values = sensor_statistics(stuck, None)
+        once = np.abs(np.diff(stuck.observations["contact"][:, 0])).sum() == 1
+        assert np.isnan(values["opposition/contact/all"]) == once
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_gain_keeps_the_roughness_of_the_force_and_noise_raises_it(task: str) -> None:
+    name = "roughness/force/contact"
+    assert change(task, "force_gain=3", name) == pytest.approx(0.0, abs=1e-6)  # stored as float32
+    assert change(task, "force_noise=8", name) > 0.1
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
