@@ -22,6 +22,7 @@ from torch import nn
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 
 REPOSITORIES = {
@@ -113,7 +114,7 @@ def _measure(workload: Workload, filters: dict[str, Any]) -> list[tuple[str, ...
         run = workload.published if key == "published" else workload.ours
         return lambda: run(filters[key], workload.batch)
 
-    flops = {key: count(call(key)) for key in NETWORKS}
+    flops = {key: executed(filters[key], call(key)) for key in NETWORKS}
     seconds: dict[str, list[float]] = {key: [] for key in NETWORKS}
     multiples: dict[str, list[float]] = {key: [] for key in NETWORKS}
     for _ in range(REPETITIONS):
@@ -139,6 +140,17 @@ def trained_values(filter_: Any) -> int:
     copies = getattr(filter_, "filter_models", [None])[1:]
     skipped = {id(p) for copy in copies for p in copy.dynamics_model.parameters()}
     return sum(p.numel() for p in filter_.parameters() if p.requires_grad and id(p) not in skipped)
+
+
+def executed(filter_: Any, run: Callable[[], object]) -> Flops:
+    """Operations of a run of the filter, all of it in PyTorch: those of NumPy are not counted."""
+    if not isinstance(filter_, ExtendedKalmanFilter) or not filter_.single_in_numpy:
+        return count(run)
+    filter_.single_in_numpy = False
+    try:
+        return count(run)
+    finally:
+        filter_.single_in_numpy = True
 
 
 @torch.no_grad()

@@ -5,8 +5,9 @@ Steps are pure: ``step(belief, evidence, generator) -> (belief, StepTrace)``. Mo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import torch
 from torch import Tensor
@@ -82,6 +83,12 @@ class Evidence:
 
     def __getitem__(self, index: int | slice) -> Evidence:
         return self._map(lambda tensor: tensor[index])
+
+    def __iter__(self) -> Iterator[Evidence]:
+        """The evidence of each step."""
+        tensors = (self.control, self.observation, self.noise, self.log_weights, self.present)
+        columns = (repeat(None) if tensor is None else tensor.unbind() for tensor in tensors)
+        return (Evidence(*row) for row in zip(*columns, strict=False))
 
     def __len__(self) -> int:
         return len(self.control)

@@ -188,8 +188,8 @@ class Filter(nn.Module, ABC):
         self, belief: Belief, evidence: Evidence, generator: torch.Generator
     ) -> Iterator[tuple[Belief, StepTrace]]:
         """Belief and trace of all T steps of ``evidence``, each from the belief of the previous one."""
-        for t in range(len(evidence)):
-            belief, trace = self.step(belief, evidence[t], generator)
+        for one in evidence:
+            belief, trace = self.step(belief, one, generator)
             yield belief, trace
 
 

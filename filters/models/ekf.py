@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,7 @@ from beliefscope.filters.filter import WEIGHTED, Architecture, Filter, WeightMod
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import product_of_experts, symmetric, weighted_average
 from beliefscope.filters.models.networks import Residual, Stack
+from beliefscope.filters.models.single_trajectory import SingleTrajectory
 
 
 def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> Gaussian:
@@ -85,7 +87,14 @@ class ExtendedKalmanFilter(Filter):
     The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters stay independent, as in
     the paper's text, unless ``architecture.feedback`` replaces each belief by the fused one. A belief that all filters
     have in common is (N, 1, n), and predicted once.
+
+    Attributes:
+        single_in_numpy: whether the equations of one trajectory may be executed by ``SingleTrajectory``.
+        single: only in the copy that executes ``steps`` of one trajectory.
     """
+
+    single_in_numpy = True
+    single: SingleTrajectory | None = None
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
@@ -108,6 +117,19 @@ class ExtendedKalmanFilter(Filter):
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
         return shared(belief)
 
+    def steps(
+        self, belief: Belief, evidence: Evidence, generator: torch.Generator
+    ) -> Iterator[tuple[Belief, StepTrace]]:
+        filter_ = copy.copy(self)  # shares the weights, which are looked up once
+        object.__setattr__(filter_, "single", self.single_trajectory(evidence.control))
+        return super(ExtendedKalmanFilter, filter_).steps(belief, evidence, generator)
+
+    def single_trajectory(self, control: Tensor) -> SingleTrajectory | None:
+        """None unless N is 1 on a CPU without gradients. control: (..., N, u), its part of the dynamics model."""
+        if control.shape[-2] > 1 or not control.is_cpu or torch.is_grad_enabled() or not self.single_in_numpy:
+            return None
+        return SingleTrajectory(self.dynamics) if type(self.dynamics) is Dynamics else None
+
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         predicted, bank = self.predict_and_update(belief, evidence)
         fused = self.fuse(bank, evidence.log_weights, evidence.present)
@@ -118,6 +140,8 @@ class ExtendedKalmanFilter(Filter):
         """The predicted bank, and the bank after the update of each filter with its own observation, (N, K, n)."""
         assert isinstance(belief, Gaussian)
         assert evidence.noise is not None
+        if belief.mean.shape[1] == 1 and (single := self.single or self.single_trajectory(evidence.control)):
+            return single.predict_and_update(belief, evidence)
         predicted = self.predict(belief, evidence.control.unsqueeze(1))
         bank = update(predicted, evidence.observation, evidence.noise)
         predicted = Gaussian(predicted.mean.expand_as(bank.mean), predicted.covariance.expand_as(bank.covariance))

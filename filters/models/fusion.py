@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import reduce
+from math import exp
 from typing import Literal
 
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor
 from beliefscope.filters.belief import Gaussian
 
 CovarianceRule = Literal["paper", "moments"]
+
+LEAST_WEIGHT = exp(-40.0)
 
 
 def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussian:
@@ -47,10 +50,10 @@ def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule =
         spread = bank.mean - mean.unsqueeze(-2)
         inner = bank.covariance + spread.unsqueeze(-1) * spread.unsqueeze(-2)
         return Gaussian(mean, symmetric((root.unsqueeze(-1) * root.unsqueeze(-2) * inner).sum(-3)))
-    # In log space, the ratio stays finite for one-hot weights that differ between components (else 0 / 0).
-    log_beta = torch.log_softmax(log_weights, dim=-2).clamp_min(-40.0)
-    share = torch.softmax(log_beta.unsqueeze(-1) + log_beta.unsqueeze(-2), dim=-3)
-    return Gaussian(mean, positive_definite((share * bank.covariance).sum(-3)))
+    # With this minimum, the ratio stays finite for one-hot weights that differ between components (else 0 / 0).
+    beta = beta.clamp_min(LEAST_WEIGHT)
+    outer = beta.unsqueeze(-1) * beta.unsqueeze(-2)
+    return Gaussian(mean, positive_definite((outer * bank.covariance).sum(-3) / outer.sum(-3)))
 
 
 def powers(log_weights: Tensor, present: Tensor | None = None) -> Tensor:

@@ -60,6 +60,7 @@ class InformationFilter(ExtendedKalmanFilter):
     """
 
     history = MEMORY
+    single_in_numpy = False
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
