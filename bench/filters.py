@@ -68,7 +68,7 @@ def speed() -> list[Row]:
             filter_ = build(architecture("door", name, networks))
             for workload in workloads():
                 call = partial(workload.ours, filter_, workload.batch)
-                flops, seconds, multiples = reference.executed(filter_, call), [], []
+                flops, seconds, multiples = reference.executed(call), [], []
                 for _ in range(REPETITIONS):
                     rate = measure_rate()
                     seconds.append(cpu_seconds(call))

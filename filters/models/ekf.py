@@ -89,11 +89,9 @@ class ExtendedKalmanFilter(Filter):
     have in common is (N, 1, n), and predicted once.
 
     Attributes:
-        single_in_numpy: whether the equations of one trajectory may be executed by ``SingleTrajectory``.
         single: only in the copy that executes ``steps`` of one trajectory.
     """
 
-    single_in_numpy = True
     single: SingleTrajectory | None = None
 
     def __init__(self, architecture: Architecture) -> None:
@@ -125,10 +123,14 @@ class ExtendedKalmanFilter(Filter):
         return super(ExtendedKalmanFilter, filter_).steps(belief, evidence, generator)
 
     def single_trajectory(self, control: Tensor) -> SingleTrajectory | None:
-        """None unless N is 1 on a CPU without gradients. control: (..., N, u), its part of the dynamics model."""
-        if control.shape[-2] > 1 or not control.is_cpu or torch.is_grad_enabled() or not self.single_in_numpy:
+        """None unless N is 1 on a CPU without gradients, and for other equations.
+
+        control: (..., N, u), its part of the dynamics model.
+        """
+        if control.shape[-2] > 1 or not control.is_cpu or torch.is_grad_enabled():
             return None
-        return SingleTrajectory(self.dynamics) if type(self.dynamics) is Dynamics else None
+        usual = type(self).predict is ExtendedKalmanFilter.predict and self.dynamics.is_usual
+        return SingleTrajectory(self.dynamics) if usual else None
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         predicted, bank = self.predict_and_update(belief, evidence)

@@ -60,7 +60,6 @@ class InformationFilter(ExtendedKalmanFilter):
     """
 
     history = MEMORY
-    single_in_numpy = False
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)

@@ -47,8 +47,6 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
     The update needs no sigma points, since virtual sensors observe the state itself: H = I.
     """
 
-    single_in_numpy = False
-
     def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
         predicted = unscented(self.dynamics(sigma_points(belief), control_part.unsqueeze(-2)))
         return Gaussian(predicted.mean, symmetric(predicted.covariance) + torch.diag_embed(self.dynamics.noise**2))

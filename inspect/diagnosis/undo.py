@@ -175,7 +175,6 @@ def _with_dynamics(setting: Setting, change: Callable[[Tensor, Tensor], Tensor])
         predicted, jacobian = with_jacobian(states, control)
         return change(states, predicted), jacobian
 
-    object.__setattr__(filter_, "single_in_numpy", False)
     object.__setattr__(filter_.dynamics, "forward", predict)
     object.__setattr__(filter_.dynamics, "with_jacobian", predict_with_jacobian)
     return _with_filter(setting, filter_)
