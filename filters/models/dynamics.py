@@ -64,11 +64,6 @@ class Dynamics(nn.Module):
             return change
         return change.index_fill(-1, torch.tensor(self.static, device=change.device), 0.0)
 
-    @property
-    def is_usual(self) -> bool:
-        """Whether all components move, by these equations: no subclass, and no method replaced in this object."""
-        return type(self) is Dynamics and not self.static and "with_jacobian" not in vars(self)
-
     def with_jacobian(self, states: Tensor, control_part: Tensor) -> tuple[Tensor, Tensor]:
         """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass."""
         offsets = torch.eye(self.n + 1, self.n, dtype=states.dtype, device=states.device)  # the last row is zero

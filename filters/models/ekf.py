@@ -15,7 +15,7 @@ from beliefscope.filters.filter import WEIGHTED, Architecture, Filter, WeightMod
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import product_of_experts, symmetric, weighted_average
 from beliefscope.filters.models.networks import Residual, Stack
-from beliefscope.filters.models.single_trajectory import SingleTrajectory
+from beliefscope.filters.models.single_trajectory import SingleTrajectory, is_usual
 
 
 def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> Gaussian:
@@ -129,7 +129,7 @@ class ExtendedKalmanFilter(Filter):
         """
         if control.shape[-2] > 1 or not control.is_cpu or torch.is_grad_enabled():
             return None
-        usual = type(self).predict is ExtendedKalmanFilter.predict and self.dynamics.is_usual
+        usual = type(self).predict is ExtendedKalmanFilter.predict and is_usual(self.dynamics)
         return SingleTrajectory(self.dynamics) if usual else None
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:

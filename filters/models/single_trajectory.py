@@ -16,6 +16,11 @@ Layer = tuple[np.ndarray, np.ndarray]
 """Transposed weight, bias."""
 
 
+def is_usual(dynamics: nn.Module) -> bool:
+    """Whether a dynamics model has the equations below: no static components, and no method that was replaced."""
+    return type(dynamics) is Dynamics and not dynamics.static and "with_jacobian" not in vars(dynamics)
+
+
 class SingleTrajectory:
     """The equations of ``ExtendedKalmanFilter`` for N = 1 and a common belief of all filters, without gradients.
 
