@@ -9,7 +9,16 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.inspect.statistics.contact_distance import contact_residual
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND, Reference, displacements_in_contact
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats, robust_line
+from beliefscope.inspect.statistics.signals import (
+    MIN_STEPS,
+    Array,
+    Mask,
+    lag,
+    noise_level,
+    repeats,
+    robust_fit,
+    robust_line,
+)
 
 AXES = "xyz"
 FORCE, TORQUE = "force", "torque"
@@ -20,6 +29,12 @@ POSITION, CHANGE = slice(0, 3), slice(3, 6)
 
 STEADY = 0.1
 """Largest median deviation from the median distance in contact, relative to the mean distance."""
+
+SAME_POSITION = 1e-6
+"""m: largest variation of the distance of set points from measured positions that are the same but for rounding."""
+
+LAWFUL = 0.005
+"""m: largest median error of the law of an impedance controller; twice that of most healthy episodes."""
 
 CALMER = 0.2
 """Relative variation of the force with the contact flag below which the flag is inverted."""
@@ -153,13 +168,39 @@ def control_statistics(episode: Episode) -> dict[str, float]:
     steps = np.arange(len(hand))
     known = (steps - shift >= 1) & (steps - shift < len(hand))
     a, b = change[known], moved[steps[known] - shift]
-    offset = np.median(controls[known][:, POSITION] - hand[steps[known] - shift - 1], axis=0)
     power = np.square(b).sum()
     return {
         "lag/control/all": delay,
         "scale/control/all": float((a * b).sum() / power) if power > 1e-12 else np.nan,
-        **{f"offset/control {axis}/all": float(m) for axis, m in zip(AXES, offset, strict=True)},
+        **impedance_statistics(episode),
     }
+
+
+def impedance_statistics(episode: Episode) -> dict[str, float]:
+    """How the hand p follows its set point s under the force F, on each axis: ``s - p = offset - c F + k v``.
+
+    The law of an impedance controller with compliance c (m/N) and damping, here a delay of k steps with the velocity v
+    (m per step). The offset (m) is that of the measured position, which neither contact nor motion hides. A gain g of
+    the force divides c by g. A robust fit; c and k are NaN if the set point is the measured position. The offset and c
+    are NaN where the law does not hold (``LAWFUL``), such as for a jammed arm.
+    """
+    hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
+    known = episode.present(HAND)[:-1]
+    force = np.zeros_like(hand)
+    if FORCE in episode.observations and episode.observations[FORCE].shape[1] == 3:
+        force, known = episode.observations[FORCE].astype(np.float64), known & episode.present(FORCE)[:-1]
+    distance = (controls[1:, POSITION] - hand[:-1])[known].T
+    columns = np.stack([np.ones_like(hand), -force, np.gradient(hand, axis=0)], axis=-1)[:-1][known].swapaxes(0, 1)
+    if distance.shape[1] < MIN_STEPS:
+        return {}
+    fit = robust_fit(columns, distance)
+    if np.ptp(distance) < SAME_POSITION:
+        fit[:, 1:] = np.nan
+    else:
+        error = np.median(np.abs(distance - (columns @ fit[..., None])[..., 0]), axis=1)
+        fit[error > LAWFUL, :2] = np.nan
+    names = ("offset/control", f"compliance/{FORCE}", "following/control")
+    return {f"{name} {AXES[i]}/all": float(fit[i, k]) for k, name in enumerate(names) for i in range(3)}
 
 
 def contact_distance_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:

@@ -71,6 +71,8 @@ KINDS = {
     "lever": ("lever of the torque{axis}", False, 0.01),
     "axes": ("evidence for the order of the axes", False, 0.3),
     "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),
+    "compliance": ("yielding of the hand to the force{axis}", False, 2e-5),
+    "following": ("steps by which the hand follows its set point{axis}", False, 0.05),
     "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
@@ -121,6 +123,7 @@ OF_KINDS = {
     "angle error": display_unit("rad"),
     **dict.fromkeys(("shift", "hand offset", "object offset"), ("px", 1.0)),
     "unflagged force": ("N", 1.0),
+    "compliance": ("mm/N", 1e3),
     **dict.fromkeys(LENGTHS, display_unit("m")),
 }
 """Kind of statistic -> its unit for display, and the factor from its own."""

@@ -21,6 +21,9 @@ Fisher's z, 1 / sqrt(number of steps), and itself by step of the lag. A smooth s
 MIN_STEPS = 10
 """Minimum number of steps of an estimate."""
 
+FIT_ITERATIONS = 6
+"""Of a robust fit; further ones hardly change it."""
+
 NORMAL_MAD = 0.6745
 """Median absolute deviation of the standard normal distribution."""
 
@@ -38,6 +41,23 @@ def robust_line(values: Array, at: Mask) -> tuple[Array, Array]:
     i, j = np.triu_indices(len(steps), 1)
     slope = np.median((chosen[j] - chosen[i]) / (steps[j] - steps[i])[:, None], axis=0)
     return np.median(chosen - slope * steps[:, None], axis=0), slope
+
+
+def robust_fit(columns: Array, values: Array) -> Array:
+    """(A, k) coefficients of values (A, T) by columns (A, T, k) with Huber's weights, by reweighted least squares.
+
+    Residuals above their median count with their size instead of its square.
+    """
+    scale = np.maximum(np.abs(columns).mean(1, keepdims=True), 1e-12)  # of units
+    columns, weight = columns / scale, np.ones_like(values)
+    for _ in range(FIT_ITERATIONS):
+        weighted = columns * weight[..., None]
+        gram, moment = weighted.mT @ columns, weighted.mT @ values[..., None]
+        fit = np.linalg.pinv(gram, hermitian=True) @ moment
+        left = np.abs(values - (columns @ fit)[..., 0])
+        weight = 1.0 / np.maximum(left / np.maximum(np.median(left, axis=1, keepdims=True), 1e-9), 1.0)
+    result: Array = fit[..., 0] / scale[:, 0]
+    return result
 
 
 def noise_level(values: Array, present: Mask | None = None) -> Array:

@@ -23,5 +23,8 @@ CONTACT_DISTANCE = "contact distance*/*"
 IMAGE = f"module */*image*|{LABELS}|{WEIGHTS}"
 """Modules that use the image."""
 
+IMPEDANCE = "offset/control*|compliance/force*|following/control*"
+"""How the measured hand follows its set point under the measured force."""
+
 HAPTICS = f"module */*haptics*|{LABELS}|{WEIGHTS}"
 """Modules that use haptics."""

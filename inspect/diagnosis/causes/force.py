@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import HAPTICS
+from beliefscope.inspect.diagnosis.causes.consequences import HAPTICS, IMPEDANCE
 
 CONTACT = "agreement/contact/*|opposition/contact/*|unflagged force/contact/*|lag/contact/*"
 """Relations of the force and the contact flag."""
 
 READINGS = (
     "level/force*|drift/force*|change/force*|noise/force*|size/force/*|roughness/force/*|lever/force*|axes/force/*"
-    "|direction/force/*"
+    f"|direction/force/*|{IMPEDANCE}"
 )
 """Statistics of the values of the force."""
 
@@ -19,7 +19,7 @@ CAUSES = (
         "force.bias",
         "Force biased",
         (Symptom("level/force*", 0),),
-        f"drift/force*|direction/force/*|{CONTACT}|{HAPTICS}",
+        f"drift/force*|direction/force/*|offset/control*|{CONTACT}|{HAPTICS}",
         "Tare the force sensor in free motion.",
         "tare force",
     ),
@@ -27,14 +27,18 @@ CAUSES = (
         "force.drift",
         "Force drifting",
         (Symptom("drift/force*", 0),),
-        f"level/force*|direction/force/*|size/force/*|roughness/force/*|axes/force/*|lever/force*|{CONTACT}|{HAPTICS}",
+        f"level/force*|direction/force/*|size/force/*|roughness/force/*|axes/force/*|lever/force*|{IMPEDANCE}"
+        f"|{CONTACT}|{HAPTICS}",
         "Tare the force sensor before each run and check its temperature.",
         "detrend force",
     ),
     Cause(
         "force.gain",
         "Force gain wrong",
-        (Symptom("lever/force*|size/force/*", 0), Symptom("size/force/*|noise/force*", 0)),
+        (
+            Symptom("lever/force*|size/force/*|compliance/force*", 0),
+            Symptom("size/force/*|noise/force*|compliance/force*", 0),
+        ),
         f"level/force*|drift/force*|change/force*|saturation/force*|{CONTACT}|{HAPTICS}",
         "Check the units and the calibration of the force sensor.",
         "scale force",
@@ -42,7 +46,11 @@ CAUSES = (
     Cause(
         "force.sign",
         "Force sign inverted",
-        (Symptom("direction/force/*", 1), Symptom("lever/force*", 0)),
+        (
+            Symptom("direction/force/*", 1),
+            Symptom("lever/force*", 0),
+            Symptom("compliance/force*", -1, optional=True),
+        ),
         f"level/force*|drift/force*|{CONTACT}|{HAPTICS}",
         "Invert the force, or correct the frame of the sensor.",
         "negate force",
@@ -51,7 +59,8 @@ CAUSES = (
         "force.axes",
         "Force axes exchanged",
         (Symptom("axes/force/*", -1),),
-        f"lever/force*|direction/force/*|level/force*|drift/force*|noise/force*|stuck/force*|{CONTACT}|{HAPTICS}",
+        f"lever/force*|direction/force/*|level/force*|drift/force*|noise/force*|stuck/force*|{IMPEDANCE}|{CONTACT}"
+        f"|{HAPTICS}",
         "Correct the frame of the force sensor.",
         "permute force|drop haptics",
     ),

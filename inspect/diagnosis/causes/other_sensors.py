@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import CONTACT_DISTANCE, DYNAMICS, HAPTICS
+from beliefscope.inspect.diagnosis.causes.consequences import CONTACT_DISTANCE, DYNAMICS, HAPTICS, IMPEDANCE
 from beliefscope.inspect.diagnosis.causes.image import HAND, LANDMARKS
 
 IN_PHASES = "|".join(
@@ -27,7 +27,7 @@ CAUSES = (
         "effector.noise",
         "End-effector position noisy",
         (Symptom("position noise/effector_position*"),),
-        f"{LANDMARKS}|direction/force/*|scale/control/*|lag/control/*|offset/control*|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}"
+        f"{LANDMARKS}|direction/force/*|scale/control/*|lag/control/*|{IMPEDANCE}|{LAGS}|{CONTACT_DISTANCE}|{HAPTICS}"
         f"|{DYNAMICS}",
         "Check the joint encoders and the filter of the robot's kinematics.",
         "drop haptics",
@@ -68,7 +68,8 @@ CAUSES = (
         "haptics.dropout",
         "Haptics lost: all readings repeat the last one",
         (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
-        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|{LANDMARKS}|position noise/*"
+        f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|following/*|{LANDMARKS}"
+        f"|position noise/*"
         f"|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
@@ -76,8 +77,8 @@ CAUSES = (
     Cause(
         "haptics.delay",
         "Haptics delayed",
-        (Symptom("lag/image/*", -1),),
-        f"lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*|{CONTACT_DISTANCE}|{HAPTICS}"
+        (Symptom("lag/image/*", -1, otherwise=(Symptom("following/control*", 1),)),),
+        f"{IMPEDANCE}|lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*|{CONTACT_DISTANCE}|{HAPTICS}"
         f"|{DYNAMICS}",
         "Synchronise the clocks of camera and robot.",
         "advance haptics",
@@ -85,8 +86,8 @@ CAUSES = (
     Cause(
         "control.delay",
         "Controls delayed",
-        (Symptom("lag/control/*", 1),),
-        f"scale/control/*|offset/control*|lag/dynamics/*|{DYNAMICS}",
+        (Symptom("lag/control/*", 1, otherwise=(Symptom("following/control*", -1),)),),
+        f"scale/control/*|{IMPEDANCE}|lag/dynamics/*|{DYNAMICS}",
         "Synchronise the controls with the sensors.",
         "advance control",
     ),
