@@ -17,7 +17,7 @@ from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_
 from beliefscope.datasets.store import open_dataset
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
-from beliefscope.inspect.diagnosis.vector_checks import free_motion, saturated
+from beliefscope.inspect.diagnosis.vector_checks import free_motion, impedance_statistics, saturated
 from beliefscope.inspect.diagnosis.window_checks import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
@@ -182,7 +182,8 @@ def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[
         force = scale * episode.observations["force"][:, order]
         faulty = replace(episode, observations={**episode.observations, "force": force})
         rows.append(sensor_statistics(faulty, reference(task)))
-    return {name: float(np.nanmean([row.get(name, np.nan) for row in rows])) for name in rows[0]}
+    columns = {name: [row[name] for row in rows if np.isfinite(row.get(name, np.nan))] for name in rows[0]}
+    return {name: float(np.mean(column)) for name, column in columns.items() if column}
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -214,6 +215,41 @@ def test_delay_and_scale_of_controls(task: str) -> None:
     healthy = sensor_statistics(first, None)
     assert (healthy["lag/control/all"], healthy["scale/control/all"]) == (0.0, pytest.approx(1.0))
     assert max(abs(healthy[f"offset/control {axis}/all"]) for axis in "xyz") < 1e-6
+
+
+@pytest.mark.parametrize("episode", range(3))
+def test_the_law_of_the_impedance_controller(episode: int) -> None:
+    """Offsets of the hand and biases, gains and signs of the force change its coefficients exactly, and nothing else.
+
+    Tolerance: readings are float32.
+    """
+    with open_dataset("datasets/samples/push-field.h5") as data:
+        clean = data[episode]
+
+    def law(faults: str = "") -> dict[str, float]:
+        return impedance_statistics(Faults.parse(faults).apply(clean) if faults else clean)
+
+    healthy, moved, biased, scaled, negated = (
+        law(f) for f in ("", "effector_offset=0.02", "force_bias=2", "force_gain=2", "force_gain=-1")
+    )
+    offset, compliance, following = "offset/control x/all", "compliance/force x/all", "following/control x/all"
+    assert 2e-4 < healthy[compliance] < 2e-2  # m/N
+    assert 0.5 < healthy[following] < 3.0  # steps
+    assert abs(healthy[offset]) < 0.008
+    assert moved[offset] == pytest.approx(healthy[offset] - 0.02, abs=1e-5)
+    assert moved[compliance] == pytest.approx(healthy[compliance], rel=1e-3)
+    assert biased[offset] == pytest.approx(healthy[offset] + 2.0 * healthy[compliance], abs=1e-5)
+    assert scaled[compliance] == pytest.approx(healthy[compliance] / 2.0, rel=1e-3)
+    assert negated[compliance] == pytest.approx(-healthy[compliance], rel=1e-3)
+    for values in (moved, biased, scaled, negated):
+        assert values[following] == pytest.approx(healthy[following], rel=1e-3)
+
+
+def test_a_set_point_that_is_the_measured_position_says_nothing_about_the_controller() -> None:
+    values = impedance_statistics(episodes("door")[0])
+    assert abs(values["offset/control x/all"]) < 1e-6
+    assert np.isnan(values["compliance/force x/all"])
+    assert np.isnan(values["following/control x/all"])
 
 
 def test_image_shift_is_registered() -> None:

@@ -22,6 +22,7 @@ from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, OF_COMPONENTS
         ("contact distance/labels x/all", "cm", 100.0),
         ("offset/labels angle/all", "deg", 57.29577951308232),
         ("offset/control z/all", "cm", 100.0),
+        ("compliance/force z/all", "mm/N", 1000.0),
         ("level/force y/free motion", "N", 1.0),
         ("drift/torque x/all", "N m/s", 1.0),
         ("level/pressure/all", "", 1.0),

@@ -12,6 +12,7 @@ from beliefscope.inspect.statistics.signals import (
     long_runs,
     noise_level,
     repeats,
+    robust_fit,
     robust_line,
 )
 
@@ -86,3 +87,15 @@ def test_repeats_at_the_start_are_a_delay() -> None:
     assert not repeats(delayed).any()
     assert repeats(np.where(np.arange(40)[:, None] < 20, values, values[20])).sum() == 19
     assert repeats(np.zeros((40, 1))).sum() == 39
+
+
+def test_robust_fit_recovers_coefficients_beside_outliers() -> None:
+    """Of any unit: the columns differ by six orders of magnitude."""
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(2, 200, 3)) * np.array([1.0, 1e3, 1e-3])
+    coefficients = np.array([[2.0, -1e-3, 5e2], [-1.0, 4e-3, 0.0]])
+    exact = (columns @ coefficients[..., None])[..., 0]
+    np.testing.assert_allclose(robust_fit(columns, exact), coefficients, rtol=1e-9, atol=1e-9)
+    values = exact + rng.normal(scale=0.01, size=exact.shape)
+    values[:, ::10] += 50.0
+    np.testing.assert_allclose(robust_fit(columns, values), coefficients, rtol=0.02, atol=2.0)
