@@ -39,6 +39,11 @@ class Effect:
     ratios: Mapping[str, float]
     complete: bool
 
+    @property
+    def failed(self) -> bool:
+        """Whether errors are clearly larger after undoing the cause, which does not show the run without it."""
+        return any(ratio < 1.0 / VISIBLE[name] for name, ratio in self.ratios.items() if name != NEES)
+
 
 def effect_ratios(before: Sequence[Trace], after: Sequence[Trace]) -> dict[str, float]:
     """Ratios of the root mean square errors by unit, and of the mean NEES, over the counted steps of all episodes.
@@ -63,7 +68,7 @@ def _totals(traces: Sequence[Trace]) -> dict[str, float]:
 def is_visible(deviations: Mapping[str, Deviation], effect: Effect | None) -> bool:
     """Whether a fault affects the filter: its error or calibration differ from those without the fault.
 
-    If it was undone, these are known for the same episodes. A sensor that could only be removed affects the filter if
+    If it was undone, these are known for the same episodes, unless the undo failed. A sensor that could only be removed affects the filter if
     an error decreases without it. Beyond that, errors and calibration must be outside of the healthy range or, if the
     fault was undone or removing the sensor changes nothing, show as alarms, because episodes differ.
 
@@ -72,7 +77,7 @@ def is_visible(deviations: Mapping[str, Deviation], effect: Effect | None) -> bo
         effect: of undoing the fault; None if it was not undone.
     """
     explained = False
-    if effect is not None:
+    if effect is not None and not effect.failed:
         if any(_large(name, ratio) for name, ratio in effect.ratios.items() if effect.complete or name != NEES):
             return True
         unused = bool(effect.ratios) and all(1.0 / UNUSED < ratio < UNUSED for ratio in effect.ratios.values())
