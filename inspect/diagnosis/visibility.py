@@ -68,9 +68,10 @@ def _totals(traces: Sequence[Trace]) -> dict[str, float]:
 def is_visible(deviations: Mapping[str, Deviation], effect: Effect | None) -> bool:
     """Whether a fault affects the filter: its error or calibration differ from those without the fault.
 
-    If it was undone, these are known for the same episodes, unless the undo failed. A sensor that could only be removed affects the filter if
-    an error decreases without it. Beyond that, errors and calibration must be outside of the healthy range or, if the
-    fault was undone or removing the sensor changes nothing, show as alarms, because episodes differ.
+    If it was undone, these are known for the same episodes, unless the undo failed. A sensor that could only be
+    removed affects the filter if an error decreases without it. Beyond that, errors and calibration must be outside of
+    the healthy range or, if the fault was undone or removing the sensor changes nothing, show as alarms, because
+    episodes differ.
 
     Args:
         deviations: by statistic.

@@ -37,6 +37,7 @@ def effect(ratio: float, complete: bool) -> Effect:
         (1.6, False, effect(1.0, False), False),  # it does not use the sensor
         (1.6, False, effect(0.5, False), True),  # it needs the sensor, whose healthy readings are unknown
         (1.1, False, effect(0.5, False), False),
+        (1.6, False, effect(0.5, True), True),  # the undo failed, whose errors are larger than with the fault
     ],
 )
 def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool) -> None:
@@ -47,6 +48,11 @@ def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool
 def test_calibration_may_change_in_both_directions(nees: float, visible: bool) -> None:
     changed = Effect(Recovery(0.0, 0.0, 0.0, 0.0, "position"), 0.0, {"nees/fused/all": nees}, True)
     assert is_visible({}, changed) is visible
+
+
+def test_calibration_after_a_failed_undo_says_nothing() -> None:
+    ratios = {"error//all": 0.5, "nees/fused/all": 0.25}
+    assert not is_visible({}, Effect(Recovery(-1.0, 0.0, 0.0, 0.0, "position"), 0.0, ratios, True))
 
 
 def test_ratios_are_those_of_all_steps_of_all_episodes() -> None:
