@@ -112,8 +112,8 @@ def wrench_statistics(episode: Episode) -> dict[str, float]:
     """Laws of a rigid contact: torque = lever x force + constant, and a force that opposes the hand's motion.
 
     A gain g of the force divides the lever by g; a sign inverts lever and motion; an exchange of axes breaks both laws.
-    A bias of force or torque changes only the constant. The roughness, noise relative to the standard deviation, tells
-    noise from a gain, which does not change it.
+    A bias of force or torque changes only the constant. The roughness, noise relative to the standard deviation,
+    separates noise from a gain, which does not change it.
     """
     observations = episode.observations
     values: dict[str, float] = {}
