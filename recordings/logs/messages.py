@@ -192,8 +192,9 @@ def _ends(ticks: Mapping[str, NDArray[np.int64]], required: set[str], truth: set
     last = min((int(ticks[topic].max()) for topic in truth), default=max(int(t.max()) for t in ticks.values()))
     if last < first:
         raise BadInput(f"the topics of state and sensors do not overlap in time: {', '.join(sorted(required))}")
-    for topic in sorted(required):  # the only message of a topic may be a constant
-        if ticks[topic].min() < ticks[topic].max() < first:
+    for topic in sorted(required):  # the only message of a topic may be a constant, the last one valid until the next
+        own = np.unique(ticks[topic])
+        if len(own) > 1 and own[-1] + np.diff(own).max() < first:
             later = max(required, key=lambda other: int(ticks[other].min()))
             raise BadInput(f"topic {topic!r} ends before {later!r} begins: they do not overlap in time")
     return first, last
