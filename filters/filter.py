@@ -188,8 +188,8 @@ class Filter(nn.Module, ABC):
         self, belief: Belief, evidence: Evidence, generator: torch.Generator
     ) -> Iterator[tuple[Belief, StepTrace]]:
         """Belief and trace of all T steps of ``evidence``, each from the belief of the previous one."""
-        for one in evidence:
-            belief, trace = self.step(belief, one, generator)
+        for step_evidence in evidence:
+            belief, trace = self.step(belief, step_evidence, generator)
             yield belief, trace
 
 

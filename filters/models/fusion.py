@@ -14,6 +14,7 @@ from beliefscope.filters.belief import Gaussian
 CovarianceRule = Literal["paper", "moments"]
 
 LEAST_WEIGHT = exp(-40.0)
+"""Smallest weight of a filter, whose square is still a normal number in single precision."""
 
 
 def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussian:

@@ -17,6 +17,7 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     contact_changes,
     contact_distance_statistics,
     free_motion,
+    impedance_statistics,
     saturated,
     stuck,
     vector_statistics,
@@ -40,7 +41,8 @@ def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference)
-    values |= vector_statistics(episode) | contact_distance_statistics(episode, reference)
+    values |= vector_statistics(episode) | impedance_statistics(episode)
+    values |= contact_distance_statistics(episode, reference)
     values |= window_statistics(episode, reference)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1

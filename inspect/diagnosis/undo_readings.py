@@ -144,8 +144,8 @@ def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
 
 def scale_force(setting: Setting, deviations: Deviations) -> Setting | None:
     """Force of healthy size: from how much the hand yields to it or, where this is unknown, from its size."""
-    yielding = [ratio for axis in "xyz" if (ratio := _ratio(deviations, f"compliance/force {axis}/all"))]
-    gain = 1.0 / float(np.median(yielding)) if yielding else _ratio(deviations, "size/force/contact")
+    ratios = [ratio for axis in "xyz" if (ratio := _ratio(deviations, f"compliance/force {axis}/all"))]
+    gain = 1.0 / float(np.median(ratios)) if ratios else _ratio(deviations, "size/force/contact")
     return None if not gain else _with_readings(setting, "force", lambda force, episode: force / gain)
 
 

@@ -86,7 +86,7 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     if CONTACT not in episode.observations:
         return {}
     flag = episode.observations[CONTACT][:, 0] > 0.5
-    changes = float(np.mean(flag[1:] != flag[:-1])) if len(flag) > 1 else np.nan
+    changes = contact_changes(episode) / (len(flag) - 1) if len(flag) > 1 else np.nan
     values = {f"share/{CONTACT}/all": float(flag.mean()), f"toggles/{CONTACT}/all": changes}
     if FORCE not in episode.observations:
         return values
@@ -125,8 +125,8 @@ def wrench_statistics(episode: Episode) -> dict[str, float]:
     if len(force) < MIN_STEPS or force.shape[1] != 3:
         return values
     size = float(np.sqrt(np.square(force - force.mean(0)).sum(1).mean()))
-    rough = float(np.linalg.norm(noise_level(readings, at)))
-    values |= {f"size/{FORCE}/contact": size, f"roughness/{FORCE}/contact": rough / size if size > 0.0 else np.nan}
+    noise = float(np.linalg.norm(noise_level(readings, at)))
+    values |= {f"size/{FORCE}/contact": size, f"roughness/{FORCE}/contact": noise / size if size > 0.0 else np.nan}
     if TORQUE in observations and observations[TORQUE].shape[1] == 3:
         torque = observations[TORQUE].astype(np.float64)[at]
         values[f"size/{TORQUE}/contact"] = float(np.sqrt(np.square(torque - torque.mean(0)).sum(1).mean()))
@@ -156,12 +156,10 @@ def lever(force: Array, torque: Array) -> tuple[Array, float]:
 
 
 def control_statistics(episode: Episode) -> dict[str, float]:
-    """Delay, scale and offset of controls that command a hand position, against the measured position."""
-    if HAND not in episode.observations or episode.controls.shape[1] < CHANGE.stop:
+    """Delay and scale of controls that command a hand position, against the measured position."""
+    if not commands_hand(episode):
         return {}
     hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
-    if hand.shape[1] != 3:
-        return {}
     moved, change = np.diff(hand, axis=0, prepend=hand[:1]), controls[:, CHANGE]
     delay = lag(change, moved)[0]
     shift = 0 if np.isnan(delay) else int(delay)
@@ -172,8 +170,13 @@ def control_statistics(episode: Episode) -> dict[str, float]:
     return {
         "lag/control/all": delay,
         "scale/control/all": float((a * b).sum() / power) if power > 1e-12 else np.nan,
-        **impedance_statistics(episode),
     }
+
+
+def commands_hand(episode: Episode) -> bool:
+    """Whether the controls command the position (x, y, z) of a hand that is measured."""
+    measured = HAND in episode.observations and episode.observations[HAND].shape[1] == 3
+    return measured and episode.controls.shape[1] >= CHANGE.stop
 
 
 def impedance_statistics(episode: Episode) -> dict[str, float]:
@@ -184,13 +187,15 @@ def impedance_statistics(episode: Episode) -> dict[str, float]:
     the force divides c by g. A robust fit; c and k are NaN if the set point is the measured position. The offset and c
     are NaN where the law does not hold (``LAWFUL``), such as for a jammed arm.
     """
+    if not commands_hand(episode):
+        return {}
     hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
-    known = episode.present(HAND)[:-1]
+    present = episode.present(HAND)[:-1]
     force = np.zeros_like(hand)
     if FORCE in episode.observations and episode.observations[FORCE].shape[1] == 3:
-        force, known = episode.observations[FORCE].astype(np.float64), known & episode.present(FORCE)[:-1]
-    distance = (controls[1:, POSITION] - hand[:-1])[known].T
-    columns = np.stack([np.ones_like(hand), -force, np.gradient(hand, axis=0)], axis=-1)[:-1][known].swapaxes(0, 1)
+        force, present = episode.observations[FORCE].astype(np.float64), present & episode.present(FORCE)[:-1]
+    distance = (controls[1:, POSITION] - hand[:-1])[present].T
+    columns = np.stack([np.ones_like(hand), -force, np.gradient(hand, axis=0)], axis=-1)[:-1][present].swapaxes(0, 1)
     if distance.shape[1] < MIN_STEPS:
         return {}
     fit = robust_fit(columns, distance)

@@ -86,8 +86,8 @@ def _all_nodes(path: Path) -> set[str]:
 
 def _elsewhere(path: Path) -> str:
     """Where the episodes' ends are in an archive or folder of a whole store."""
-    found = sorted(node for node in _all_nodes(path) if node.endswith(f"/{ENDS}"))
-    return f"; it is in the folder {found[0].removesuffix(f'/{ENDS}')!r}, expected at the top" if found else ""
+    places = sorted(node for node in _all_nodes(path) if node.endswith(f"/{ENDS}"))
+    return f"; it is in the folder {places[0].removesuffix(f'/{ENDS}')!r}, expected at the top" if places else ""
 
 
 def _values(path: Path, node: str, array: Any, wanted: bool) -> NDArray[Any]:

@@ -73,16 +73,15 @@ def import_(
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
         result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
-        imported = [episodes[episode]]
-        return replace(
-            result, document={**result.document, **_ranges(imported)}, text=f"{result.text}, {_values(imported)}"
-        )
+        ranges = _ranges([episodes[episode]])
+        return replace(result, document={**result.document, **ranges}, text=f"{result.text}, {_values(ranges)}")
     check_complete(episodes)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
-    document = {"task": mapping.task, "episodes": len(episodes), "steps": steps} | _ranges(episodes)
+    ranges = _ranges(episodes)
+    document = {"task": mapping.task, "episodes": len(episodes), "steps": steps} | ranges
     count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
-    return console.Result(document, f"{count} of {mapping.task}, {steps} steps, {_values(episodes)}", output)
+    return console.Result(document, f"{count} of {mapping.task}, {steps} steps, {_values(ranges)}", output)
 
 
 def _ranges(episodes: list[Episode]) -> dict[str, Any]:
@@ -91,16 +90,15 @@ def _ranges(episodes: list[Episode]) -> dict[str, Any]:
 
     states = np.concatenate([episode.states for episode in episodes])
     ranges = {
-        component.name: {"unit": component.unit, "min": float(known.min()) + 0.0, "max": float(known.max()) + 0.0}
+        component.name: {"unit": component.unit, "min": float(finite.min()) + 0.0, "max": float(finite.max()) + 0.0}
         for component, values in zip(episodes[0].task.components, states.T, strict=True)
-        if len(known := values[np.isfinite(values)])
+        if len(finite := values[np.isfinite(values)])
     }
     return {"dt": episodes[0].dt, "ranges": ranges}
 
 
-def _values(episodes: list[Episode]) -> str:
+def _values(document: dict[str, Any]) -> str:
     """``_ranges`` as text."""
-    document = _ranges(episodes)
     parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in document["ranges"].items()]
     return "; ".join([f"{document['dt']:.4g} s each", *parts])
 

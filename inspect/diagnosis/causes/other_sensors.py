@@ -69,8 +69,7 @@ CAUSES = (
         "Haptics lost: all readings repeat the last one",
         (Symptom("stuck/effector_position*"), Symptom("stuck/force*|stuck/torque*", 1, 0.3)),
         f"*/force*|*/torque*|*/contact/*|lag/*|shift/image*|scale/control/*|offset/*|following/*|{LANDMARKS}"
-        f"|position noise/*"
-        f"|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
+        f"|position noise/*|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Check the connection of the wrist sensor and the robot; until then, run the filter without haptics.",
         "drop haptics",
     ),
@@ -78,8 +77,8 @@ CAUSES = (
         "haptics.delay",
         "Haptics delayed",
         (Symptom("lag/image/*", -1, otherwise=(Symptom("following/control*", 1),)),),
-        f"{IMPEDANCE}|lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*|{CONTACT_DISTANCE}|{HAPTICS}"
-        f"|{DYNAMICS}",
+        f"{IMPEDANCE}|lag/contact/*|lag/control/*|lag/dynamics/*|{LANDMARKS}|level/*|direction/force/*"
+        f"|{CONTACT_DISTANCE}|{HAPTICS}|{DYNAMICS}",
         "Synchronise the clocks of camera and robot.",
         "advance haptics",
     ),
