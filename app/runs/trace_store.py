@@ -4,7 +4,7 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -15,7 +15,7 @@ from weakref import WeakValueDictionary
 
 from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
-from beliefscope.app.runs.examples import Example, available
+from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
@@ -101,7 +101,7 @@ class TraceStore:
         """The first example; without one, the first task and filter. Raises BadInput if no task can be displayed."""
         with self._lock:
             catalogs, problems = self._catalogs
-            if example := next(self._examples(), None):
+            if example := next((example for example in self._examples() if not example.setup), None):
                 catalog, filter_ = catalogs[example.task], example.filter
             else:
                 first = next((catalog for catalog in catalogs.values() if not catalog.problem), None)
@@ -111,11 +111,17 @@ class TraceStore:
             data, episodes = next(iter(catalog.data.items()))
             return Selection(catalog.task.name, filter_, first_moment(episodes)[0], data=data)
 
-    def _examples(self) -> Iterator[Example]:
-        """None for a server with filters, data sets or tasks of the user."""
-        settings = self.settings
-        has_own = settings.data or settings.checkpoints or settings.tasks
-        return iter(()) if has_own else available(self._catalogs[0])
+    def _examples(self) -> list[Example]:
+        """The examples, first those of the user's data.
+
+        None for a server with filters, tasks or other data sets of the user.
+        """
+        catalogs, settings = self._catalogs[0], self.settings
+        needed = {example.task for example in EXAMPLES if example.setup}
+        own = {task: catalog.user_data for task, catalog in catalogs.items() if catalog.user_data}
+        if settings.checkpoints or settings.tasks or own.keys() - needed:
+            return []
+        return sorted(available(catalogs), key=lambda example: example.task not in own)
 
     def request(self, selection: Selection) -> TracedRun:
         """The selected run; its computation is started if necessary.

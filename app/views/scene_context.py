@@ -26,6 +26,7 @@ from beliefscope.inspect.figures.scene_shapes import (
     grid,
     map_pixels,
 )
+from beliefscope.inspect.figures.soft_shadows import SoftShadows
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.sensors import camera_images
@@ -43,10 +44,13 @@ _TICKS = np.arange(-1.0, 1.01, 0.25)
 FLOOR_LINES = np.array(
     [[(-1.0, a, 0.0), (1.0, a, 0.0)] for a in _TICKS] + [[(a, -1.0, 0.0), (a, 1.0, 0.0)] for a in _TICKS], np.float32
 )
+FLOOR_CENTRE = (0.4, 0.0)  # m
+FLOOR_HALF_WIDTH = 1.0  # m
+SHADOW_HEIGHT = -0.002  # m, below the lines of the floor
 
 
 def set_png(handle: Any, prop: str, pixels: NDArray[np.uint8]) -> None:
-    """Set the image of a viser handle to (H, W) gray or (H, W, 3) pixels.
+    """Set the image of a viser handle to (H, W) gray, (H, W, 2) gray and opacity, or (H, W, 3) pixels.
 
     Sets the private property behind viser's ``image``, whose setter takes five times as long and accepts no gray
     images.
@@ -193,13 +197,39 @@ class RobotScene:
             if movable[part.body]:
                 self._movable.append((mesh, part))
         server.scene.add_line_segments(
-            "/floor", FLOOR_LINES, GRAY, thickness=1.0, thickness_units="screen", position=(0.4, 0.0, 0.0)
+            "/floor", FLOOR_LINES, GRAY, thickness=1.0, thickness_units="screen", position=(*FLOOR_CENTRE, 0.0)
+        )
+        # The renderer's own shadows need the slow material and halve the frame rate again.
+        self._shadows = SoftShadows(parts, FLOOR_CENTRE, FLOOR_HALF_WIDTH)
+        self._shadow_image: Any = server.scene.add_image(
+            "/bodies/shadows",
+            np.zeros((1, 1, 3), np.uint8),
+            1.0,
+            1.0,
+            format="png",
+            cast_shadow=False,
+            receive_shadow=False,
         )
 
     def move(self, positions: Array, rotations: Array) -> None:
         """Move all bodies: (B, 3) m and (B, 3, 3), one step of ``Replay``."""
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = positions[body], SO3.from_matrix(rotations[body]).wxyz
+        self._show_shadows(np.rint(255.0 * self._shadows.opacity(positions, rotations)).astype(np.uint8))
+
+    def _show_shadows(self, opacity: NDArray[np.uint8]) -> None:
+        """Show the part of the image with shadows: without a GPU, transparent pixels cost as much as others."""
+        rows, columns = (np.flatnonzero(opacity.max(axis=axis)) for axis in (1, 0))
+        self._shadow_image.visible = bool(rows.size)
+        if not rows.size:
+            return
+        first, last = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
+        shadow = opacity[first[1] : last[1], first[0] : last[0]]
+        set_png(self._shadow_image, "_data", np.stack([np.zeros_like(shadow), shadow], axis=-1))
+        pixel = 2.0 * FLOOR_HALF_WIDTH / len(opacity)
+        self._shadow_image.scale = (*(pixel * (last - first)), 1.0)
+        centre = FLOOR_CENTRE + pixel * (first + last) / 2.0 - FLOOR_HALF_WIDTH
+        self._shadow_image.position = (*centre, SHADOW_HEIGHT)
 
     def set_translucent(self, translucent: bool) -> None:
         """Make the hand and the objects translucent, or as opaque as in the model."""

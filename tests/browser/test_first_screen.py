@@ -45,7 +45,12 @@ def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: A
 
     chips = page.page.locator("#intro .chip")
     assert chips.count() == EXAMPLES
-    chips.nth(2).click()
+    chips.filter(has_text="Real push").click()
+    setup = page.page.get_by_role("dialog", name="Real push")
+    assert setup.locator("pre").text_content() == "beliefscope serve --data mit_push"
+    page.page.keyboard.press("Escape")
+    assert not setup.is_visible()
+    chips.filter(has_text="Frozen image").click()
     page.until("() => document.querySelector('#finding').dataset.source === 'fault'")
     assert page.state["faults"].startswith("image_frozen")
     assert finding.text_content().startswith("Image frozen from step 3")

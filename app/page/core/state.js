@@ -305,8 +305,9 @@ export function parsePermalink(search, catalog) {
  */
 export function completeLink(search, { examples, tasks }) {
   const query = new URLSearchParams(search);
-  if (query.has('task') || !examples.length) return search;
-  const link = new URLSearchParams(examples[0].link);
+  const first = examples.find(({ setup }) => !setup);
+  if (query.has('task') || !first) return search;
+  const link = new URLSearchParams(first.link);
   const task = tasks.find(({ name }) => name === link.get('task'));
   /**
    * @param {string} key

@@ -427,7 +427,11 @@ export interface components {
         };
         /**
          * Example
-         * @description A run on the page. help: what it shows. link: query string of the page's address.
+         * @description A run on the page.
+         *
+         *     Attributes:
+         *         help: what it shows. link: query string of the page's address.
+         *         setup: shell command that serves its data where they are not included; empty if this server has them.
          */
         Example: {
             /** Title */
@@ -436,6 +440,11 @@ export interface components {
             help: string;
             /** Link */
             link: string;
+            /**
+             * Setup
+             * @default
+             */
+            setup: string;
         };
         /**
          * ExperimentRow

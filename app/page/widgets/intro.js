@@ -5,6 +5,7 @@
 
 import { create, html } from '../core/dom.js';
 import { parsePermalink } from '../core/state.js';
+import { emptyNote } from './empty_note.js';
 
 const STORAGE_KEY = 'beliefscope.intro';
 
@@ -19,9 +20,17 @@ export class Intro {
    */
   constructor(host, catalog, store, startTour) {
     this.#host = host;
-    const chips = catalog.examples.map(({ title, help, link }) => {
-      const chip = create('button', { type: 'button', className: 'chip', title: help }, title);
-      chip.addEventListener('click', () => store.set(parsePermalink(link, catalog).state));
+    const chips = catalog.examples.map((example) => {
+      const chip = create(
+        'button',
+        { type: 'button', className: 'chip', title: example.help },
+        example.title,
+      );
+      if (example.setup) openSetup(chip, example);
+      else
+        chip.addEventListener('click', () =>
+          store.set(parsePermalink(example.link, catalog).state),
+        );
       return chip;
     });
     if (!chips.length) this.#isShown = false;
@@ -44,4 +53,33 @@ export class Intro {
   set #isShown(/** @type {boolean} */ isShown) {
     document.documentElement.classList.toggle('first-visit', isShown);
   }
+}
+
+/**
+ * Lets a chip open what an example is about, and the command that serves its data.
+ * @param {HTMLButtonElement} chip
+ * @param {Catalog['examples'][number]} example
+ */
+function openSetup(chip, { title, help, setup }) {
+  const box = create('div', { className: 'setup', popover: 'auto', role: 'dialog' });
+  box.setAttribute('aria-label', title);
+  box.append(
+    ...emptyNote({
+      title,
+      paragraphs: [
+        [help],
+        ['The data set is not included. Download it and start the server with it.'],
+      ],
+      purpose: `With the files in the folder ${setup.split(' ').at(-1)}:`,
+      commands: [setup],
+    }),
+  );
+  document.body.append(box);
+  chip.popoverTargetElement = box;
+  chip.setAttribute('aria-haspopup', 'dialog');
+  box.addEventListener('beforetoggle', () => {
+    const { bottom, right } = chip.getBoundingClientRect();
+    box.style.top = `${bottom + 4}px`;
+    box.style.right = `${Math.max(6, document.documentElement.clientWidth - right)}px`;
+  });
 }
