@@ -44,12 +44,13 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     if not present.any():
         return {}
     lost = lost_images(images)
-    usable = present & ~lost
+    usable, dark = present & ~lost, lost[present]
     middle = median_image(images[present])
     known = reference is not None and (reference.key, reference.image.shape) == (key, middle.shape) and usable.any()
     brightness = float(brightness_of(middle, reference)) if reference is not None and known else 1.0
     values = {
-        f"black/{key}/all": float(lost[present].mean()),
+        f"black/{key}/all": float(dark.mean()),
+        f"losses/{key}/all": float((np.diff(dark, prepend=False) & dark).mean()),
         f"frozen/{key}/all": float(frozen_images(images, episode.task.held_steps(key))[present].mean()),
         f"noise/{key}/all": _noise(images[usable & ~frozen_images(images)], brightness),
         f"sharpness/{key}/all": _sharpness(middle),

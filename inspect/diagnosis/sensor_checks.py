@@ -79,7 +79,7 @@ def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | No
     """(T,) affected steps of a statistic that counts steps; None for others."""
     readings, present = episode.observations[key], episode.present(key)
     match kind:
-        case "black":
+        case "black" | "losses":
             return lost_images(readings) & present
         case "frozen":
             return _in_runs(frozen_images(readings, episode.task.held_steps(key)), present)

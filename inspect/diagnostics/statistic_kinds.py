@@ -40,6 +40,7 @@ KINDS = {
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),
     "black": ("share of lost readings", False, 0.02),
+    "losses": ("losses{of} per step", False, 0.01),
     "frozen": ("share of repeated readings", False, 0.02),
     "sharpness": ("sharpness", True, 0.05),
     "brightness": ("exposure{of} relative to healthy images", True, 0.03),
@@ -100,15 +101,9 @@ PHASES = {
 """Phase of a statistic -> how its label begins and ends; others are phases of the task."""
 
 RISING = frozenset(
-    {"error", "angle error", "regret", "outside", "black", "frozen", "stuck", "saturation", "occlusion", "change"}
-    | {
-        "opposition",
-        "contact distance error",
-        "contact distance scatter",
-        "module error",
-        "module scatter",
-        "dynamics error",
-    }
+    {"error", "angle error", "regret", "outside", "black", "losses", "frozen", "stuck", "saturation", "occlusion"}
+    | {"change", "opposition", "contact distance error", "contact distance scatter"}
+    | {"module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 

@@ -20,7 +20,7 @@ CAUSES = (
     Cause(
         "image.blackout",
         "Images blacked out",
-        (Symptom("black/image/*"),),
+        (Symptom("black/image/*|losses/image/*"),),
         f"lag/image/*|frozen/image/*|{IMAGE}",
         CHECK,
         "skip lost images",
@@ -29,7 +29,7 @@ CAUSES = (
         "image.frozen",
         "Image frozen",
         (Symptom("frozen/image/*"),),
-        f"lag/image/*|black/image/*|noise/image/*|occlusion/image/*|shift/image*|sharpness/image/*|brightness/image/*"
+        f"lag/image/*|black/image/*|losses/image/*|noise/image/*|occlusion/image/*|shift/image*|sharpness/image/*|brightness/image/*"
         f"|{LANDMARKS}|{IMAGE}",
         CHECK,
         "drop image",

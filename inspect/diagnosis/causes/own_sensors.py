@@ -14,10 +14,10 @@ VECTOR = (
     ("noise", "noise", "noisy", "Check the cable and the filter of the sensor."),
     ("saturation", "saturation", "saturated", "Extend the measuring range of the sensor."),
 )
-"""Kind of the statistic, mechanism, word of the title, next action."""
+"""Kinds of the statistic, mechanism, word of the title, next action."""
 
 IMAGE = (
-    ("black", "blackout", "blacked out", "Check the camera and its driver."),
+    ("black|losses", "blackout", "blacked out", "Check the camera and its driver."),
     ("frozen", "frozen", "frozen", "Check the camera and its driver."),
     ("noise", "noise", "noisy", "Light the scene better, or correct the exposure and gain of the camera."),
 )
@@ -31,8 +31,8 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
     for key, modality in keys.items():
         changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
         name = display_name(key)
-        for kind, mechanism, word, action in IMAGE if key in task.images else VECTOR:
-            symptom = Symptom(f"{kind}/{key}/*|{kind}/{key} */*")
+        for kinds, mechanism, word, action in IMAGE if key in task.images else VECTOR:
+            symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"{name[0].upper()}{name[1:]} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
     return tuple(result)

@@ -58,6 +58,8 @@ def change(task: str, faults: str, statistic: str) -> float:
     [
         ("image_frozen:from=60", "frozen/image/all", 0.39, 0.01),
         ("blackout:from=60", "black/image/all", 0.4, 1e-6),
+        ("blackout:from=60", "losses/image/all", 0.01, 1e-6),
+        ("blackout=0.3", "losses/image/all", 0.3 * 0.7, 0.06),
         ("image_underexposed=0.5", "brightness/image/all", -0.5, 0.01),
         ("image_noise=20", "noise/image/all", 20.0, 1.0),
         ("delay=image:steps=4", "lag/image/all", 4.0, 0.2),

@@ -58,7 +58,8 @@ def deviations(healthy: Setting, faulty: Setting) -> dict[str, Deviation]:
     ]
     result = {}
     for name in rows[0][0]:
-        mean = [float(np.nanmean([row.get(name, np.nan) for row in group])) for group in rows]
+        values = [[row[name] for row in group if np.isfinite(row.get(name, np.nan))] for group in rows]
+        mean = [float(np.mean(group)) if group else np.nan for group in values]
         result[name] = Deviation(name, mean[1], mean[0], mean[0], mean[0], 0.0, True, 10.0)
     return result
 
