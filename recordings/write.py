@@ -85,9 +85,11 @@ def write_recording(
     sample = thinned(trace)
     layout = blueprint(sample, task, first[0] if first else None, diagnostics)
     bodies = Bodies(sample, task)
-    with new_recording(Path(path), sample, bodies, len(trace), layout) as stream:
+    with new_recording(Path(path), sample, bodies, len(trace)) as stream:
         for start, last in chunks(len(trace), steps_per_chunk(trace)):
             send_steps(stream, trace, task, bodies, slice(start, last))
+            if start == 0:
+                send_layout(stream, layout)
             report(0.5 * last / len(trace))
         for name, diagnostic in diagnostics.items():
             log_diagnostic(stream, diagnostic, name, trace)
@@ -103,9 +105,7 @@ def write_recording(
 
 
 @contextmanager
-def new_recording(
-    path: Path, sample: Trace, bodies: Bodies, steps: int, layout: rrb.Blueprint
-) -> Iterator[rr.RecordingStream]:
+def new_recording(path: Path, sample: Trace, bodies: Bodies, steps: int) -> Iterator[rr.RecordingStream]:
     """Yields a stream to a file written atomically, after sending header and static entities.
 
     Args:
@@ -118,31 +118,33 @@ def new_recording(
     flush_and_cleanup_orphaned_recordings()  # Rerun keeps every stream and its two threads until this call
     with _complete_or_absent(path) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
-        with closing_layout(layout):
-            stream.save(unfinished)
-            stream.send_blueprint(layout)  # active at once, also in a viewer that shows another recording
+        stream.save(unfinished)
         send_header(stream, sample, bodies, steps)
         stream.flush()  # so that a truncated file has a header
         yield stream
         _finish(stream, unfinished)
 
 
-@contextmanager
-def closing_layout(layout: rrb.Blueprint) -> Iterator[None]:
-    """Closes the stream that Rerun creates for a layout; otherwise its memory and two threads are never released."""
-    streams, log = [], layout._log_to_stream
+def send_layout(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+    """Send a layout, which is active at once, also in a viewer that shows another recording.
 
-    def capture(stream: rr.RecordingStream) -> None:
-        streams.append(stream)
-        log(stream)
+    Send steps before: the viewer warns of a layout with a timeline that it does not know yet. Closes the stream that
+    Rerun creates for a layout; otherwise its memory and two threads are never released.
+    """
+    opened, log = [], layout._log_to_stream
 
-    layout._log_to_stream = capture  # type: ignore[method-assign]
+    def capture(own: rr.RecordingStream) -> None:
+        opened.append(own)
+        log(own)
+
+    layout._log_to_stream = capture  # type: ignore[method-assign, assignment]
     try:
-        yield
+        stream.flush()  # the steps
+        stream.send_blueprint(layout)
     finally:
         layout._log_to_stream = log  # type: ignore[method-assign]
-        for stream in streams:
-            stream.disconnect()
+        for own in opened:
+            own.disconnect()
 
 
 def steps_per_chunk(like: Trace) -> int:

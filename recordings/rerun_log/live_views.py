@@ -16,9 +16,9 @@ from beliefscope.recordings.rerun_log.bodies import Bodies
 from beliefscope.recordings.schema import APPLICATION
 from beliefscope.recordings.write import (
     chunks,
-    closing_layout,
     new_recording,
     send_header,
+    send_layout,
     send_steps,
     steps_per_chunk,
     thinning,
@@ -68,16 +68,16 @@ class LiveViews:
                     first = reader.part(0, 1)
                     task, at_once = first.task, steps_per_chunk(first)
                     layout, bodies = blueprint(first, task, growing=True), Bodies(first, task)
-                    with closing_layout(layout):
-                        # Without footer: the index of all chunks would fill the memory of a long run.
-                        stream.save(self._live.with_suffix(".rrd"), write_footer=False)
-                        stream.send_blueprint(layout)
+                    # Without footer: the index of all chunks would fill the memory of a long run.
+                    stream.save(self._live.with_suffix(".rrd"), write_footer=False)
                     send_header(stream, first, bodies)
                 if ended and not self._write_rest:
                     return
                 if waiting >= MIN_STEPS or (waiting and (ended or time.monotonic() > written_at + MAX_DELAY)):
                     last = min(reader.steps, written + at_once)
                     send_part(stream, reader, bodies, written, last)
+                    if written == 0:
+                        send_layout(stream, layout)
                     stream.flush()
                     written, written_at = last, time.monotonic()
         except (BadInput, RuntimeError, ValueError) as error:
@@ -99,9 +99,12 @@ def write_live_recording(live: Path, path: Path) -> Path:
         sample = reader.part(0, stride=thinning(reader.steps))
         task = sample.task
         bodies = Bodies(sample, task)
-        with new_recording(path, sample, bodies, reader.steps, blueprint(sample, task)) as stream:
+        layout = blueprint(sample, task)
+        with new_recording(path, sample, bodies, reader.steps) as stream:
             for first, last in chunks(reader.steps, steps_per_chunk(sample)):
                 send_part(stream, reader, bodies, first, last)
+                if first == 0:
+                    send_layout(stream, layout)
                 stream.flush()  # or all of it would wait in memory for the disk
     finally:
         reader.close()

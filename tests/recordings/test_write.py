@@ -210,6 +210,16 @@ def test_rerun_verifies_the_file(trace: Trace, new_map: MapMaker, tmp_path: Path
     assert done.returncode == 0, done.stderr
 
 
+def test_the_layout_follows_the_first_steps(trace: Trace, tmp_path: Path) -> None:
+    """A viewer warns of a layout that arrives before its timeline."""
+    path = write_recording(trace, tmp_path / "run.rrd")
+    rerun = shutil.which("rerun", path=os.path.dirname(sys.executable)) or shutil.which("rerun")
+    if rerun is None:
+        pytest.skip("the rerun command is not installed")
+    done = subprocess.run([rerun, "rrd", "print", path], capture_output=True, text=True, check=True)
+    assert 0 < done.stdout.index(" - /trace/states - ") < done.stdout.index("Blueprint:")
+
+
 def test_progress_increases_to_one(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
     shares: list[float] = []
     write_recording(trace, tmp_path / "run.rrd", (new_map(trace, s) for s in range(0, 40, 2)), shares.append)
