@@ -218,16 +218,19 @@ class RobotScene:
         self._show_shadows(np.rint(255.0 * self._shadows.opacity(positions, rotations)).astype(np.uint8))
 
     def _show_shadows(self, opacity: NDArray[np.uint8]) -> None:
-        """Show the part of the image with shadows: without a GPU, transparent pixels cost as much as others."""
+        """Show the part of the image with shadows: without a GPU, transparent pixels cost as much as others.
+
+        A transparent pixel on each side keeps their edges soft.
+        """
         rows, columns = (np.flatnonzero(opacity.max(axis=axis)) for axis in (1, 0))
         self._shadow_image.visible = bool(rows.size)
         if not rows.size:
             return
         first, last = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
-        shadow = opacity[first[1] : last[1], first[0] : last[0]]
+        shadow = np.pad(opacity[first[1] : last[1], first[0] : last[0]], 1)
         set_png(self._shadow_image, "_data", np.stack([np.zeros_like(shadow), shadow], axis=-1))
         pixel = 2.0 * FLOOR_HALF_WIDTH / len(opacity)
-        self._shadow_image.scale = (*(pixel * (last - first)), 1.0)
+        self._shadow_image.scale = (*(pixel * (last - first + 2)), 1.0)
         centre = FLOOR_CENTRE + pixel * (first + last) / 2.0 - FLOOR_HALF_WIDTH
         self._shadow_image.position = (*centre, SHADOW_HEIGHT)
 
