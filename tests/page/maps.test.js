@@ -197,6 +197,14 @@ test('the colour bar names its quantity, its unit, and scales that differ', () =
   });
   assert.equal(labels('log', 'own', 'step 3').label, 'log density ratio to step 3, nats');
   assert.equal(axesText(maps, false), '→ Δ hinge x  ↑ Δ hinge y (cm)');
+  const curve = /** @type {any} */ ({ axes: maps.axes.slice(0, 1) });
+  const height = labels('normalised', 'own').label;
+  assert.equal(axesText(curve, true, height), '→ hinge x (cm)  ↑ fraction of each peak');
+  const log = labels('log', 'own').label;
+  assert.equal(
+    axesText(curve, true, log),
+    '→ hinge x (cm)  ↑ log likelihood below each peak, nats',
+  );
 });
 
 test('small maps show the change to contact and the steps around the cursor', () => {

@@ -206,8 +206,9 @@ export class MapPanel {
       if (!isCurve(maps)) paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
       figure.head.title = layerMeasures(maps, layer, this.#world).description;
     });
-    this.#showColours(maps, reference);
-    html('#maps-axis-names', this.#panel).textContent = axesText(maps, this.#world);
+    const { label } = this.#showColours(maps, reference);
+    const axes = axesText(maps, this.#world, isCurve(maps) ? label : '');
+    html('#maps-axis-names', this.#panel).textContent = axes;
     this.redraw();
   }
 
@@ -230,6 +231,7 @@ export class MapPanel {
   }
 
   /**
+   * Shows the colour bar of maps over two components and returns its labels.
    * @param {Maps} maps
    * @param {Reference | null} reference
    */
@@ -250,6 +252,7 @@ export class MapPanel {
       reference?.name ?? '',
     );
     showColourBar(bar, this.#figures[0].colourMap, labels);
+    return labels;
   }
 
   /** Fills the table of measures in the menu. */

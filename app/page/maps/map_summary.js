@@ -109,8 +109,9 @@ export function measureColumns({ axes }) {
  * Names the axes of the maps, with their units.
  * @param {Maps} maps
  * @param {boolean} world whether they show world coordinates
+ * @param {string} [height] label of the colour scale, which a map over one component shows as its height
  */
-export function axesText({ axes }, world) {
+export function axesText({ axes }, world, height = '') {
   const units = axes.map((axis) => displayUnit(axis).unit);
   const common = units.every((unit) => unit === units[0]);
   const texts = axes.map(({ name }, i) => {
@@ -119,6 +120,7 @@ export function axesText({ axes }, world) {
     const unit = units[i] && (!common || i === axes.length - 1) ? ` (${units[i]})` : '';
     return `${i ? '↑' : '→'} ${label}${unit}`;
   });
+  if (height) texts.push(`↑ ${height.replace(/^of /, 'fraction of ').replace(/;.*/, '')}`);
   return texts.join('  ');
 }
 
