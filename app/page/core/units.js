@@ -44,7 +44,8 @@ export function mainName({ main, map }) {
  * @param {string} text
  * @param {string} unit
  */
-export const withUnit = (text, unit) => `${text} ${unit}`.trim();
+export const withUnit = (text, unit) =>
+  unit.startsWith('°') && /\d$/.test(text) ? text + unit : `${text} ${unit}`.trim();
 
 /**
  * Replaces the underscores of a name such as hinge_x by spaces.

@@ -165,6 +165,7 @@ export function conditionText({ covariate, unit: siUnit, low, high, category }) 
       ' ',
       NO_BREAK,
     );
-  if (low === null) return `${covariate} ≤ ${end(high)}`;
-  return high === null ? `${covariate} > ${end(low)}` : `${end(low)} < ${covariate} ≤ ${end(high)}`;
+  if (high === null) return `${covariate} >${NO_BREAK}${end(low)}`;
+  const above = low === null ? '' : `${end(low)}${NO_BREAK}< `;
+  return `${above}${covariate} ≤${NO_BREAK}${end(high)}`;
 }
