@@ -122,7 +122,8 @@ def _advice(rows: Sequence[SliceChange]) -> str:
 
 
 def _description(row: SliceChange) -> str:
-    values = f"{row.before:.3g} to {row.after:.3g} {row.unit}".rstrip()
+    before, after = (f"{value:#.3g}".rstrip(".") for value in (row.before, row.after))
+    values = f"{before} to {after} {row.unit}".rstrip()
     interval = ""
     if not math.isnan(row.low):
         interval = f", 95 % interval {round(100 * row.low):+d} to {round(100 * row.high):+d} %"
