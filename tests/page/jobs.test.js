@@ -17,3 +17,9 @@ test('the summary of a running job has progress, activity and remaining time', (
   const job = { state: 'running', progress: 0.2, message: 'step 10 of 100', started };
   assert.match(jobSummary(/** @type {any} */ (job)), /^20 %, step 10 of 100, \d+ s left$/);
 });
+
+test('a cancelled fine-tuning is paused', () => {
+  const job = { state: 'cancelled', kind: 'finetune', error: '' };
+  assert.equal(jobSummary(/** @type {any} */ (job)), 'Paused.');
+  assert.equal(jobSummary(/** @type {any} */ ({ ...job, kind: 'failures' })), 'Cancelled.');
+});

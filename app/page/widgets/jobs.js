@@ -200,6 +200,7 @@ export function jobSummary(job) {
     const seconds = Number(job.ended) - Number(job.started);
     return `Done in ${Math.max(1, Math.round(seconds))} s.`;
   }
+  if (job.state === 'cancelled' && job.kind === 'finetune') return 'Paused.'; // it resumes
   return sentence(STATES[job.state]);
 }
 
