@@ -10,7 +10,7 @@ import { seriesStyle } from './chart.js';
 import { areaSample } from './stack.js';
 
 const CHARACTER = 0.61; // rem
-const SAMPLE_AND_VALUE = { full: 8, compact: 6.6, dense: 7 }; // rem
+const SAMPLE_AND_VALUE = { full: 8, compact: 7.1, dense: 7.5 }; // rem
 
 /** @typedef {{text: Text, track: Track, index: number}} ValueCell index of the series in the track */
 
