@@ -27,7 +27,8 @@ def test_bar_opens_the_largest_error(open_page: Any) -> None:
     cells = panel.locator("tbody tr").first.locator("td").all_text_contents()
     assert cells[3] == f"{row['mean']['position_cm']:.2f}"
     row = offset["crossmodal-ekf", 0.0]
-    assert panel.locator("thead th").all_text_contents()[5:8] == ["from step 0", "dynamics", "stay"]
+    titles = panel.locator("thead th").all_text_contents()[5:8]
+    assert titles == ["from step 0, cm", "dynamics, cm", "stay, cm"]
     numbers = [row["from_step_0"], row["baselines"]["dynamics"], row["baselines"]["stay"]]
     assert cells[4:7] == [f"{values['position_cm']:.2f}" for values in numbers]
     assert cells[6] == "3.00", "keeping the start does not have the error of the start"

@@ -150,9 +150,10 @@ export class StudyTable {
  * @returns {StudyColumn[]}
  */
 function studyColumns({ quantity, blackouts, filters }) {
+  const unit = quantity.unit && `, ${quantity.unit}`;
   const errors = ERRORS.map(({ title, help, values }) => ({
     name: title,
-    title,
+    title: title + unit,
     help,
     value: (/** @type {FilterResults} */ { rows }) => values(rows[0])?.[quantity.key] ?? null,
   })).filter(({ value }) => filters.some((filter) => value(filter) !== null));
@@ -169,7 +170,7 @@ function studyColumns({ quantity, blackouts, filters }) {
     },
     ...blackouts.map((share, i) => ({
       name: `blackout ${i}`,
-      title: `${blackoutLabel(share)}${i || !quantity.unit ? '' : `, ${quantity.unit}`}`,
+      title: blackoutLabel(share) + (i ? '' : unit),
       help: quantity.description,
       value: (/** @type {FilterResults} */ { bars }) => bars[i].mean,
       content: (/** @type {FilterResults} */ { bars }) => barValue(bars[i]),
