@@ -104,6 +104,7 @@ def slices(page: Page) -> None:
     """Open the slices of a field task and the worst step of the first one."""
     query = "?task=push-field&filter=information-ekf&tab=failures&list=slices"
     page.goto(page.url.partition("?")[0] + query, timeout=TIMEOUT)
+    page.wait_for_function(USEFUL, timeout=TIMEOUT)
     tab("failures", state("#failures"), "Search for failures")(page)
     page.locator("#failures .slices .title").first.click()
 
