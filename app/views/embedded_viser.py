@@ -39,8 +39,12 @@ log = logging.getLogger("beliefscope.app")
 _process_lock = threading.Lock()
 
 
-HIDDEN_PANEL = "<style>[data-floating-window] { display: none !important; }</style>"
-"""Hides viser's control panel: the page has the controls of the scene."""
+CLIENT_STYLE = """<style>
+[data-floating-window] { display: none !important; }
+body, div:has(> div > div > div > canvas) { background: none !important; }
+</style>"""
+"""Hides viser's control panel, as the page has the controls of the scene, and its background, which is almost black in
+the dark theme: the page's is behind it."""
 
 
 def client_page(script: str) -> bytes:
@@ -51,7 +55,7 @@ def client_page(script: str) -> bytes:
     before, head, after = CLIENT_PAGE.read_bytes().partition(b"<head>")
     if not head:
         raise RuntimeError(f"the client page of viser {viser.__version__} has no <head>")
-    return before + head + f'{HIDDEN_PANEL}<script src="{script}"></script>'.encode() + after
+    return before + head + f'{CLIENT_STYLE}<script src="{script}"></script>'.encode() + after
 
 
 class _Connection:
