@@ -213,8 +213,8 @@ def run_small_sweep(folder: Path) -> None:
 
 @contextmanager
 def live_run(workspace: Path) -> Iterator[None]:
-    """Run a filter with one step per second while the screenshots are taken."""
-    options = ["--filter", "crossmodal-ekf", "--rate", "1", "--name", "go", "--workspace", str(workspace)]
+    """Run a filter slowly enough that it still runs after the views before its own, while the screenshots are taken."""
+    options = ["--filter", "crossmodal-ekf", "--rate", "0.25", "--name", "go", "--workspace", str(workspace)]
     process = subprocess.Popen(
         [sys.executable, "-m", "beliefscope", "live", "door", *options], stderr=subprocess.DEVNULL
     )
