@@ -78,6 +78,11 @@ SHOWN = 0.05
 """Smallest probability of a cause in headlines, in tables and on the page."""
 
 
+def probability_text(probability: float) -> str:
+    """A probability with two digits; none is certain."""
+    return f"{probability:.2f}" if probability < 0.995 else "above 0.99"
+
+
 @dataclass(frozen=True)
 class Evidence:
     """A deviation that supports a cause.

@@ -14,7 +14,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
 from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches
+from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
@@ -193,9 +193,9 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {first.cause.title}"
-    text = f"{title}{since}{where}, probability {first.probability:.2f}"
+    text = f"{title}{since}{where}, probability {probability_text(first.probability)}"
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
-        text += f"; and {_lower(second.cause.title)}, probability {second.probability:.2f}"
+        text += f"; and {_lower(second.cause.title)}, probability {probability_text(second.probability)}"
     if masked:
         text += "; the filter is unaffected"
     return text if first.probability >= SURE else f"{text}; try: {first.next}"

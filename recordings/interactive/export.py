@@ -19,6 +19,7 @@ from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.cause import probability_text
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.figures.top_view import scene_footprints
 from beliefscope.inspect.likelihood import COARSE, MapEngine, no_maps
@@ -256,7 +257,7 @@ def _diagnosis(trace: Trace, checkpoint: Checkpoint | None) -> dict[str, Any]:
     causes = [
         {
             "name": candidate.cause.name,
-            "probability": f"{candidate.probability:.2f}",
+            "probability": probability_text(candidate.probability),
             "evidence": [{"text": e.text, "step": e.step} for e in candidate.evidence],
         }
         for candidate in result.listed[:MOMENTS]

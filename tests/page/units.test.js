@@ -6,6 +6,7 @@ import {
   fixed,
   formatBytes,
   percent,
+  probabilityText,
   sentence,
   signed,
   significant,
@@ -18,6 +19,11 @@ test('fixed uses a true minus sign and a dash for missing values', () => {
   assert.equal(fixed(-1.25, 2), '−1.25');
   assert.equal(fixed(-0.01), '0.0');
   for (const value of [null, undefined, NaN, Infinity]) assert.equal(fixed(value), '–');
+});
+
+test('no probability is certain', () => {
+  assert.equal(probabilityText(0.994), '0.99');
+  assert.equal(probabilityText(0.9951), 'above 0.99');
 });
 
 test('signed adds a plus only to values that round to a positive number', () => {

@@ -114,6 +114,13 @@ export const stepLabel = (step, time) =>
   `step ${step}${Number.isFinite(time) ? ` (${fixed(time, 2)} s)` : ''}`;
 
 /**
+ * Formats a probability with two digits; none is certain.
+ * @param {number} probability
+ */
+export const probabilityText = (probability) =>
+  probability < 0.995 ? probability.toFixed(2) : 'above 0.99';
+
+/**
  * Formats a share from 0 to 1 in percent.
  * @param {number | null | undefined} share
  */

@@ -9,7 +9,15 @@
 
 import { SHOWN } from '../core/constants.js';
 import { create, html } from '../core/dom.js';
-import { displayName, fixed, percent, sentence, stepLabel, typeset } from '../core/units.js';
+import {
+  displayName,
+  fixed,
+  percent,
+  probabilityText,
+  sentence,
+  stepLabel,
+  typeset,
+} from '../core/units.js';
 import * as api from '../data/api.js';
 import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
@@ -307,7 +315,10 @@ export class Diagnosis {
       {},
       create('h4', { textContent: cause.title, title: cause.cause }),
       bar,
-      create('output', { textContent: `probability ${probability.toFixed(2)}`, title: PRESENT }),
+      create('output', {
+        textContent: `probability ${probabilityText(probability)}`,
+        title: PRESENT,
+      }),
       create('div', { className: 'details' }, ...lines),
     );
   }

@@ -10,7 +10,7 @@ import pytest
 
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges, probability_text
 from beliefscope.inspect.diagnosis.conclusion import is_unused, next_action
 from beliefscope.inspect.diagnosis.scoring import (
     Explanation,
@@ -64,6 +64,10 @@ def row(cause: Cause) -> str:
 
     symptoms = "; ".join(map(text, cause.symptoms))
     return f"| `{cause.name}` | {cause.title} | {symptoms} | {cause.undo.replace('|', ', or ') or 'none'} |"
+
+
+def test_no_probability_is_certain() -> None:
+    assert [probability_text(p) for p in (0.05, 0.994, 0.9951, 1.0)] == ["0.05", "0.99", "above 0.99", "above 0.99"]
 
 
 def test_the_catalog_has_every_required_cause_once() -> None:
