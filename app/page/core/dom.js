@@ -37,6 +37,19 @@ export function create(tag, properties = {}, ...children) {
 }
 
 /**
+ * Lets a popover open below a button, with the same right edge.
+ * @param {HTMLElement} popover
+ * @param {HTMLElement} button
+ */
+export function openBelow(popover, button) {
+  popover.addEventListener('beforetoggle', () => {
+    const { bottom, right } = button.getBoundingClientRect();
+    popover.style.top = `${bottom + 4}px`;
+    popover.style.right = `${Math.max(0, document.documentElement.clientWidth - right)}px`;
+  });
+}
+
+/**
  * Returns the drawing context of a canvas.
  * @param {HTMLCanvasElement} canvas
  * @param {CanvasRenderingContext2DSettings} [settings]

@@ -5,7 +5,7 @@
 
 /** @import { Sizes } from './pane_sizes.js' */
 
-import { create, html } from './dom.js';
+import { create, html, openBelow } from './dom.js';
 
 /** @typedef {{name: string, help: string, sizes: Sizes, tab: string}} Layout */
 
@@ -54,11 +54,7 @@ export function layoutMenu(menu, button, apply) {
     return row;
   });
   html('.rows', menu).append(...rows);
-  menu.addEventListener('beforetoggle', () => {
-    const { bottom, right } = button.getBoundingClientRect();
-    menu.style.top = `${bottom + 4}px`;
-    menu.style.right = `${Math.max(0, document.documentElement.clientWidth - right)}px`;
-  });
+  openBelow(menu, button);
 }
 
 /**

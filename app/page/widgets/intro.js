@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog } from '../types/server.js' */
 
-import { create, html } from '../core/dom.js';
+import { create, html, openBelow } from '../core/dom.js';
 import { parsePermalink } from '../core/state.js';
 import { emptyNote } from './empty_note.js';
 
@@ -77,9 +77,5 @@ function openSetup(chip, { title, help, setup }) {
   document.body.append(box);
   chip.popoverTargetElement = box;
   chip.setAttribute('aria-haspopup', 'dialog');
-  box.addEventListener('beforetoggle', () => {
-    const { bottom, right } = chip.getBoundingClientRect();
-    box.style.top = `${bottom + 4}px`;
-    box.style.right = `${Math.max(6, document.documentElement.clientWidth - right)}px`;
-  });
+  openBelow(box, chip);
 }
