@@ -35,8 +35,7 @@ class SoftShadows:
         high = np.array([np.max(points, axis=0) for points in corners.values()]).reshape(-1, 3)
         self._centres, self._half_sizes = (low + high) / 2.0, (high - low) / 2.0  # (B, 3) m, in the body's frame
         side = half_width * (np.arange(0.5, SHADOW_PIXELS) / SHADOW_PIXELS * 2.0 - 1.0)
-        y, x = np.meshgrid(centre[1] + side, centre[0] + side, indexing="ij")
-        self._points = np.stack([x, y], axis=-1).reshape(-1, 2)
+        self._x, self._y = centre[0] + side, centre[1] + side
 
     def opacity(self, positions: Array, rotations: Array) -> Array:
         """One step of ``Replay`` -> (P, P) opacity of the shadows, 0..1; row 0 has the smallest y."""
@@ -47,7 +46,11 @@ class SoftShadows:
         squares, axes = np.linalg.eigh(matrix)
         semi_axes = np.sqrt(squares.clip(0.0))
         blurred = semi_axes + SHADOW_EDGE + SHADOW_SPREAD * centres[:, 2:].clip(0.0)
-        offsets = ((self._points - centres[:, None, :2]) @ axes) / blurred[:, None]
         strength = SHADOW_OPACITY * (semi_axes / blurred).prod(axis=-1)
-        shadows = strength[:, None] * (1.0 - (offsets**2).sum(axis=-1)).clip(0.0)
-        return (1.0 - (1.0 - shadows).prod(axis=0)).reshape(SHADOW_PIXELS, SHADOW_PIXELS)
+        form = (axes / blurred[:, None] ** 2) @ axes.swapaxes(1, 2)  # 1 on the rim of the blurred ellipse
+        xx, xy, yy = (form[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+        x = (self._x - centres[:, :1])[:, None]
+        y = (self._y - centres[:, 1:2])[:, :, None]
+        distance = xx * x**2 + (2.0 * xy * x + yy * y) * y
+        shadows = strength[:, None, None] * (1.0 - distance).clip(0.0)
+        return np.asarray(1.0 - (1.0 - shadows).prod(axis=0))
