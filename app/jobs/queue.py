@@ -307,7 +307,7 @@ class Jobs:
         if process is not None and process.poll() is None:
             return process
         with log.open("wb") as output:
-            return WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
+            return WorkerProcess(__name__, output)
 
     def _stop(self, id: str, state: State) -> None:
         if id in self._stopping:

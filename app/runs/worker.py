@@ -41,7 +41,7 @@ class WorkerProcess(subprocess.Popen[str]):
     It ends with the server. It has its own session: Ctrl+C in the terminal stops the server only.
     """
 
-    def __init__(self, module: str, log: IO[bytes] | None = None, **environment: str) -> None:
+    def __init__(self, module: str, log: IO[bytes] | None = None) -> None:
         """log: file for its printed text; by default the server's standard error."""
         super().__init__(
             [sys.executable, "-P", "-u", "-m", __name__, module],
@@ -51,7 +51,7 @@ class WorkerProcess(subprocess.Popen[str]):
             text=True,
             bufsize=1,
             start_new_session=True,
-            env=os.environ | environment,
+            env={"OMP_NUM_THREADS": "1"} | os.environ,
         )
 
     def call(self, function: str, arguments: Mapping[str, Any], report: Report) -> Any:

@@ -18,6 +18,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Batch, Steps, check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, reweighted
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import one_thread
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
@@ -63,17 +64,18 @@ def trace(
     faults.check(checkpoint.task, len(episode))
     if isinstance(checkpoint, ExternalFilter):
         return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
-    run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
-    arrays = run_arrays(
-        checkpoint,
-        encoded(run.filter, run.episode),
-        len(episode),
-        run.start,
-        run.generator(),
-        particles,
-        particles_kept,
-        progress,
-    )
+    with one_thread():  # the tensors of a trajectory are too small for several
+        run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
+        arrays = run_arrays(
+            checkpoint,
+            encoded(run.filter, run.episode),
+            len(episode),
+            run.start,
+            run.generator(),
+            particles,
+            particles_kept,
+            progress,
+        )
     return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
 
 

@@ -54,6 +54,16 @@ def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(shipped("door", request.param))
 
 
+def test_a_trace_uses_one_thread(checkpoint: Checkpoint, episode: Episode) -> None:
+    before, threads = torch.get_num_threads(), set()
+    torch.set_num_threads(2)
+    try:
+        trace(checkpoint, episode, particles=10, progress=lambda _: threads.add(torch.get_num_threads()))
+        assert (threads, torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
     return trace(checkpoint, episode, seed=7, particles=100)

@@ -44,6 +44,15 @@ def test_unwritable_output_prints_one_line() -> None:
     )
 
 
+@pytest.mark.parametrize(("given", "used"), [(None, 1), ("2", 2)], ids=["default", "set by the user"])
+def test_torch_uses_one_thread_unless_the_user_sets_a_number(given: str | None, used: int) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    if given is not None:
+        environment["OMP_NUM_THREADS"] = given
+    printed = subprocess.run([*COMMAND, "doctor"], env=environment, capture_output=True, text=True, check=False).stdout
+    assert f", {used} threads," in printed
+
+
 # Python uses UTF-8 in the C locale by default; these settings restore plain ASCII.
 ASCII = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 RENDER = """

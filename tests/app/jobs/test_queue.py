@@ -85,7 +85,8 @@ class Waiting:
         return [int(pid) for pid in self.started.read_text().split()]
 
 
-def test_result_is_stored_and_reused(open_jobs: OpenJobs) -> None:
+def test_result_is_stored_and_reused(open_jobs: OpenJobs, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     jobs = open_jobs()
     job = jobs.submit("add", "Add", {"numbers": [1, 2, 3]}, "one to three")
     done = wait_for(jobs, job.id)
