@@ -1,10 +1,16 @@
-"""Index of a large data file, stored beside it: opening reads the index instead of the attributes of all episodes."""
+"""Index of a data file, stored beside it: opening reads the index instead of the attributes of all episodes.
+
+Large files and the included ones have an index. It belongs to a file of the same size and time, or of the same size and
+content: installing a file changes its time.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from contextlib import suppress
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +33,12 @@ def index_path(path: Path) -> Path:
 
 
 def read_index(path: Path) -> tuple[tuple[EpisodeSummary, ...], str] | None:
-    """The summaries and the hash of a data file; None without an index of the file's present size and time."""
+    """The summaries and the hash of a data file; None without an index of the file as it is."""
     try:
         stored = read_json(index_path(path).read_bytes())
-        if stored["version"] != VERSION or stored["file"] != _identity(path):
+        if stored["version"] != VERSION or stored["file"] != _identity(
+            path, by_content=isinstance(stored["file"][1], str)
+        ):
             return None
         columns, digest = [stored["columns"][name] for name in COLUMNS], stored["hash"]
         rows = zip(*columns, strict=True)
@@ -40,19 +48,27 @@ def read_index(path: Path) -> tuple[tuple[EpisodeSummary, ...], str] | None:
     return (summaries, digest) if summaries and isinstance(digest, str) else None
 
 
-def write_index(path: Path, summaries: tuple[EpisodeSummary, ...], digest: str) -> None:
-    """Store the index if the file is large and its folder can be written."""
-    if len(summaries) < EPISODES:
+def write_index(path: Path, summaries: tuple[EpisodeSummary, ...], digest: str, by_content: bool = False) -> None:
+    """Store the index if the folder can be written and the file is large, or ``by_content``, as of included files."""
+    if len(summaries) < EPISODES and not by_content:
         return
     columns = {name: [getattr(s, name) for s in summaries] for name in COLUMNS}
     with suppress(OSError, BadInput):
-        document = {"version": VERSION, "file": _identity(path), "hash": digest, "columns": columns}
+        document = {"version": VERSION, "file": _identity(path, by_content), "hash": digest, "columns": columns}
         write_atomically(index_path(path), json.dumps(document, separators=(",", ":")).encode())
 
 
-def _identity(path: Path) -> list[int]:
+def _identity(path: Path, by_content: bool) -> list[int | str]:
     status = path.stat()
+    if by_content:
+        return [status.st_size, _content_hash(path, status.st_size, status.st_mtime_ns)]
     return [status.st_size, status.st_mtime_ns]
+
+
+@lru_cache(maxsize=16)
+def _content_hash(path: Path, size: int, time: int) -> str:
+    """SHA-256 of a file with this size and time."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _summary(index: int, values: dict[str, Any]) -> EpisodeSummary:

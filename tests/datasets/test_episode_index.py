@@ -56,6 +56,26 @@ def test_index_of_another_time_or_version_is_replaced(path: Path) -> None:
     assert contents(path) == indexed
 
 
+def test_index_by_content_is_valid_at_any_time_and_only_for_the_content(path: Path) -> None:
+    with open_dataset(path) as data:
+        episode_index.write_index(path, data.summaries, data.hash, by_content=True)
+    index = read_index(path)
+    os.utime(path, ns=(1, 1))
+    assert read_index(path) == index is not None
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    assert read_index(path) is None
+
+
+@pytest.mark.parametrize("task", ["door", "push", "door-field", "push-field"])
+def test_included_files_have_an_index(task: str, tmp_path: Path) -> None:
+    copied = tmp_path / "set.h5"
+    copied.write_bytes(sample_path(task).read_bytes())
+    with open_dataset(copied) as data:
+        assert read_index(sample_path(task)) == (data.summaries, data.hash)
+
+
 @pytest.mark.parametrize(
     "change",
     [
