@@ -287,7 +287,8 @@ class Trainer:
         def loss(split: str) -> Tensor:
             batch = self.sample(split, steps, max(8, 2 * size // (1 + steps)))
             if isinstance(filter_, InformationFilter):
-                return losses.sensor_likelihood(filter_, name, batch)
+                factors = losses.NOISE_FACTORS if split == "val" else (1.0,)
+                return losses.sensor_likelihood(filter_, name, batch, factors)
             if not uses_images:
                 batch = self.shifted(batch)
             if isinstance(module, VirtualSensor):

@@ -20,7 +20,7 @@ from beliefscope.filters.models.information import MAX_NOISE, InformationFilter,
 from beliefscope.filters.models.path_circle import circle
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import standalone_evidence
-from beliefscope.filters.training.losses import sensor_likelihood
+from beliefscope.filters.training.losses import NOISE_FACTORS, sensor_likelihood
 from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.stages import Trainer
 
@@ -273,27 +273,50 @@ def test_static_components_do_not_move(filter_: InformationFilter, batch: Batch)
     torch.testing.assert_close(jacobian[:, :2], torch.eye(3)[:2].expand(5, -1, -1))
 
 
+class ConstantNoise:
+    """A sensor with given readings and the same reported noise at all steps."""
+
+    def __init__(self, filter_: InformationFilter, readings: Tensor, noise: float) -> None:
+        self.statistics, self.observations = filter_.statistics, filter_.observations
+        self.reading = readings, torch.full_like(readings, noise)
+
+    def sense(self, name: str, observations: object) -> tuple[Tensor, Tensor]:
+        return self.reading
+
+    def has_reading(self, batch: Batch, modalities: list[str]) -> Tensor:
+        return torch.ones(batch.states.shape[:2], dtype=torch.bool)
+
+
+def sensor_loss(
+    filter_: InformationFilter, batch: Batch, error: float, noise: float, factors: tuple[float, ...] = (1.0,)
+) -> float:
+    """Loss of a sensor with this standard deviation of the error, infinite for readings of 0, and reported noise."""
+    generator = torch.Generator().manual_seed(0)
+    truth, white = torch.randn(2, 4096, 1, 3, generator=generator)
+    readings = truth + error * white if error < torch.inf else torch.zeros_like(truth)
+    sensor = ConstantNoise(filter_, readings, noise)
+    many = replace(batch, states=filter_.statistics.state_to_si(truth))
+    return float(sensor_likelihood(sensor, "image", many, factors))  # type: ignore[arg-type]
+
+
 def test_a_sensor_without_information_has_an_optimum_at_infinite_noise(
     batch: Batch, filter_: InformationFilter
 ) -> None:
     """The prior of the training states is not part of a sensor, so that a filter may use it at every step."""
-    truth = torch.randn(4096, 1, 3, generator=torch.Generator().manual_seed(0))
-    states = filter_.statistics.state_to_si(truth)
-    many = replace(batch, states=states)
-    losses = []
-    for noise in (1.0, 10.0, 100.0):
-
-        class Sensor:
-            statistics, observations = filter_.statistics, filter_.observations
-
-            def sense(self, name: str, observations: object, noise: float = noise) -> tuple[Tensor, Tensor]:
-                return torch.zeros_like(truth), torch.full_like(truth, noise)
-
-            def has_reading(self, batch: Batch, modalities: list[str]) -> Tensor:
-                return torch.ones(batch.states.shape[:2], dtype=torch.bool)
-
-        losses.append(float(sensor_likelihood(Sensor(), "image", many)))  # type: ignore[arg-type]
+    losses = [sensor_loss(filter_, batch, torch.inf, noise) for noise in (1.0, 10.0, 100.0)]
     assert losses[0] > losses[1] > losses[2]
+
+
+def test_validation_prefers_an_overconfident_sensor_to_an_untrained_one(
+    batch: Batch, filter_: InformationFilter
+) -> None:
+    """Calibration corrects a constant factor on the noise."""
+    untrained, overconfident = (torch.inf, 1.0), (0.3, 0.3 / NOISE_FACTORS[6])
+    assert sensor_loss(filter_, batch, *overconfident) > sensor_loss(filter_, batch, *untrained)
+    validated = [sensor_loss(filter_, batch, *sensor, NOISE_FACTORS) for sensor in (overconfident, untrained)]
+    assert validated[0] < validated[1] - 1.0
+    # Rounding of float32 only.
+    assert validated[0] == pytest.approx(sensor_loss(filter_, batch, 0.3, 0.3), abs=1e-4)
 
 
 def test_sensors_are_trained_by_their_likelihood_and_then_frozen(episodes: list[Episode]) -> None:
