@@ -7,6 +7,7 @@ import subprocess
 import sysconfig
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -71,26 +72,55 @@ def start_server(tmp_path: Path) -> Iterator[Callable[..., Server]]:
         server.stop()
 
 
-# Module scope: Playwright keeps an event loop running in its thread, which tests of other files may need to themselves.
-@pytest.fixture(scope="module")
-def browser(chromium: str) -> Iterator[Any]:
-    reason = "Playwright is not installed: pip install -e '.[test]'"
-    sync_api = pytest.importorskip("playwright.sync_api", reason=reason)
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield browser
-        browser.close()
+class SharedBrowser:
+    """Chromium and a context of it, started when they are first used, for the tests of all files in this folder."""
+
+    def __init__(self) -> None:
+        self._open = ExitStack()
+
+    def browser(self, path: str) -> Any:
+        reason = "Playwright is not installed: pip install -e '.[test]'"
+        sync_api = pytest.importorskip("playwright.sync_api", reason=reason)
+        playwright = self._open.enter_context(sync_api.sync_playwright())
+        return self._open.enter_context(playwright.chromium.launch(executable_path=path, args=FLAGS))
+
+    def context(self, browser: Any, **options: Any) -> Any:
+        """A context whose pages are tabs of one window. Each window has a process for the browser's own controls."""
+        context = self._open.enter_context(browser.new_context(**options))
+        context.new_page()
+        return context
+
+    def close(self) -> None:
+        self._open.close()
 
 
-@pytest.fixture(scope="module")
-def context(browser: Any) -> Iterator[Any]:
-    """The pages of a file share a browser context: with an empty cache, each would load and compile all scripts.
+SHARED = SharedBrowser()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """Closes the browser after the last test of this folder.
+
+    Playwright keeps an event loop running in its thread, which tests of other folders may need to themselves.
+    """
+    yield
+    if nextitem is None or nextitem.path.parent != item.path.parent:
+        SHARED.close()
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: str) -> Any:
+    return SHARED.browser(chromium)
+
+
+@pytest.fixture(scope="session")
+def context(browser: Any) -> Any:
+    """All pages share a browser context: with an empty cache, each would load and compile all scripts.
 
     A pixel of the screen is 2 by 2 of the page, which halves the time of the 3D views; kept screenshots are sharp.
     """
-    context = browser.new_context(device_scale_factor=1.0 if os.environ.get("BELIEFSCOPE_SCREENSHOTS") else 0.5)
-    yield context
-    context.close()
+    scale = 1.0 if os.environ.get("BELIEFSCOPE_SCREENSHOTS") else 0.5
+    return SHARED.context(browser, device_scale_factor=scale)
 
 
 # Embedded pages of other projects are excluded: viser's scene and Rerun's canvas.
@@ -106,6 +136,16 @@ STATE = (
     "() => JSON.stringify([window.beliefscope?.state(), window.beliefscope?.stats,"
     " [...document.querySelectorAll('.note, #messages')].map((n) => n.textContent)])"
 )
+
+
+WAIT = """async () => {
+  const condition = CONDITION;
+  for (const end = performance.now() + 1000; performance.now() < end; ) {
+    if (await condition()) return true;
+    await new Promise((resolve) => setTimeout(resolve, 50));
+  }
+  return false;
+}"""
 
 
 class MonitoredPage:
@@ -147,9 +187,19 @@ class MonitoredPage:
     def until(self, condition: str, timeout: float = TIMEOUT) -> None:
         """Waits until a JavaScript function is true. Playwright's ``wait_for_function`` is blocked by the policy."""
         end = time.monotonic() + timeout
-        while not self.page.evaluate(condition):
+        while not self._becomes(condition):
             assert time.monotonic() < end, f"not within {timeout} s: {condition}; {self.page.evaluate(STATE)}"
-            time.sleep(0.05)
+
+    def _becomes(self, condition: str) -> bool:
+        """Whether the function is true within a second. The page checks it: calls from here take 3 ms of CPU time."""
+        from playwright.sync_api import Error
+
+        try:
+            return self.page.evaluate(WAIT.replace("CONDITION", condition))
+        except Error as error:
+            if "context was destroyed" in str(error):  # the page is loaded again
+                return False
+            raise
 
     @property
     def state(self) -> dict[str, Any]:

@@ -46,9 +46,18 @@ class Frame:
         return self.page.evaluate(f"() => frameThrottle.pause({times})")
 
 
+@pytest.fixture(scope="module")
+def without_policy(browser: Any) -> Iterator[Any]:
+    """A context in which scripts run on every page; the policy of JSON answers forbids them."""
+    context = browser.new_context(bypass_csp=True)
+    context.new_page()  # the others are tabs of its window
+    yield context
+    context.close()
+
+
 @pytest.fixture
-def frame(browser: Any, server: Any) -> Iterator[Frame]:
-    page = browser.new_page(bypass_csp=True)  # the policy of JSON answers forbids scripts
+def frame(without_policy: Any, server: Any) -> Iterator[Frame]:
+    page = without_policy.new_page()
     yield Frame(page, server.url)
     page.close()
 
