@@ -18,7 +18,9 @@ def test_filter_is_finetuned_promoted_and_discarded(
     open_page: Any, start_server: Callable[..., Any], tmp_path: Path
 ) -> None:
     with open_dataset(sample_path("door")) as data:
-        write_dataset(tmp_path / "few.h5", find_task("door"), [data[index] for index in range(0, len(data), 11)])
+        held_out = data.held_out()
+        indices = [index for index in range(0, len(data), 11) if index not in held_out] + held_out[:2]
+        write_dataset(tmp_path / "few.h5", find_task("door"), [data[index] for index in indices])
     # A separate server, as the test changes the default filter.
     server = start_server("--data", str(tmp_path / "few.h5"))
     page = open_page("?tab=finetune&filter=crossmodal-ekf&data=few", server.url)
