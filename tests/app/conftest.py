@@ -92,7 +92,7 @@ class Browser(TestClient):
         return super().websocket_connect(f"ws://{self.base_url.netloc.decode()}{url}", *args, **kwargs)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def open_client() -> Callable[..., TestClient]:
     return Browser
 

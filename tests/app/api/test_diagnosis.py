@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -31,29 +31,37 @@ URL = "/api/diagnosis/door/crossmodal-ekf/9"
 FAULTS = "image_frozen=5"
 
 
-def test_diagnosis_is_a_job_and_equals_that_of_the_command(
-    tmp_path: Path, open_client: Callable[..., TestClient]
-) -> None:
-    settings = Settings(workspace=tmp_path)  # the shipped filter has a healthy profile
-    query = {"faults": FAULTS, "over": "episode"}
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> Settings:
+    """Of a server with the included filters, which have healthy records."""
+    return Settings(workspace=tmp_path_factory.mktemp("workspace"))
+
+
+@pytest.fixture(scope="module")
+def server(settings: Settings, open_client: Callable[..., TestClient]) -> Iterator[TestClient]:
     with open_client(settings) as client:
-        first = wait_for_trace(client, query)
-        assert first["job"] is None
-        assert first["preliminary"]["causes"][0]["cause"] == "image.frozen"
-        assert all(cause["recovered"] is None for cause in first["preliminary"]["causes"])
-        response = client.post(URL, params=query)
-        assert response.status_code == 202
-        job = response.json()["job"]
-        assert job["title"] == f"Diagnosis of crossmodal-ekf, door episode 9, {FAULTS}"
-        link = dict(parse_qsl(job["link"].removeprefix("?")))
-        run = {"task": "door", "filter": "crossmodal-ekf", "data": "sample", "episode": "9", "tab": "diagnosis"}
-        assert link == run | query
-        end = time.monotonic() + TIMEOUT
-        while (answer := client.get(URL, params=query)).status_code == 202:
-            assert answer.json()["job"]["state"] in ("waiting", "running"), answer.text
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        result = answer.json()
+        yield client
+
+
+def test_diagnosis_is_a_job_and_equals_that_of_the_command(server: TestClient, settings: Settings) -> None:
+    query = {"faults": FAULTS, "over": "episode"}
+    first = wait_for_trace(server, query)
+    assert first["job"] is None
+    assert first["preliminary"]["causes"][0]["cause"] == "image.frozen"
+    assert all(cause["recovered"] is None for cause in first["preliminary"]["causes"])
+    response = server.post(URL, params=query)
+    assert response.status_code == 202
+    job = response.json()["job"]
+    assert job["title"] == f"Diagnosis of crossmodal-ekf, door episode 9, {FAULTS}"
+    link = dict(parse_qsl(job["link"].removeprefix("?")))
+    run = {"task": "door", "filter": "crossmodal-ekf", "data": "sample", "episode": "9", "tab": "diagnosis"}
+    assert link == run | query
+    end = time.monotonic() + TIMEOUT
+    while (answer := server.get(URL, params=query)).status_code == 202:
+        assert answer.json()["job"]["state"] in ("waiting", "running"), answer.text
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    result = answer.json()
     store = TraceStore(settings)
     episode = Faults.parse(FAULTS).apply(store.dataset("door", "")[1][9], settings.seed)
     expected = diagnose(
@@ -64,13 +72,11 @@ def test_diagnosis_is_a_job_and_equals_that_of_the_command(
     assert result == json.loads(json.dumps(as_json(expected.to_json())))
 
 
-def test_a_healthy_run_needs_no_job(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
-    settings = Settings(workspace=tmp_path)
-    with open_client(settings) as client:
-        result = wait_for_trace(client, {})
-        assert result["state"] == "healthy"
-        both = wait_for_trace(client, {"over": "held-out"})
-        assert both == {"job": None, "preliminary": result}
+def test_a_healthy_run_needs_no_job(server: TestClient, settings: Settings) -> None:
+    result = wait_for_trace(server, {})
+    assert result["state"] == "healthy"
+    both = wait_for_trace(server, {"over": "held-out"})
+    assert both == {"job": None, "preliminary": result}
     store = TraceStore(settings)
     episodes = {9: store.dataset("door", "")[1][9]}
     expected = diagnose(store.checkpoint("door", "crossmodal-ekf"), episodes, particles=settings.particles)
@@ -85,18 +91,16 @@ def wait_for_trace(client: TestClient, query: dict[str, str]) -> Any:
     return reply
 
 
-def test_the_smallest_repair_is_that_of_the_command(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
+def test_the_smallest_repair_is_that_of_the_command(server: TestClient, settings: Settings) -> None:
     url, faults = "/api/repair/push/crossmodal-ekf/9", "image_occluded=14:from=40:to=60"
-    settings = Settings(workspace=tmp_path)
-    with open_client(settings) as client:
-        assert client.get(url, params={"faults": faults}).json() == {"job": None}
-        job = client.post(url, params={"faults": faults}).json()["job"]
-        assert job["title"] == f"Smallest repair of crossmodal-ekf, push episode 9, {faults}"
-        end = time.monotonic() + TIMEOUT
-        while (answer := client.get(url, params={"faults": faults})).status_code == 202:
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        result = answer.json()
+    assert server.get(url, params={"faults": faults}).json() == {"job": None}
+    job = server.post(url, params={"faults": faults}).json()["job"]
+    assert job["title"] == f"Smallest repair of crossmodal-ekf, push episode 9, {faults}"
+    end = time.monotonic() + TIMEOUT
+    while (answer := server.get(url, params={"faults": faults})).status_code == 202:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    result = answer.json()
     store = TraceStore(settings)
     run = store.request(Selection("push", "crossmodal-ekf", 9, Faults.parse(faults)))
     bound = healthy_bound(required_profile(run.checkpoint).statistics)
@@ -165,12 +169,12 @@ def test_a_healthy_record_needs_ten_episodes(tmp_path: Path, open_client: Callab
         assert "'few' has 7 held-out episodes; a healthy record needs at least 10" in reply.text
 
 
-def test_unknown_names_are_reported(client: TestClient) -> None:
+def test_unknown_names_are_reported(server: TestClient) -> None:
     for url, name in (
         ("/api/diagnosis/door/crossmodal-ekg/1", "crossmodal-ekg"),
         (f"{URL}?faults=image_frozzen", "image_frozzen"),
         (f"{URL}?over=all", "over"),
     ):
-        reply = client.post(url)
+        reply = server.post(url)
         assert reply.status_code in (400, 404, 422)
         assert name in reply.text

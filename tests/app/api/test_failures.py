@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -40,21 +41,33 @@ def wait_for_failures(client: TestClient, url: str = URL, **query: str) -> Any:
     return answer.json()
 
 
+@pytest.fixture(scope="module")
+def settings(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> Settings:
+    """Of the server of ``client``."""
+    return replace(base_settings, workspace=tmp_path_factory.mktemp("workspace"))
+
+
+@pytest.fixture(scope="module")
+def client(settings: Settings, open_client: Callable[..., TestClient]) -> Iterator[TestClient]:
+    with open_client(settings) as client:
+        yield client
+
+
 def test_survey_is_a_job_and_stores_no_traces(
-    settings: Settings, open_client: Callable[..., TestClient], steps: int
+    client: TestClient, settings: Settings, open_client: Callable[..., TestClient], steps: int
 ) -> None:
     query = {"among": "all", "faults": FAULTS}
-    with open_client(settings) as client:
-        assert client.get(URL, params=query).json() == {"job": None}
-        response = client.post(URL, params=query)
-        assert response.status_code == 202
-        job = response.json()["job"]
-        assert job["title"] == f"Failures of crossmodal-ekf, door, all 2 episodes, {FAULTS}"
-        assert client.post(URL, params=query).json()["job"]["id"] == job["id"]
-        result = wait_for_failures(client, **query)
-        link = dict(parse_qsl(job["link"].removeprefix("?")))
-        assert link == {"task": "door", "filter": "crossmodal-ekf", "data": "mine", "tab": "failures"} | query
-        assert client.get(URL).json() == {"job": None}  # held-out episodes without faults: another survey
+    assert client.get(URL, params=query).json() == {"job": None}
+    response = client.post(URL, params=query)
+    assert response.status_code == 202
+    job = response.json()["job"]
+    assert job["title"] == f"Failures of crossmodal-ekf, door, all 2 episodes, {FAULTS}"
+    assert client.post(URL, params=query).json()["job"]["id"] == job["id"]
+    result = wait_for_failures(client, **query)
+    link = dict(parse_qsl(job["link"].removeprefix("?")))
+    assert link == {"task": "door", "filter": "crossmodal-ekf", "data": "mine", "tab": "failures"} | query
+    for other in ({"among": "held-out"}, {"faults": "blackout=0.6"}):  # other surveys
+        assert client.get(URL, params=query | other).json() == {"job": None}
     assert not (settings.workspace / "traces").exists()
 
     store = TraceStore(settings)
@@ -71,8 +84,8 @@ def test_survey_is_a_job_and_stores_no_traces(
     few = "Slices were not searched: 2 episodes; a search for slices needs at least 8."
     assert result["scores"][0]["slices"] == {"summary": few, "rows": []}
     assert [(e["index"], e["steps"]) for e in result["episodes"]] == [(0, steps), (1, steps)]
-    with open_client(settings) as client:  # another server on the same workspace
-        assert client.get(URL, params=query).json() == result
+    with open_client(settings) as second:  # on the same workspace
+        assert second.get(URL, params=query).json() == result
 
 
 def test_every_score_is_ranked_or_has_a_reason(client: TestClient) -> None:
@@ -129,8 +142,9 @@ def test_slices_are_those_of_the_command(client: TestClient) -> None:
 def test_invalid_requests_are_refused(
     client: TestClient, url: str, query: dict[str, str], status: int, message: str
 ) -> None:
+    jobs = client.get("/api/jobs").json()
     for method in ("GET", "POST"):
         answer = client.request(method, url, params=query)
         assert answer.status_code == status
         assert message in answer.json()["error"]
-    assert client.get("/api/jobs").json() == []
+    assert client.get("/api/jobs").json() == jobs
