@@ -131,14 +131,14 @@ class TraceStore:
         if (live_run := self._live_run(selection)) is not None:
             return live_run
         with self._lock:
-            run = self._in_use.get(self.key(selection))
+            key = self._key(selection)
+            run = self._in_use.get(key)
             if run is None or self._is_outdated(run):
-                checkpoint, episode = self._resolve(selection)
                 if self._waiting >= MAX_WAITING:
                     raise QueueFull(f"{self._waiting} filter runs are waiting already; try again later")
-                run = TracedRun(self.key(selection), checkpoint)
+                run = TracedRun(key, self.checkpoint(selection.task, selection.filter))
                 self._waiting += 1
-                self._executor.submit(self._compute, run, selection, episode)
+                self._executor.submit(self._compute, run, selection)
             self._remember(run)
             return run
 
@@ -244,25 +244,23 @@ class TraceStore:
         run = self.live[selection.data.removeprefix(LIVE_PREFIX)]
         return self.live.traced_run(selection, self.filters_of(run))
 
-    def _resolve(self, selection: Selection) -> tuple[Checkpoint, Episode]:
-        catalog = self._catalog(selection.task)
-        checkpoint = self.healthy_records.complete(catalog.filter(selection.filter))
-        live = selection.data.startswith(LIVE_PREFIX)
-        episode = self.live.episode(selection.data) if live else catalog.episode(selection.data, selection.episode)
-        selection.faults.check(checkpoint.task, len(episode))
-        if selection.edit is not None:
-            selection.edit.faults.check(checkpoint.task)
-        if selection.only:
-            check_standalone(checkpoint, selection.only)
-        return checkpoint, episode
+    def _episode(self, selection: Selection) -> Episode:
+        with self._lock:
+            if selection.data.startswith(LIVE_PREFIX):
+                return self.live.episode(selection.data)
+            return self._catalog(selection.task).episode(selection.data, selection.episode)
 
     def _compute_key(self, selection: Selection) -> str:
-        checkpoint, episode = self._resolve(selection)
+        """Checks all parts of the selection: other functions rely on this."""
+        checkpoint, episode = self.checkpoint(selection.task, selection.filter), self._episode(selection)
+        selection.faults.check(checkpoint.task, len(episode))
         seed, particles = self.settings.seed, self.settings.particles
         parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.faults)]
         if selection.edit is not None:
+            selection.edit.faults.check(checkpoint.task)
             parts.append(selection.edit.to_json())
         if selection.only:
+            check_standalone(checkpoint, selection.only)
             parts.append(f"only {selection.only}")
         return hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
 
@@ -274,7 +272,7 @@ class TraceStore:
         while len(self._recent) > TRACES_IN_MEMORY or (size > BYTES_IN_MEMORY and len(self._recent) > 1):
             size -= self._recent.popitem(last=False)[1].nbytes
 
-    def _compute(self, run: TracedRun, selection: Selection, episode: Episode) -> None:
+    def _compute(self, run: TracedRun, selection: Selection) -> None:
         def progress(fraction: float) -> None:
             if self._closing:
                 raise CancelledError
@@ -288,6 +286,7 @@ class TraceStore:
             if self._worker is not None and self._worker.started:
                 result = _run_in_worker(self._worker, request, progress)
             else:
+                episode = self._episode(selection)
                 result = self._runs.run(run.checkpoint, episode, progress=progress, **request.settings())
             run.future.set_result(result)
         except BaseException as error:
