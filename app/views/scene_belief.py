@@ -24,7 +24,7 @@ from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.task import Outline, Task
 from beliefscope.inspect.figures.scene_belief import DISC_SPACING, DrawnBelief, rgb
 from beliefscope.inspect.figures.scene_shapes import DISC, FAN, OUTLINE_EDGES, RGB, UP, Array, dashed
-from beliefscope.inspect.likelihood import LikelihoodMap, no_maps
+from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.statistics.measures import layer_label
 from beliefscope.inspect.trace import Trace
 
@@ -97,7 +97,7 @@ class BeliefScene:
             self._robot = RobotScene(server, self._replay)
         elif self._task.floor is not None:
             add_grid(server, self._task, trace)
-        available: set[str] = set(scene_layers(self._task, trace, no_maps(run.checkpoint, trace)))
+        available: set[str] = set(scene_layers(self._task, trace, run.no_maps))
         poles = self._belief.names if "estimates" in available else ()
         self._poles = [self._add_pole(i, name) for i, name in enumerate(poles)]
         self._outline_frames = [] if self._belief.outline is None else self._add_outlines(self._belief.outline)
