@@ -118,8 +118,8 @@ def _selections(store: TraceStore, selection: Selection, episodes: Episodes) -> 
 def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> object:
     """Everything the result depends on, including the indices of the episodes."""
     traces = [(selection.episode, store.key(selection)) for selection in selections]
-    measured = {store.record_version(selection.task, selection.filter) for selection in selections}
-    return entry.name, traces, sorted(options.items()), *filter(None, measured)
+    version = store.record_version(selections[0].task, selections[0].filter)
+    return entry.name, traces, sorted(options.items()), *filter(None, [version])
 
 
 def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:

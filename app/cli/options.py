@@ -276,12 +276,6 @@ class Run(Runs):
         with self.episodes(task) as episodes:
             return episodes[self.index(episodes)], self.index(episodes)
 
-    def trace(self, align: bool = False, **settings: int) -> tuple[Checkpoint, Trace]:
-        """The filter, and its run over the selected episode: see ``over``."""
-        checkpoint, faults = self.open()
-        episode, index = self.read_episode(checkpoint.task)
-        return checkpoint, self.over(checkpoint, episode, index, faults, align, **settings)
-
     def over(
         self, checkpoint: Checkpoint, episode: Episode, index: int, faults: Faults, align: bool = False, **settings: int
     ) -> Trace:

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, TextIO
 
-LEVELS = ("debug", "info", "warning", "error")
-FORMATS = ("text", "json")
 SECRET = re.compile(r"((?:\btoken=|[Bb]earer |beliefscope-\d+=))[^\s&;\"']+")
 MAX_REFUSALS = 30  # logged per minute, so that refused requests do not fill the disk
 REFUSALS = ("refused: ", "Invalid HTTP request", "Unsupported upgrade")

@@ -133,11 +133,15 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     return app
 
 
+def _print_url(url: str) -> None:
+    print(f"Beliefscope is running at {url} (press Ctrl+C to stop)", flush=True)
+
+
 def serve(
     settings: Settings,
     host: str = "127.0.0.1",
     port: int = 8000,
-    on_start: Callable[[str], None] | None = None,
+    on_start: Callable[[str], None] = _print_url,
     access: Access = OPEN,
 ) -> None:
     """Serve on one port until SIGINT, SIGTERM or SIGHUP.
@@ -150,7 +154,6 @@ def serve(
 
     Raises BadInput if the address is not available or not allowed, or if a file cannot be used.
     """
-    on_start = on_start or _print_url
     if host not in LOOPBACK and not access.token:
         raise BadInput(f"Others can reach {host}: a server there needs a token, in Access or in {VARIABLE}.")
     limit_malloc_arenas()
@@ -287,7 +290,3 @@ def listen(host: str, port: int) -> socket.socket:
             f"Cannot listen on {host} port {port}: {reason}. Choose another --port (0: any free one)."
         ) from None
     return listener
-
-
-def _print_url(url: str) -> None:
-    print(f"Beliefscope is running at {url} (press Ctrl+C to stop)", flush=True)

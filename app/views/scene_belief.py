@@ -244,6 +244,6 @@ class ComparisonEstimate:
         self._root.remove()
 
 
-def add_lines(server: ViserServer, path: str, lines: Array, color: RGB, thickness: float = 2.0) -> None:
-    """Add line segments (N, 2, 3) in m. thickness: pixels."""
-    server.scene.add_line_segments(path, lines.astype(np.float32), color, thickness=thickness, thickness_units="screen")
+def add_lines(server: ViserServer, path: str, lines: Array, color: RGB) -> None:
+    """Add line segments (N, 2, 3) in m, 2 pixels thick."""
+    server.scene.add_line_segments(path, lines.astype(np.float32), color, thickness=2.0, thickness_units="screen")

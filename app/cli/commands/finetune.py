@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.external.load import ExternalFilter
-    from beliefscope.filters.finetuning.finetune import Callbacks, FineTuned
+    from beliefscope.filters.finetuning.finetune import Callbacks
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
     from beliefscope.inspect.compare.success import Success
@@ -112,6 +112,7 @@ def finetune(
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.filters.finetuning.finetune import finetune as tune
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnostics.healthy_profile import included_reference
     from beliefscope.inspect.healthy import measure_profile
@@ -127,10 +128,12 @@ def finetune(
         members, data_hash = _training_episodes(episodes, data, output.parent)
         command = finetune_command(target, filter, data, settings)
         partial = output.with_name(f"{output.name}.partial")  # from which an interrupted run resumes
-        source = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
+        source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source)
-        tuned = _run(base, members, log, rerun, source)
+        with _progress(base, partial, log, rerun) as callbacks:
+            tuned = tune(base, members, callbacks=callbacks, **source)
+        assert tuned is not None, "runs without a stop callback always complete"
         images = included_reference(base.task) if data is None else None  # of the same camera
         profile = measure_profile(tuned.filter, base.name, members, command, images)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
@@ -152,11 +155,6 @@ def _training_episodes(data: Dataset, path: Path | None, folder: Path) -> tuple[
             update(f"Simulating {count} training episodes of {data.task.name}", done / count, "")
 
         return training_episodes(data.path.name, data, True, folder, on_simulation)
-
-
-def _partial(output: Path) -> Path:
-    """File from which an interrupted run resumes."""
-    return output.with_name(f"{output.name}.partial")
 
 
 @contextmanager
@@ -181,18 +179,6 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: 
             console.note(f"resuming after step {step}, from {partial.name}")
 
         yield Callbacks(report, on_validation, on_resume)
-
-
-def _run(
-    base: Checkpoint, episodes: list[Episode], log: Path | None, viewer: str, source: Mapping[str, Any]
-) -> FineTuned:
-    """Fine-tune a filter of this project. source: other arguments of ``finetune``."""
-    from beliefscope.filters.finetuning.finetune import finetune as tune
-
-    with _progress(base, source["partial"], log, viewer) as callbacks:
-        tuned = tune(base, episodes, callbacks=callbacks, **source)
-    assert tuned is not None, "runs without a stop callback always complete"
-    return tuned
 
 
 def _external(base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any]) -> console.Result:

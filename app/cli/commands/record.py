@@ -27,7 +27,8 @@ def record(
     from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
-    checkpoint, trace = run.trace()
+    checkpoint, faults = run.open()
+    trace = run.over(checkpoint, *run.read_episode(checkpoint.task), faults)
     if maps and (reason := no_maps(checkpoint, trace, quantity)):
         if quantity:
             raise BadInput(reason)

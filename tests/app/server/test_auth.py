@@ -199,7 +199,7 @@ def test_host_names() -> None:
     assert host_names("0.0.0.0")[0] != "0.0.0.0"
 
 
-@pytest.mark.parametrize("form", logs.FORMATS)
+@pytest.mark.parametrize("form", ["text", "json"])
 @pytest.mark.usefixtures("restore_loggers")
 def test_log_contains_no_secrets(client: TestClient, form: str) -> None:
     stream = io.StringIO()

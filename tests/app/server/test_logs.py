@@ -56,7 +56,7 @@ def test_text_format(log_text: io.StringIO) -> None:
     assert line.split(" ", 1)[1] == 'warning: job ended job="0123" error="no room"'
 
 
-@pytest.mark.parametrize("log_text", logs.FORMATS, indirect=True)
+@pytest.mark.parametrize("log_text", ["text", "json"], indirect=True)
 def test_log_lines_cannot_be_forged(log_text: io.StringIO, client: TestClient) -> None:
     forged = "x\r\n2026-01-01T00:00:00.000Z error: injected line\u2028\x1b[2J\x9b2J"
     client.get("/api/jobs", headers={"Host": forged.encode()})  # type: ignore[dict-item]
