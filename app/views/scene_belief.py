@@ -9,7 +9,6 @@ import numpy as np
 from viser import ViserServer
 
 from beliefscope.app.protocol.messages import SceneLayers
-from beliefscope.app.protocol.trace_format import scene_layers
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.scene_context import (
     SHADING,
@@ -97,7 +96,7 @@ class BeliefScene:
             self._robot = RobotScene(server, self._replay)
         elif self._task.floor is not None:
             add_grid(server, self._task, trace)
-        available: set[str] = set(scene_layers(self._task, trace, run.no_maps))
+        available = set(run.header["scene"])
         poles = self._belief.names if "estimates" in available else ()
         self._poles = [self._add_pole(i, name) for i, name in enumerate(poles)]
         self._outline_frames = [] if self._belief.outline is None else self._add_outlines(self._belief.outline)
