@@ -29,6 +29,7 @@ from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference, task_to_json
+from beliefscope.filters.batch import Statistics
 from beliefscope.filters.catalog import build
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
@@ -61,6 +62,11 @@ class Checkpoint:
     @property
     def kind(self) -> Kind:
         return self.filter.architecture.kind
+
+    @property
+    def statistics(self) -> Statistics:
+        """Of the training data."""
+        return self.filter.statistics
 
     def with_filter(self, filter_: Filter) -> Checkpoint:
         """The same checkpoint with another filter."""
@@ -100,7 +106,7 @@ class DeferredCheckpoint(Checkpoint):
 
     def __init__(self, path: Path) -> None:
         """Raises BadInput like ``load_checkpoint``, except for damaged tensors."""
-        header, _ = _read(path, with_tensors=False)
+        header, _ = _read(path, prefix=None)
         architecture = _architecture(header)
         values = _description(path, header) | {"_path": path, "_architecture": architecture}
         for key, value in values.items():
@@ -112,6 +118,13 @@ class DeferredCheckpoint(Checkpoint):
     @cached_property
     def filter(self) -> Filter:
         return _filter(self._path, _read(self._path)[1], self._architecture)
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        statistics, prefix = Statistics(self.task), "statistics."
+        tensors = _read(self._path, prefix)[1]
+        statistics.load_state_dict({key.removeprefix(prefix): value.clone() for key, value in tensors.items()})
+        return statistics
 
     @property
     def task(self) -> Task:
@@ -155,14 +168,14 @@ def _filter(path: Path, tensors: Mapping[str, torch.Tensor], architecture: Archi
     return filter_.eval().requires_grad_(False)
 
 
-def _read(path: Path, with_tensors: bool = True) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Header and tensors of a file."""
+def _read(path: Path, prefix: str | None = "") -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Header of a file, and the tensors whose names start with the prefix; None: no tensors."""
     if not path.is_file():
         raise BadInput(f"checkpoint {str(path)!r} does not exist")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            names = file.keys() if with_tensors else ()
+            names = () if prefix is None else filter(lambda name: name.startswith(prefix), file.keys())
             tensors = {key: file.get_tensor(key) for key in names}
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise BadInput(f"{str(path)!r} is not a readable safetensors file: {reason_unreadable(path, error)}") from None

@@ -154,7 +154,7 @@ def findings(checkpoint: Checkpoint, episodes: Sequence[Episode], ignored: Seque
     """
     if isinstance(checkpoint, ExternalFilter) or not episodes:
         return []
-    task, statistics = checkpoint.task, checkpoint.filter.statistics
+    task, statistics = checkpoint.task, checkpoint.statistics
     parts = [_normalised(statistics, task, episode) for episode in episodes]
     result = _channel_findings(task, statistics, [values for values, _ in parts])
     summary = checkpoint.record.get("data_summary") or _shipped_summaries().get(summary_key(statistics))

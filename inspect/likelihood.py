@@ -13,6 +13,7 @@ from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
+from beliefscope.filters.catalog import KINDS
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import usual_variances, with_floor
 from beliefscope.filters.engine import one_thread
@@ -67,7 +68,7 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
         reasons = [_no_density(checkpoint, trace, each) for each in wanted]
         if None not in reasons:
             return f"filter {checkpoint.name!r} {subject}: {reasons[-1]}"
-    elif not checkpoint.filter.has_covariance:
+    elif not KINDS[checkpoint.kind].has_covariance:
         kind = {"lstm": "an LSTM"}.get(checkpoint.kind, f"a {checkpoint.kind}")
         return f"filter {checkpoint.name!r} {subject}: {kind} has no likelihood and no covariance"
     return None

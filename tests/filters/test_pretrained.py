@@ -97,6 +97,8 @@ def test_a_deferred_checkpoint_equals_the_loaded_one() -> None:
     deferred, loaded = DeferredCheckpoint(path), load_checkpoint(path)
     for name in ("name", "hash", "record", "healthy_profile", "task", "kind"):
         assert getattr(deferred, name) == getattr(loaded, name), name
+    statistics = deferred.statistics.state_dict()
+    assert all(torch.equal(statistics[key], value) for key, value in loaded.statistics.state_dict().items())
     assert "filter" not in vars(deferred)  # the networks were not read
     expected = loaded.filter.state_dict()
     assert deferred.filter.state_dict().keys() == expected.keys()
