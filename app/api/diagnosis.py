@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
-from beliefscope.app.api.jobs import key_over_episodes, result_or_job
+from beliefscope.app.api.jobs import arguments_over_episodes, key_over_episodes, result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob, HealthyRecord, SmallestRepair
 from beliefscope.app.api.traces import RequestedRun, finished_run
@@ -129,14 +129,9 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
     name, data = store.dataset(selection.task, selection.data)
     selection.faults.check(store.checkpoint(selection.task, selection.filter).task)
     held_out = [index for index in data.held_out() if index != selection.episode][: MAX_EPISODES - 1]
-    return {
-        "settings": store.settings.to_json(),
-        "task": selection.task,
-        "filter": selection.filter,
-        "data": name,
-        "faults": str(selection.faults),
-        "episodes": [selection.episode, *(held_out if over == "held-out" else ())],
-    }
+    episodes = [selection.episode, *(held_out if over == "held-out" else ())]
+    faults = str(selection.faults)
+    return arguments_over_episodes(store, selection.task, selection.filter, name, episodes, faults=faults)
 
 
 def _key(store: TraceStore, arguments: Mapping[str, Any]) -> object:
@@ -152,10 +147,4 @@ def _repair_key(store: TraceStore, selection: Selection) -> object:
 def _record_arguments(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:
     """Arguments of the job that measures a healthy record. Raises BadInput for an unknown name."""
     name, episodes = store.dataset(task, data)
-    return {
-        "settings": store.settings.to_json(),
-        "task": task,
-        "filter": filter_,
-        "data": name,
-        "episodes": episodes.held_out()[:MAX_RECORDED],
-    }
+    return arguments_over_episodes(store, task, filter_, name, episodes.held_out()[:MAX_RECORDED])

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends
 from fastapi.responses import JSONResponse, Response
 
-from beliefscope.app.api.jobs import key_over_episodes, result_or_job
+from beliefscope.app.api.jobs import arguments_over_episodes, key_over_episodes, result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.results import Failures
 from beliefscope.app.api.traces import finished_run
@@ -84,9 +84,5 @@ def _arguments(store: TraceStore, request: SurveyRequest) -> dict[str, Any]:
     name, data = store.dataset(request.task, request.data)
     episodes = data.held_out() if request.among == "held-out" else list(range(len(data)))
     faults.check(store.checkpoint(request.task, request.filter).task, data.most_steps(episodes))
-    return asdict(request) | {
-        "settings": store.settings.to_json(),
-        "data": name,
-        "faults": str(faults),
-        "episodes": episodes,
-    }
+    others = {"among": request.among, "faults": str(faults)}
+    return arguments_over_episodes(store, request.task, request.filter, name, episodes, **others)

@@ -45,6 +45,14 @@ def routes(jobs: Jobs) -> APIRouter:
     return router
 
 
+def arguments_over_episodes(
+    store: TraceStore, task: str, filter_: str, data: str, episodes: list[int], **others: str
+) -> dict[str, Any]:
+    """Arguments of a job that runs a filter over episodes of a data set."""
+    names = {"settings": store.settings.to_json(), "task": task, "filter": filter_, "data": data}
+    return {**names, **others, "episodes": episodes}
+
+
 def key_over_episodes(store: TraceStore, arguments: Mapping[str, Any]) -> object:
     """Everything that the result of a job over episodes of a data set depends on, given its arguments, except for a
     healthy record of the workspace.
