@@ -21,7 +21,7 @@ from starlette.requests import ClientDisconnect
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import JobReply, RequestBody
 from beliefscope.app.api.models.files import DeletedId, Freed, RecordingEntry, RecordingList, RunNames, WrittenRecording
-from beliefscope.app.jobs.queue import Job, Jobs
+from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.jobs.recording import write
 from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.protocol.messages import READ_ONLY
@@ -120,27 +120,23 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
 
     @router.post("/api/recordings/{name}.rrd/run", status_code=202)
     def open_run(name: str) -> JobReply:
-        return JobReply(job=_open_run(store, files, jobs, name))
+        recording = files.get(name)
+        info = recording.info
+        if info is None or info.problem:
+            raise BadInput(info.problem if info else f"{recording.name!r} is still being read.")
+        assert info.filter is not None
+        key = repr((recording.name, recording.bytes, recording.modified))
+        run = f"{recording.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
+        filters: Mapping[str, Checkpoint] = {}
+        with suppress(BadInput):  # a task that this server does not have
+            filters = store.filters(str(info.task))
+        filter_, output = display_name(info.filter, info.checkpoint_hash, filters), store.live.folder / f"{run}{SUFFIX}"
+        link = page_link(task=info.task, filter=filter_, data=LIVE_PREFIX + run, episode=info.episode or 0, tab="scene")
+        arguments, title = {"recording": str(files.path(name)), "run": str(output)}, f"The run in {recording.name}"
+        return JobReply(job=jobs.submit("reading", title, arguments, key, link, output.is_file()))
 
     _add_file_routes(router, files, matcher)
     return router
-
-
-def _open_run(store: TraceStore, files: RecordingFolder, jobs: Jobs, name: str) -> Job:
-    recording = files.get(name)
-    info = recording.info
-    if info is None or info.problem:
-        raise BadInput(info.problem if info else f"{recording.name!r} is still being read.")
-    assert info.filter is not None
-    key = repr((recording.name, recording.bytes, recording.modified))
-    run = f"{recording.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
-    filters: Mapping[str, Checkpoint] = {}
-    with suppress(BadInput):  # a task that this server does not have
-        filters = store.filters(str(info.task))
-    filter_, output = display_name(info.filter, info.checkpoint_hash, filters), store.live.folder / f"{run}{SUFFIX}"
-    link = page_link(task=info.task, filter=filter_, data=LIVE_PREFIX + run, episode=info.episode or 0, tab="scene")
-    arguments = {"recording": str(files.path(name)), "run": str(output)}
-    return jobs.submit("reading", f"The run in {recording.name}", arguments, key, link, output.is_file())
 
 
 def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatcher) -> None:

@@ -12,7 +12,6 @@ from beliefscope.app.api.models.files import DeletedId, Freed, Name, ReportList
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.etag import tagged_json
-from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.reports import ReportFolder
 from beliefscope.datasets.errors import BadInput
@@ -55,7 +54,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         selection: RequestedRun, request: Request, options: Annotated[ReportRequest | None, Body()] = None
     ) -> JobReply:
         options = options or ReportRequest()
-        _check(store, selection, options)
+        if options.pdf:
+            browser()  # raises BadInput without Chromium
+        if options.events and (last := max(options.events)) >= (steps := len(store.request(selection))):
+            raise BadInput(f"event step {last} does not exist: the run has steps 0 to {steps - 1}")
         url = str(request.base_url)
         key = repr((store.key(selection), selection.filter, selection.data, url, options.model_dump_json()))
         name = f"{selection.file_stem}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
@@ -98,11 +100,3 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return Freed(freed=reports.trash.empty())
 
     return router
-
-
-def _check(store: TraceStore, selection: Selection, options: ReportRequest) -> None:
-    """Raise BadInput for a step outside the run, or if a PDF is requested and Chromium is missing."""
-    if options.pdf:
-        browser()
-    if options.events and (last := max(options.events)) >= (steps := len(store.request(selection))):
-        raise BadInput(f"event step {last} does not exist: the run has steps 0 to {steps - 1}")

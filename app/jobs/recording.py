@@ -12,7 +12,8 @@ from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.recordings import RecordingFolder
 from beliefscope.inspect.catalog import quick
-from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
+from beliefscope.inspect.likelihood import FINE, LikelihoodMap, Quantity
+from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.traces.live_file import SUFFIX, write_live
 from beliefscope.recordings.probe import RecordingInfo
 
@@ -46,9 +47,9 @@ def write(
     steps = range(0, len(trace), stride) if stride else range(0)
 
     def maps() -> Iterator[LikelihoodMap]:
-        for count, likelihood_map in enumerate(run.maps(steps, quantity), start=1):
+        for count, step in enumerate(steps, start=1):
+            yield run.map(step, FINE, MapOptions(quantity=quantity))
             report(count / len(steps), f"likelihood maps, {count} of {len(steps)}")
-            yield likelihood_map
 
     part = files.partial_path()
     try:

@@ -2,7 +2,6 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, TimeoutError as FutureTimeout
 from functools import cached_property
 from typing import Any
@@ -12,7 +11,7 @@ from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.data_check import data_warning
 from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
-from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
+from beliefscope.inspect.likelihood import COARSE, LikelihoodMap, MapEngine, missing_quantities, no_maps
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.trace import Trace, arrays_of
 
@@ -90,10 +89,6 @@ class TracedRun:
         """Compute one map. The map engine keeps caches, so it computes one map at a time."""
         with self._engine_lock:
             return self._engine.available_map(step, size, options)
-
-    def maps(self, steps: Iterable[int], quantity: Quantity = "likelihood") -> Iterator[LikelihoodMap]:
-        """Compute fine maps of several steps. Other threads get their maps in between."""
-        return (self.map(step, FINE, MapOptions(quantity=quantity)) for step in steps)
 
     def encoded_maps(self, step: int, size: int, options: MapOptions = DEFAULT_MAP) -> EncodedMaps:
         """One map in its binary encoding. The most recent ones are cached for all views of the run."""
