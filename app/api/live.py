@@ -23,7 +23,6 @@ from beliefscope.app.runs.live_runs import LiveRuns, describe, resolve_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.external.load import UnavailableFilter
@@ -117,11 +116,9 @@ def routes(store: TraceStore) -> APIRouter:
 
 def _parse_request(text: str) -> StepsRequest:
     try:
-        return StepsRequest.model_validate(read_json(text))
+        return StepsRequest.model_validate_json(text)
     except ValidationError as error:
         raise BadInput(f"invalid request for steps: {describe_error(error)}") from None
-    except ValueError as error:
-        raise BadInput(f"not JSON: {error}") from None
 
 
 async def _next_block(runs: LiveRuns, name: str, request: StepsRequest) -> bytes:
