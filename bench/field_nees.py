@@ -1,21 +1,24 @@
-"""Calibrate the shipped filters of a field task on held-out episodes and print their NEES before and after.
+"""Calibrate the shipped filters of a field task on held-out episodes and print their NEES on others.
 
-    beliefscope collect push-field --episodes 240 --steps 200 --seed 23 --split test -o fit.h5
-    beliefscope collect push-field --episodes 60 --steps 200 --seed 22 --split test -o test.h5
-    python bench/field_nees.py push-field fit.h5 test.h5
+    beliefscope collect push-field --episodes 960 --steps 200 --seed 31 --split test -o first.h5
+    beliefscope collect push-field --episodes 240 --steps 200 --seed 32 --split test -o second.h5
+    python bench/field_nees.py push-field first.h5 second.h5
 
-The factor on the covariance is the mean NEES over the first file (docs/calibration.md), either one for all steps, or
-one for each combination of contact and outage, which a robot can measure. Brackets: 95 % intervals over trajectories.
+The episodes of all files are divided into sets of 60. The factor on the covariance for a set is the mean NEES over all
+other sets (docs/calibration.md), either one for all steps, or one for each combination of contact and outage, which a
+robot can measure. For each phase the table has the mean NEES over all episodes, with its 95 % interval over
+trajectories, and the number of sets whose own interval contains 1.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from field_tasks import Array, mean_of_steps, nees_by_step, phases
+from field_tasks import Array, mean_of_steps, nees_by_step, phase_mean, phases
 
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
@@ -23,32 +26,50 @@ from beliefscope.filters.names import shipped
 
 RULES = ("crossmodal", "unimodal", "feature", "image", "haptics")
 FILTERS = ("information-ekf", "crossmodal-pf", *(f"{rule}-ekf" for rule in RULES))
+EPISODES = 60
+"""Episodes of a set."""
 
 
-def cells(masks: dict[str, Array]) -> Array:
-    """(T, R) number of the combination of contact and outage."""
-    return masks["contact"] + 2 * masks["outage"]
+def calibrated(values: Array, cells: Array) -> Array:
+    """NEES (T, R) of all sets, each divided by the mean over the other sets of the steps in the same cell (T, R)."""
+    result = values.copy()
+    for first in range(0, values.shape[1], EPISODES):
+        inside = np.zeros(values.shape[1], bool)
+        inside[first : first + EPISODES] = True
+        for cell in np.unique(cells):
+            others = values[:, ~inside][cells[:, ~inside] == cell].mean()
+            result[:, inside] /= np.where(cells[:, inside] == cell, others, 1.0)
+    return result
 
 
 def row(values: Array, masks: dict[str, Array]) -> str:
-    return " | ".join(mean_of_steps(values, mask) for mask in masks.values())
+    """Mean NEES of each phase over all episodes, and the number of sets whose interval contains 1."""
+    parts = []
+    for mask in masks.values():
+        sets = [slice(first, first + EPISODES) for first in range(0, values.shape[1], EPISODES)]
+        intervals = [phase_mean(values[:, part], mask[:, part]) for part in sets]
+        consistent = sum(bool(low <= 1.0 <= high) for _, low, high in intervals)
+        parts.append(f"{mean_of_steps(values, mask)}, {consistent} of {len(sets)}")
+    return " | ".join(parts)
 
 
-def main(task: str, fit: Path, test: Path) -> None:
+def main(task: str, paths: Sequence[Path]) -> None:
     torch.set_num_threads(1)
-    with open_dataset(fit) as first, open_dataset(test) as second:
-        fitted, tested = list(first), list(second)
-    fit_masks, test_masks = phases(fitted), phases(tested)
-    print(f"| filter | factors | {' | '.join(test_masks)} |")
+    episodes = []
+    for path in paths:
+        with open_dataset(path) as data:
+            episodes += list(data)
+    masks = phases(episodes)
+    by_phase = masks["contact"] + 2 * masks["outage"]
+    print(f"| filter | factors | {' | '.join(masks)} |")
     for name in FILTERS:
         filter_ = load_checkpoint(shipped(task, name)).filter
-        before, values = nees_by_step(filter_, fitted), nees_by_step(filter_, tested)
-        factors = np.array([before[cells(fit_masks) == cell].mean() for cell in range(4)])
-        print(f"| {name} | none | {row(values, test_masks)} |")
-        print(f"| | one, {before.mean():.2f} | {row(values / before.mean(), test_masks)} |")
-        labels = ", ".join(f"{factor:.2f}" for factor in factors)
-        print(f"| | by phase, {labels} | {row(values / factors[cells(test_masks)], test_masks)} |", flush=True)
+        starts = range(0, len(episodes), EPISODES)
+        values = np.concatenate([nees_by_step(filter_, episodes[i : i + EPISODES]) for i in starts], 1)
+        print(f"| {name} | none | {row(values, masks)} |")
+        print(f"| | one | {row(calibrated(values, np.zeros_like(by_phase)), masks)} |")
+        print(f"| | by phase | {row(calibrated(values, by_phase), masks)} |", flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))
+    main(sys.argv[1], [Path(path) for path in sys.argv[2:]])

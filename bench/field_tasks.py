@@ -39,7 +39,7 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.information_pf import with_particles
 from beliefscope.filters.training.plan import Plan
 from beliefscope.filters.training.train import train
-from beliefscope.inspect.statistics.intervals import jackknife
+from beliefscope.inspect.statistics.intervals import jackknife, mean_interval
 
 Array = NDArray[np.float64]
 
@@ -133,9 +133,15 @@ def nees_by_step(filter_: Filter, episodes: Sequence[Episode]) -> Array:
     return values
 
 
+def phase_mean(values: Array, mask: Array) -> tuple[Array, Array, Array]:
+    """Mean NEES (T, R) of some steps, and its interval over trajectories, whose means are skewed."""
+    has = mask.any(0)
+    return mean_interval((mask * values).sum(0)[has], mask.sum(0)[has])
+
+
 def mean_of_steps(values: Array, mask: Array) -> str:
-    """Mean of the values (T, R) of some steps, with its interval over trajectories."""
-    return triple(jackknife(np.stack([mask.sum(0), (mask * values).sum(0)], 1), lambda s: s[..., 1] / s[..., 0]))
+    """The same as text."""
+    return triple(phase_mean(values, mask))
 
 
 def nees(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, str]:

@@ -34,7 +34,7 @@ def prediction(filter_: Filter, batch: Batch) -> Tensor:
 
 
 NOISE_FACTORS = tuple(10 ** (i / 10) for i in range(11))
-"""Factors on a sensor's noise of which validation takes the best, since calibration fits one afterwards.
+"""Factors on a sensor's noise. Validation takes the best one, since calibration fits one afterwards.
 
 Otherwise, of few training episodes, it would prefer the untrained sensor to an accurate one that is overconfident.
 """
