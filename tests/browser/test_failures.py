@@ -27,7 +27,6 @@ def wait_for_step(page: Any, episode: int, step: int) -> None:
     page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().step === {step}")
 
 
-@pytest.mark.long  # nineteen seconds; tests/app/api/test_failures.py has the values
 def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
     page = open_results(open_page, "&step=40", clipboard=True)
     scores = {score["name"]: score for score in page.page.request.get(page.url + API).json()["scores"]}

@@ -180,7 +180,6 @@ def test_image_blackout_is_labelled(open_page: Any) -> None:
     page.screenshot("blackout")
 
 
-@pytest.mark.long  # nineteen seconds; test_first_screen.py opens a fault by an example
 def test_fault_preset_is_applied_and_removed(open_page: Any) -> None:
     page = open_page("?step=40")
     page.settle(40)

@@ -46,7 +46,6 @@ def test_readers_of_logs_raise_only_bad_input(name: str, tmp_path: Path) -> None
         readers.attempt(name, seed=12, number=number, folder=tmp_path)
 
 
-@pytest.mark.long  # sixteen seconds
 def test_server_survives_invalid_requests_and_messages(tmp_path: Path) -> None:
     import http_fuzz  # its packages are slow to import
 

@@ -111,7 +111,6 @@ def test_the_smallest_repair_is_that_of_the_command(server: TestClient, settings
     assert result == as_json({"sentence": expected.sentence, **expected.to_json()})
 
 
-@pytest.mark.long  # thirteen seconds
 def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
     tmp_path: Path, open_client: Callable[..., TestClient]
 ) -> None:

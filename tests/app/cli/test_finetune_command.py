@@ -32,7 +32,6 @@ def test_training_episodes_of_a_field_task_are_simulated(
     assert load_checkpoint(output).healthy_profile is not None
 
 
-@pytest.mark.long  # eleven seconds
 def test_events_of_other_data_need_no_training_episodes(run: Run, tmp_path: Path) -> None:
     """Episodes with events are trained on, whatever their split; nothing is simulated for the user's own data."""
     with open_dataset(sample_path("push-field")) as sample:
