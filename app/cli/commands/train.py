@@ -18,7 +18,7 @@ def train(
     data: Path | None = None,
     skip_bad: bool = False,
     networks: str = opt.option("NAME", NETWORKS, "default"),
-    preset: str = opt.option("NAME", "cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: quick test.", "cpu"),
+    preset: str = opt.option("NAME", "cpu: about 10 minutes on one core. full: for a GPU. smoke: quick test.", "cpu"),
     blackouts: str = opt.option("P,P,...", PROBABILITIES, "0,0.4,0.8"),
     faults: str = "",
     seed: int = 0,
