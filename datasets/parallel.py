@@ -35,7 +35,7 @@ def run_in_processes(
     remaining, losses = iter(items), 0
     queue: list[Item] = []
     while True:
-        pool = ProcessPoolExecutor(workers, _context(function), _exit_with_parent)
+        pool = ProcessPoolExecutor(workers, _context(_modules(function)), _exit_with_parent)
         running: dict[Future[Result], Item] = {}
         try:
             while True:
@@ -59,18 +59,23 @@ def run_in_processes(
             pool.shutdown(cancel_futures=True)
 
 
-def _context(function: Callable[..., object]) -> BaseContext:
+def prepare_processes(module: str) -> None:
+    """Begin to import a module for the processes of the first ``run_in_processes``, while this one imports it too."""
+    _context({module})
+
+
+def _context(modules: set[str]) -> BaseContext:
     """How processes start: not as forks of this one, since locks held by its threads would stay locked.
 
-    Where possible they are forks of a process that has only imported the modules of the function, so that PyTorch is
-    imported once instead of by every process.
+    Where possible they are forks of a process that has only imported the modules, so that PyTorch is imported once
+    instead of by every process.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     from multiprocessing import forkserver, resource_tracker  # not on Windows
 
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(sorted(_modules(function)))
+    context.set_forkserver_preload(sorted(modules))
     # Ctrl-C is for this process, which stops the others: it must not interrupt their imports with a traceback.
     resource_tracker.ensure_running()  # unblocks the signal
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

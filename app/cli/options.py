@@ -15,6 +15,7 @@ from typer.models import ParameterInfo
 
 from beliefscope.app.cli import console
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.parallel import prepare_processes
 
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
@@ -43,6 +44,12 @@ def integer(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
 
 Quantity = Literal["likelihood", "posterior"]
 Engine = Literal["local", "ray"]
+
+
+def prepare_workers(engine: Engine, workers: int, module: str) -> None:
+    """Begin to import the module that the worker processes will run, if there are any on this machine."""
+    if engine == "local" and workers > 1:
+        prepare_processes(module)
 
 
 def check_output(path: Path | None, *suffixes: str) -> Path | None:

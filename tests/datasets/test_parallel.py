@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from functools import partial
@@ -55,6 +58,27 @@ def test_fails_if_no_process_survives() -> None:
     assert LOSSES > 1
     with pytest.raises(BrokenProcessPool):
         list(run_in_processes(always_killed, range(3), workers=1))
+
+
+PREPARED = """
+import sys
+from beliefscope.datasets.parallel import prepare_processes, run_in_processes
+
+def is_imported(name):
+    return name in sys.modules
+
+if __name__ == "__main__":
+    prepare_processes("colorsys")
+    print(list(run_in_processes(is_imported, ["colorsys", "this"], 1)))
+"""
+
+
+@pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="needs forks")
+def test_prepared_processes_have_imported_the_module(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(PREPARED)
+    printed = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True).stdout
+    assert printed == "[('colorsys', True), ('this', False)]\n"
 
 
 def test_processes_end_with_the_generator() -> None:

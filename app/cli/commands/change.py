@@ -38,6 +38,7 @@ def change(
       beliefscope change base.safetensors finetuned.safetensors --data door.h5 -o report
       beliefscope change crossmodal-pf finetuned.safetensors --slice blackout-in-contact:faults=blackout=1:contact=yes
     """
+    opt.prepare_workers(engine, workers, "beliefscope.inspect.compare.checkpoints")
     from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
     from beliefscope.app.runs.catalog import served_names
     from beliefscope.filters.finetuning.slices import parse_slices

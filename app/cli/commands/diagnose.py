@@ -45,6 +45,7 @@ def diagnose(
       beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from door.h5
       beliefscope diagnose door --filter new.py:build --profile-from door.h5 --profile-filter old.py:build
     """
+    opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
     from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair

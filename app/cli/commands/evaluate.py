@@ -34,6 +34,7 @@ def evaluate(
       beliefscope evaluate push-real --filter crossmodal-pf --data mit_push/val
       beliefscope evaluate door --filter crossmodal-pf --faults delay=haptics:steps=5 --only haptics
     """
+    opt.prepare_workers(engine, workers, "beliefscope.filters.evaluate")
     from beliefscope.filters.evaluate import evaluate as measure
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.start_offset import StartOffset

@@ -28,6 +28,7 @@ def failures(
       beliefscope failures door --filter mine.safetensors --data door.h5 --by angle --top 5 --json -
       beliefscope failures door --filter mine.safetensors --data door.h5 --all --workers 8
     """
+    opt.prepare_workers(engine, workers, "beliefscope.inspect.failures.survey")
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
     from beliefscope.filters.names import is_path

@@ -37,6 +37,7 @@ def sweep(
       beliefscope sweep --checkpoints 'runs/*.safetensors' --faults '' --faults blackout=0.8 --workers 8 -o sweep
       beliefscope sweep --checkpoints '/lab/**/*.safetensors' --data /lab/door.h5 --engine ray -o /lab/sweep
     """
+    opt.prepare_workers(engine, workers, "beliefscope.recordings.sweep_table")
     from beliefscope.inspect.sweep import Inputs, find_checkpoints
     from beliefscope.recordings.sweep_table import DOCUMENTS, Experiments, run_sweep
 
