@@ -36,9 +36,9 @@ def read_index(path: Path) -> tuple[tuple[EpisodeSummary, ...], str] | None:
     """The summaries and the hash of a data file; None without an index of the file as it is."""
     try:
         stored = read_json(index_path(path).read_bytes())
-        if stored["version"] != VERSION or stored["file"] != _identity(
-            path, by_content=isinstance(stored["file"][1], str)
-        ):
+        size, time_or_content = stored["file"]
+        by_content = isinstance(time_or_content, str)
+        if stored["version"] != VERSION or [size, time_or_content] != _identity(path, by_content):
             return None
         columns, digest = [stored["columns"][name] for name in COLUMNS], stored["hash"]
         rows = zip(*columns, strict=True)
@@ -68,7 +68,8 @@ def _identity(path: Path, by_content: bool) -> list[int | str]:
 @lru_cache(maxsize=16)
 def _content_hash(path: Path, size: int, time: int) -> str:
     """SHA-256 of a file with this size and time."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _summary(index: int, values: dict[str, Any]) -> EpisodeSummary:

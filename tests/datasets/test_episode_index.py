@@ -86,6 +86,8 @@ def test_included_files_have_an_index(task: str, tmp_path: Path) -> None:
         lambda d: d["columns"]["contact_fraction"].__setitem__(0, 2.0),
         lambda d: d["columns"].update({name: [] for name in episode_index.COLUMNS}),
         lambda d: d.__setitem__("hash", None),
+        lambda d: d.__setitem__("file", [3]),
+        lambda d: d.__setitem__("file", [*d["file"][:1], "0" * 64]),
         lambda d: d.__setitem__("columns", 3),
     ],
 )
