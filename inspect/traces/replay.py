@@ -18,6 +18,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import one_thread
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import WEIGHTED
 from beliefscope.filters.rollout import first_belief
@@ -165,6 +166,7 @@ class Replay:
         generator_states: T generator states, one before each step.
     """
 
+    @one_thread()  # as the traced run
     @torch.no_grad()
     def __init__(self, checkpoint: Checkpoint, trace: Trace, progress: Callable[[float], None] | None = None) -> None:
         """Raises BadInput if the trace is from another checkpoint. progress: called with the completed fraction."""
@@ -211,6 +213,7 @@ class Replay:
         generator.set_state(self.generator_states[step])
         return generator
 
+    @one_thread()
     @torch.no_grad()
     def edited(self, edit: Edit) -> Trace:
         """Trace of the edited run, from the belief before step ``edit.first`` with the original's random numbers.

@@ -64,18 +64,17 @@ def trace(
     faults.check(checkpoint.task, len(episode))
     if isinstance(checkpoint, ExternalFilter):
         return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
-    with one_thread():  # the tensors of a trajectory are too small for several
-        run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
-        arrays = run_arrays(
-            checkpoint,
-            encoded(run.filter, run.episode),
-            len(episode),
-            run.start,
-            run.generator(),
-            particles,
-            particles_kept,
-            progress,
-        )
+    run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
+    arrays = run_arrays(
+        checkpoint,
+        encoded(run.filter, run.episode),
+        len(episode),
+        run.start,
+        run.generator(),
+        particles,
+        particles_kept,
+        progress,
+    )
     return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
 
 
@@ -96,11 +95,12 @@ def trace_parts(
     run = start_run(checkpoint, episode.part(0, 1), episode_index, seed, particles, NO_FAULTS)
     provenance, done = {**run.provenance, "data_hash": episode.digest()}, 0
     blocks = encoded(checkpoint.filter, episode)
-    for arrays in run_parts(
-        checkpoint, blocks, len(episode), run.start, run.generator(), particles, particles_kept, progress
-    ):
-        first, done = done, done + len(arrays["estimate_mean"])
-        yield assemble_trace(checkpoint, episode.part(first, done), run.start, arrays, **provenance)
+    with one_thread():
+        for arrays in run_parts(
+            checkpoint, blocks, len(episode), run.start, run.generator(), particles, particles_kept, progress
+        ):
+            first, done = done, done + len(arrays["estimate_mean"])
+            yield assemble_trace(checkpoint, episode.part(first, done), run.start, arrays, **provenance)
 
 
 @dataclass(frozen=True)
@@ -160,6 +160,7 @@ def _batch(filter_: Filter, episode: Episode) -> Batch:
     return Steps.from_episodes(filter_.task, [episode]).episode(0)
 
 
+@one_thread()  # the tensors of one trajectory are too small for several
 def run_arrays(
     checkpoint: Checkpoint,
     blocks: Iterable[Evidence],

@@ -14,7 +14,9 @@ import torch
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.evaluate import run
 from beliefscope.inspect.trace import save_trace, trace
 
 pytestmark = pytest.mark.slow
@@ -49,13 +51,14 @@ def test_repeated_runs_are_identical_and_threads_only_change_rounding(
     name: str, tmp_path: Path, short_episodes: Callable[..., list[Episode]]
 ) -> None:
     assert write_trace(name, tmp_path / "one") == write_trace(name, tmp_path / "again")
-    checkpoint, (episode,) = load_checkpoint(shipped("door", name)), short_episodes("door", [9], 25)
-    means = []
-    for threads in (1, 2):  # two wait for each other while other programs run: few steps
+    filter_, episodes = load_checkpoint(shipped("door", name)).filter, short_episodes("door", [9], 25)
+    batch, errors = Steps.from_episodes(filter_.task, episodes).episode(0), []
+    for threads in (1, 2):  # two wait for each other while other programs run: few steps. A trace always uses one.
         torch.set_num_threads(threads)
-        means.append(trace(checkpoint, episode, seed=5, particles=100).estimate_mean)
+        errors.append(run(filter_, batch, None, particles=100, seed=5)[0].numpy())
+        assert torch.get_num_threads() == threads
     # A sum in two parts rounds differently: float32 has 7 digits, some of which are lost over the steps.
-    np.testing.assert_allclose(means[1], means[0], atol=2e-3)
+    np.testing.assert_allclose(errors[1], errors[0], atol=2e-3)
 
 
 @pytest.mark.long  # two processes

@@ -54,12 +54,19 @@ def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(shipped("door", request.param))
 
 
-def test_a_trace_uses_one_thread(checkpoint: Checkpoint, episode: Episode) -> None:
-    before, threads = torch.get_num_threads(), set()
+def test_runs_over_one_episode_use_one_thread(checkpoint: Checkpoint, traced: Trace, episode: Episode) -> None:
+    before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        trace(checkpoint, episode, particles=10, progress=lambda _: threads.add(torch.get_num_threads()))
-        assert (threads, torch.get_num_threads()) == ({1}, 2)
+        for run in (
+            lambda progress: trace(checkpoint, episode, particles=10, progress=progress),
+            lambda progress: Replay(checkpoint, traced, progress),
+            lambda progress: standalone(checkpoint, traced, "image", progress),
+            lambda progress: list(trace_parts(checkpoint, episode, particles=10, progress=progress)),
+        ):
+            threads: set[int] = set()
+            run(lambda _, threads=threads: threads.add(torch.get_num_threads()))
+            assert (threads, torch.get_num_threads()) == ({1}, 2)
     finally:
         torch.set_num_threads(before)
 
