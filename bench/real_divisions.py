@@ -42,7 +42,8 @@ def divide(source: Path, folder: Path, division: int) -> None:
     tested = files[division::DIVISIONS]
     rest = [file for file in files if file not in tested]
     calibration = rest[::CALIBRATION]
-    for name, splits in {"train": {"train": rest, "val": calibration}, "outages": {"test": tested}}.items():
+    training = [file for file in rest if file not in calibration]
+    for name, splits in {"train": {"train": training, "val": calibration}, "outages": {"test": tested}}.items():
         path = folder / f"{name}.h5"
         if path.exists():
             continue
@@ -50,8 +51,7 @@ def divide(source: Path, folder: Path, division: int) -> None:
             target = folder / "pushes" / name / split
             target.mkdir(parents=True, exist_ok=True)
             for file in members:
-                if split != "train" or file not in calibration:
-                    copy(file, target)
+                copy(file, target)
         with open_dataset(folder / "pushes" / name, TASK) as data:
             write_dataset(path, TASK, data)
 

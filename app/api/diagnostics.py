@@ -119,7 +119,7 @@ def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: 
     """Everything the result depends on, including the indices of the episodes."""
     traces = [(selection.episode, store.key(selection)) for selection in selections]
     version = store.record_version(selections[0].task, selections[0].filter)
-    return entry.name, traces, sorted(options.items()), *filter(None, [version])
+    return entry.name, traces, sorted(options.items()), *((version,) if version else ())
 
 
 def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:
