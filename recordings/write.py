@@ -10,7 +10,6 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
-from errno import ENOSPC
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.any_batch_value import AnyBatchValue
 from rerun.chunk import RrdReader
@@ -40,7 +38,8 @@ from beliefscope.recordings.rerun_log.blueprint import blueprint
 from beliefscope.recordings.rerun_log.bodies import Bodies
 from beliefscope.recordings.rerun_log.diagnostics import log_diagnostic
 from beliefscope.recordings.rerun_log.maps import map_columns, map_style
-from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
+from beliefscope.recordings.rerun_log.stream import FileStream, send_layout
+from beliefscope.recordings.schema import FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
 STEPS_PER_CHUNK, CHUNKS = 1000, 100
 """Minimum number of steps per chunk, and maximum number of chunks: Rerun keeps an index of about 0.4 MB per chunk in
@@ -117,34 +116,15 @@ def new_recording(path: Path, sample: Trace, bodies: Bodies, steps: int) -> Iter
     rr.set_strict_mode(True)  # otherwise Rerun turns errors into warnings and writes incomplete data
     flush_and_cleanup_orphaned_recordings()  # Rerun keeps every stream and its two threads until this call
     with _complete_or_absent(path) as unfinished:
-        stream = rr.RecordingStream(APPLICATION)
-        stream.save(unfinished)
-        send_header(stream, sample, bodies, steps)
-        stream.flush()  # so that a truncated file has a header
-        yield stream
-        _finish(stream, unfinished)
-
-
-def send_layout(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
-    """Send a layout, which is active at once, also in a viewer that shows another recording.
-
-    Send steps before: the viewer warns of a layout with a timeline that it does not know yet. Closes the stream that
-    Rerun creates for a layout; otherwise its memory and two threads are never released.
-    """
-    opened, log = [], layout._log_to_stream
-
-    def capture(own: rr.RecordingStream) -> None:
-        opened.append(own)
-        log(own)
-
-    layout._log_to_stream = capture  # type: ignore[method-assign, assignment]
-    try:
-        stream.flush()  # the steps
-        stream.send_blueprint(layout)
-    finally:
-        layout._log_to_stream = log  # type: ignore[method-assign]
-        for own in opened:
-            own.disconnect()
+        stream = FileStream()
+        try:
+            stream.save(unfinished)
+            send_header(stream, sample, bodies, steps)
+            stream.flush()  # so that a truncated file has a header
+            yield stream
+        finally:
+            stream.disconnect()
+        RrdReader(unfinished).store()  # checks the footer
 
 
 def steps_per_chunk(like: Trace) -> int:
@@ -315,19 +295,6 @@ def _blocks(maps: Iterable[LikelihoodMap], size: int) -> Iterator[list[Likelihoo
         yield block
 
 
-_TRUNCATED = ENOSPC, "Rerun could not write the complete file"  # Rerun gives no reason; a full disk is the usual one
-
-
-def _finish(stream: rr.RecordingStream, path: Path) -> None:
-    """Flush the stream and check the footer of the file, because Rerun only logs write errors."""
-    try:
-        stream.flush()
-        stream.disconnect()
-        RrdReader(path).store()
-    except (RuntimeError, ValueError):
-        raise OSError(*_TRUNCATED) from None
-
-
 @contextmanager
 def _complete_or_absent(path: Path) -> Iterator[Path]:
     """Yields a temporary path in the same folder; renamed to ``path`` at the end, removed on errors."""
@@ -344,7 +311,3 @@ def _complete_or_absent(path: Path) -> Iterator[Path]:
         raise write_error(path, error) from None
     except UnicodeEncodeError:
         raise BadInput(f"cannot write {str(path)!r}: Rerun requires file names that are valid text") from None
-    except RuntimeError as error:
-        if "File-writer" not in str(error):  # from Rerun's writer thread
-            raise
-        raise write_error(path, OSError(*_TRUNCATED)) from None

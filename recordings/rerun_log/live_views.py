@@ -13,12 +13,11 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.traces.live_file import LiveFileReader
 from beliefscope.recordings.rerun_log.blueprint import blueprint
 from beliefscope.recordings.rerun_log.bodies import Bodies
-from beliefscope.recordings.schema import APPLICATION
+from beliefscope.recordings.rerun_log.stream import FileStream, send_layout
 from beliefscope.recordings.write import (
     chunks,
     new_recording,
     send_header,
-    send_layout,
     send_steps,
     steps_per_chunk,
     thinning,
@@ -54,37 +53,40 @@ class LiveViews:
         self._thread.join()
 
     def _follow(self) -> None:
-        """Follow the file, in larger blocks the further behind."""
         rr.set_strict_mode(True)
-        stream = rr.RecordingStream(APPLICATION)
-        reader = LiveFileReader(self._live)
+        stream, reader = FileStream(), LiveFileReader(self._live)
         try:
-            written, ended, written_at, at_once = 0, False, 0.0, 1
-            while not (ended and written == reader.steps):
-                ended = self._ended.wait(0.0 if reader.steps > written + MIN_STEPS else POLL_INTERVAL)
-                waiting = reader.poll() - written
-                self.behind = max(self.behind, waiting)
-                if written == 0 and waiting:
-                    first = reader.part(0, 1)
-                    task, at_once = first.task, steps_per_chunk(first)
-                    layout, bodies = blueprint(first, task, growing=True), Bodies(first, task)
-                    # Without footer: the index of all chunks would fill the memory of a long run.
-                    stream.save(self._live.with_suffix(".rrd"), write_footer=False)
-                    send_header(stream, first, bodies)
-                if ended and not self._write_rest:
-                    return
-                if waiting >= MIN_STEPS or (waiting and (ended or time.monotonic() > written_at + MAX_DELAY)):
-                    last = min(reader.steps, written + at_once)
-                    send_part(stream, reader, bodies, written, last)
-                    if written == 0:
-                        send_layout(stream, layout)
-                    stream.flush()
-                    written, written_at = last, time.monotonic()
-        except (BadInput, RuntimeError, ValueError) as error:
+            try:
+                self._write(stream, reader)
+            finally:
+                reader.close()
+                stream.disconnect()
+        except (BadInput, OSError, RuntimeError, ValueError) as error:
             warnings.warn(f"the recording of live run {str(self._live)!r} ends: {error}", stacklevel=2)
-        finally:
-            stream.disconnect()
-            reader.close()
+
+    def _write(self, stream: FileStream, reader: LiveFileReader) -> None:
+        """Follow the file, in larger blocks the further behind."""
+        written, ended, written_at, at_once = 0, False, 0.0, 1
+        while not (ended and written == reader.steps):
+            ended = self._ended.wait(0.0 if reader.steps > written + MIN_STEPS else POLL_INTERVAL)
+            waiting = reader.poll() - written
+            self.behind = max(self.behind, waiting)
+            if written == 0 and waiting:
+                first = reader.part(0, 1)
+                task, at_once = first.task, steps_per_chunk(first)
+                layout, bodies = blueprint(first, task, growing=True), Bodies(first, task)
+                # Without footer: the index of all chunks would fill the memory of a long run.
+                stream.save(self._live.with_suffix(".rrd"), write_footer=False)
+                send_header(stream, first, bodies)
+            if ended and not self._write_rest:
+                return
+            if waiting >= MIN_STEPS or (waiting and (ended or time.monotonic() > written_at + MAX_DELAY)):
+                last = min(reader.steps, written + at_once)
+                send_part(stream, reader, bodies, written, last)
+                if written == 0:
+                    send_layout(stream, layout)
+                stream.flush()
+                written, written_at = last, time.monotonic()
 
 
 def write_live_recording(live: Path, path: Path) -> Path:

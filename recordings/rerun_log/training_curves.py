@@ -13,7 +13,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.recordings.rerun_log.diagnostics import slug
+from beliefscope.recordings.rerun_log.stream import FileStream, send_layout
 from beliefscope.recordings.schema import APPLICATION, STEP
 
 ROOT = "tuning"
@@ -75,40 +77,55 @@ def tuning_curves(folder: Path, viewer: str = "") -> Iterator[Write]:
         viewer: address of a Rerun viewer; empty for none. Rerun warns if the viewer is unreachable, and the run
             continues.
 
-    Raises BadInput for an invalid address.
+    Raises BadInput for an invalid address and a file that cannot be written.
     """
     number = 1 + sum(1 for _ in folder.glob("run-*.rrd"))
     recording = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
-    streams = [rr.RecordingStream(APPLICATION, recording_id=recording) for _ in range(2 if viewer else 1)]
+    path = folder / f"run-{number}.rrd"
+    file = FileStream(recording)
+    streams: list[rr.RecordingStream] = [file]
     if viewer:
+        streams.append(rr.RecordingStream(APPLICATION, recording_id=recording))
         try:
             streams[1].connect_grpc(viewer)
         except (RuntimeError, ValueError):
             example = "rerun+http://127.0.0.1:9876/proxy"
             raise BadInput(f"{viewer!r} is not the address of a Rerun viewer, such as {example}") from None
     folder.mkdir(parents=True, exist_ok=True)
-    streams[0].save(folder / f"run-{number}.rrd")
     names: list[str] = []
 
     def write(step: int, numbers: Mapping[str, float]) -> None:
         new = [name for name in numbers if name not in names]
         names.extend(new)
-        for stream in streams:
-            for name in new:
-                slice_, _, measure = name.rpartition("/")
-                stream.log(_path(name), rr.SeriesLines(names=slice_ or measure), static=True)
-            if new:
-                stream.send_blueprint(_layout([name.rpartition("/")[2] for name in names]))
-            stream.set_time(STEP, sequence=step)
-            for name, value in numbers.items():
-                stream.log(_path(name), rr.Scalars(value))
-        streams[0].flush()  # the file only: do not wait for the viewer
+        with _bad_input(path):
+            for stream in streams:
+                for name in new:
+                    slice_, _, measure = name.rpartition("/")
+                    stream.log(_path(name), rr.SeriesLines(names=slice_ or measure), static=True)
+                stream.set_time(STEP, sequence=step)
+                for name, value in numbers.items():
+                    stream.log(_path(name), rr.Scalars(value))
+                if new:
+                    send_layout(stream, _layout([name.rpartition("/")[2] for name in names]))
+            file.flush()  # the file only: do not wait for the viewer
 
+    with _bad_input(path):
+        file.save(path)
     try:
         yield write
     finally:
-        for stream in streams:
-            stream.disconnect()
+        with _bad_input(path):
+            for stream in reversed(streams):
+                stream.disconnect()
+
+
+@contextmanager
+def _bad_input(path: Path) -> Iterator[None]:
+    """Write errors as BadInput."""
+    try:
+        yield
+    except OSError as error:
+        raise write_error(path, error) from None
 
 
 @contextmanager

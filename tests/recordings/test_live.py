@@ -267,6 +267,14 @@ def test_later_errors_do_not_stop_the_filter(tmp_path: Path) -> None:
     assert (recorder.steps, recorder.lost) == (200, 160)
 
 
+def test_full_disk_ends_the_views_not_the_run(tmp_path: Path) -> None:
+    (tmp_path / "run.rrd").symlink_to("/dev/full")
+    with pytest.warns(UserWarning, match="recording of live run .*No space left"):
+        recorder = record_external(tmp_path, 30)
+    reader = LiveFileReader(recorder.path)
+    assert (reader.poll(), reader.finished) == (30, True)
+
+
 def test_exception_of_the_filter_leaves_complete_files(tmp_path: Path) -> None:
     recorder = LiveRecorder("run", task="door", folder=tmp_path)
 

@@ -36,6 +36,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.trace import Trace, save_trace, trace
+from beliefscope.recordings.rerun_log.training_curves import tuning_curves
 from beliefscope.recordings.write import write_recording
 
 pytestmark = pytest.mark.slow
@@ -116,13 +117,22 @@ def test_full_disk_is_reported_with_free_space(name: str, run: Trace, tmp_path: 
         subprocess.run(["umount", str(place)], check=True)
 
 
-@pytest.mark.long  # Rerun may block in a process that wrote other recordings
-def test_recording_on_a_full_disk(run: Trace, tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [1000, 10_000, 200_000])
+def test_recording_on_a_full_disk(size: int, run: Trace, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"  # Rerun does not support forks
-    with file_size_limit(10_000), pytest.raises(BadInput, match=r"cannot write .*run\.rrd': .* MB are free there"):
+    with file_size_limit(size), pytest.raises(BadInput, match=r"cannot write .*run\.rrd': File too large"):
         write_recording(run, path)
     assert not list(tmp_path.iterdir())
     assert write_recording(run, path).is_file()
+
+
+def test_training_curves_on_a_full_disk(tmp_path: Path) -> None:
+    with (
+        file_size_limit(1000),
+        pytest.raises(BadInput, match=r"cannot write .*run-1\.rrd': File too large"),
+        tuning_curves(tmp_path) as write,
+    ):
+        write(0, {"loss": 0.5})
 
 
 def errors_in_fork(*functions: Callable[[], object], user: int | None = None) -> list[str]:
