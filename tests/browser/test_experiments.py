@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,16 +18,22 @@ READY = "() => document.querySelector('#experiments').dataset.state === 'ready'"
 
 
 @pytest.mark.long
-def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any) -> None:
+def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path: Path) -> None:
     page = open_page("?tab=experiments&sweep=none", size=(1440, 900))
     page.until("() => document.querySelector('#experiments').dataset.state === 'empty'")
     assert "beliefscope serve --sweep" in page.page.locator("#experiments .note").text_content()
 
-    paths = tuple(shipped("door", name) for name in ("image-ekf", "haptics-ekf"))
+    paths = []
+    for width, name in enumerate(("image-ekf", "haptics-ekf")):
+        paths.append(Path(shutil.copy(shipped("door", name), tmp_path / f"{name}.safetensors")))
+        paths[-1].with_suffix(".json").write_text(
+            json.dumps({"width": width, "run": f"https://tracker.example/{name}"})
+        )
     with open_dataset(sample_path("door")) as sample:
         episodes = tuple(sample.held_out()[:3])
     cells = [
-        Cell(**{**vars(cell), "episodes": episodes}) for cell in Inputs(paths, faults=("", "blackout=0.8")).cells()
+        Cell(**{**vars(cell), "episodes": episodes})
+        for cell in Inputs(tuple(paths), faults=("", "blackout=0.8")).cells()
     ]
     folder = server.workspace / "sweep"
     run_sweep(cells, folder)
@@ -43,6 +51,11 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any) -> None:
         order = ",".join(row["name"] for row in sorted(worst, key=lambda row: -row["nees"]))
         page.until(f"() => ({names})().join() === '{order}'")
         assert page.state["sort"] == "-nees"
+        panel.locator("thead th", has_text="width").hover()
+        panel.get_by_label("Pin width").click()
+        page.until("() => document.querySelectorAll('#experiments thead th')[1].innerText.includes('width')")
+        assert page.state["pinned"] == "width"
+        assert panel.locator("tbody td a").first.get_attribute("href").startswith("https://tracker.example/")
         panel.locator("select.rows").select_option("seeds")
         panel.locator("select.x").select_option("level:blackout")
         page.until("() => document.querySelectorAll('#experiments .curve').length === 2")  # one for each filter

@@ -7,6 +7,8 @@ import {
   faultLevel,
   seedGroups,
 } from '../../app/page/tabs/experiment_groups.js';
+import { columnsOf } from '../../app/page/tabs/experiment_columns.js';
+import { differingEntries } from '../../app/page/tabs/experiment_provenance.js';
 import {
   comparedWith,
   matching,
@@ -57,10 +59,42 @@ test('words match in any text, conditions match numbers, and more of them never 
 
 test('conditions on columns that do not exist are reported', () => {
   assert.match(
-    unknownConditions('ekf neez>2 nees>2 (  lr<=1'),
-    /^No column of neez>2, lr<=1\. .*nees/,
+    unknownConditions('ekf neez>2 nees>2 (  momentum<=1', [...NUMBER_KEYS, 'lr']),
+    /^No column with numbers for neez>2, momentum<=1\. .*nees.* lr\.$/,
   );
-  assert.equal(unknownConditions('ekf nees>2 nees> ('), '');
+  assert.equal(unknownConditions('ekf nees>2 lr<1e-3 nees> (', [...NUMBER_KEYS, 'lr']), '');
+});
+
+const TRAINED = [
+  { lr: 0.001, model: { width: 32 }, run: 'https://tracker/1', same: [1], debug: true },
+  { lr: 0.01, model: { width: 64 }, run: 'https://tracker/2', same: [1] },
+].map((provenance, i) => ({
+  ...ROW,
+  name: `run-${i}`,
+  checkpoint: String(i).repeat(64),
+  provenance: JSON.stringify(provenance),
+}));
+
+test('entries of the provenance that differ are columns, which conditions compare', () => {
+  assert.deepEqual(differingEntries(TRAINED), ['lr', 'model.width', 'run', 'debug']);
+  const columns = columnsOf(TRAINED, false, []);
+  const texts = (/** @type {string} */ key) =>
+    TRAINED.map((row) => columns.find((column) => column.key === key)?.content(row));
+  assert.deepEqual(texts('model.width'), ['32', '64']);
+  assert.deepEqual(texts('debug'), ['true', '–']);
+  const number = (/** @type {string} */ key) => columns.find((c) => c.key === key)?.number;
+  assert.deepEqual(['lr', 'run', 'debug'].map(number), [true, false, false]);
+  const matched = (/** @type {string} */ text) => matching(TRAINED, text).map(({ name }) => name);
+  assert.deepEqual(matched('lr<5e-3'), ['run-0']);
+  assert.deepEqual(matched('model.width>=32 tracker/2'), ['run-1']);
+});
+
+test('pinned columns are the first, in the order of pinning, and no column is lost', () => {
+  const keys = (/** @type {string[]} */ ...pinned) =>
+    columnsOf(TRAINED, false, pinned).map(({ key }) => key);
+  assert.deepEqual(keys('lr', 'nees').slice(0, 4), ['name', 'lr', 'nees', 'error']);
+  assert.deepEqual(keys('missing'), keys());
+  assert.deepEqual(keys('lr', 'nees').sort(), keys().sort());
 });
 
 test('a row of the displayed filter is compared by its sensor faults', () => {
@@ -95,8 +129,8 @@ const rowsOf = (...changes) =>
 
 test('checkpoints that differ by their seed are one group with mean and standard deviation', () => {
   const rows = rowsOf(
-    { error: 1, nees: null, provenance: '{"lr": 1, "seed": 0}' },
-    { error: 3, nees: null, provenance: '{"seed": 1, "lr": 1}' },
+    { error: 1, nees: null, provenance: '{"lr": 1, "seed": 0, "run": "https://tracker/1"}' },
+    { error: 3, nees: null, provenance: '{"data": {"seed": 1}, "lr": 1}' },
     { error: 9, provenance: '{"lr": 2}' },
     { error: 5, provenance: '{"lr": 1}', faults: '' },
   );

@@ -57,6 +57,7 @@ import { displayName } from './units.js';
  * @property {string} steps phase of the sweep's results
  * @property {string} match words and conditions that the results must match
  * @property {string} sort column of the results, with a minus for descending
+ * @property {string} pinned columns kept at the left of the results, comma-separated
  * @property {string} x quantity of the x axis of the results. @property {string} y of the y axis
  * @property {string} cell selected result
  * @property {string} rows of the results: each of the `checkpoints`, or their mean over `seeds`
@@ -117,6 +118,7 @@ const TEXTS = {
   steps: 'all',
   match: '',
   sort: '-error',
+  pinned: '',
   x: 'error',
   y: 'nees',
   cell: '',

@@ -3,6 +3,7 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { NumberKey } from './experiment_rows.js' */
 
+import { isAddress, isSeed, provenanceOf } from './experiment_provenance.js';
 import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
 
 /**
@@ -14,7 +15,8 @@ import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
 const SPREAD_KEYS = ['error', 'nees', 'coverage95', 'worst'];
 
 /**
- * Joins the checkpoints that differ by their seed only: same filter, training and provenance apart from their keys `seed`.
+ * Joins the checkpoints that differ by their seed only: same filter, training and provenance apart from
+ * seeds and addresses of runs.
  * Numbers are means over the checkpoints, and `spread` their sample standard deviations.
  * @param {ExperimentRow[]} rows
  * @returns {SeedGroup[]}
@@ -79,22 +81,25 @@ function levelOf(faults) {
  * Filter, and the settings of its training without the seed, as text.
  * @param {ExperimentRow} row
  */
-function settingsOf({ filter, training, provenance }) {
-  const { finetuned, plan, ...trained } = entriesOf(training);
+function settingsOf(row) {
+  const { finetuned, plan, ...trained } = entriesOf(row.training);
   const { seed: _, ...tuning } = finetuned ?? {};
   // In the order of the names of groups, which mention the first differences.
   const settings = [
-    ...Object.entries(entriesOf(provenance)).sort(),
+    ...Object.entries(provenanceOf(row)).filter(isSetting).sort(),
     ...(finetuned ? [['fine-tuning', tuning]] : []),
     ...Object.entries(trained).sort(),
     ...Object.entries(plan ?? {}).sort(),
   ];
   const isSet = (/** @type {any} */ value) => value !== null && value?.length !== 0;
   return JSON.stringify([
-    filter,
+    row.filter,
     settings.filter(([key, value]) => key !== 'seed' && isSet(value)),
   ]);
 }
+
+/** Whether an entry of the provenance is neither a seed nor the address of a run. @param {[string, unknown]} entry */
+const isSetting = ([name, value]) => !isSeed(name) && !isAddress(value);
 
 /** @param {string} text JSON of an object @returns {Record<string, any>} */
 const entriesOf = (text) => JSON.parse(text || '{}');

@@ -4,6 +4,7 @@
 /** @import { Sort } from '../widgets/sorting.js' */
 
 import { fixed, percent } from '../core/units.js';
+import { provenanceOf } from './experiment_provenance.js';
 
 /** @typedef {'error' | 'nees' | 'coverage95' | 'worst' | 'episodes' | 'steps'} NumberKey */
 /** @typedef {{title: string, help: string, hasUnit: boolean, format: (value: number | null) => string}} NumberColumn */
@@ -41,13 +42,24 @@ export const NUMBERS = {
 export const NUMBER_KEYS = /** @type {NumberKey[]} */ (Object.keys(NUMBERS));
 
 /**
- * Value of a column, by which rows are sorted.
+ * Value of a column, by which rows are sorted: of the row itself or of its provenance.
  * @param {ExperimentRow} row
  * @param {string} column
  */
 export function valueOf(row, column) {
   const values = /** @type {Record<string, string | number | null>} */ ({ ...row });
-  return values[column] ?? null;
+  const value = column in values ? values[column] : provenanceOf(row)[column];
+  return typeof value === 'boolean' ? String(value) : (value ?? null);
+}
+
+/**
+ * Value of a column with numbers; null for other values.
+ * @param {ExperimentRow} row
+ * @param {string} column
+ */
+export function numberOf(row, column) {
+  const value = valueOf(row, column);
+  return typeof value === 'number' ? value : null;
 }
 
 /**
@@ -65,19 +77,20 @@ const COMPARISONS = {
   '<=': (value, limit) => value <= limit,
 };
 
-const CONDITION = /^(\w+)(>=|<=|>|<)(-?[\d.]+)$/;
+const CONDITION = /^([^<>=]+)(>=|<=|>|<)(-?[\d.]+(?:e-?\d+)?)$/i;
 
 /**
  * Reports the conditions, such as `neez>2`, whose column does not exist; empty without any.
  * @param {string} text
+ * @param {string[]} columns names of the columns with numbers
  */
-export function unknownConditions(text) {
+export function unknownConditions(text, columns) {
   const unknown = text.split(/\s+/).filter((word) => {
-    const [, key] = word.toLowerCase().match(CONDITION) ?? [];
-    return key !== undefined && !(key in NUMBERS);
+    const [, key] = word.match(CONDITION) ?? [];
+    return key !== undefined && !columns.includes(key);
   });
   return unknown.length
-    ? `No column of ${unknown.join(', ')}. Columns: ${NUMBER_KEYS.join(', ')}.`
+    ? `No column with numbers for ${unknown.join(', ')}. Columns: ${columns.join(', ')}.`
     : '';
 }
 
@@ -99,20 +112,18 @@ export const comparedWith = ({ faults }, filter, displayed) =>
  */
 export function matching(rows, text) {
   const tests = text
-    .toLowerCase()
     .split(/\s+/)
     .filter(Boolean)
     .map((word) => {
       const [, key, sign, limit] = word.match(CONDITION) ?? [];
-      if (key in NUMBERS) {
-        const column = /** @type {NumberKey} */ (key);
+      if (rows.some((row) => numberOf(row, key) !== null))
         return (/** @type {ExperimentRow} */ row) => {
-          const value = row[column];
+          const value = numberOf(row, key);
           return value !== null && COMPARISONS[sign](value, Number(limit));
         };
-      }
+      const part = word.toLowerCase();
       return (/** @type {ExperimentRow} */ { name, filter, task, faults, provenance }) =>
-        [name, filter, task, faults, provenance].some((part) => part.toLowerCase().includes(word));
+        [name, filter, task, faults, provenance].some((t) => t.toLowerCase().includes(part));
     });
   return rows.filter((row) => tests.every((test) => test(row)));
 }

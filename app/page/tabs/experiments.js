@@ -2,11 +2,12 @@
 
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Catalog, EpisodeResult, ExperimentRow, SweepInfo } from '../types/server.js' */
+/** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { create, element, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
-import { displayName, fixed, sentence, significant, stepLabel } from '../core/units.js';
+import { fixed, sentence, significant, stepLabel } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelState } from '../widgets/panel_state.js';
@@ -23,7 +24,9 @@ import {
   unknownConditions,
   comparedWith,
 } from './experiment_rows.js';
+import { columnsOf } from './experiment_columns.js';
 import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
+import { differingEntries, isAddress, isNumeric } from './experiment_provenance.js';
 import { coloured, drawScatter, levelName } from './scatter.js';
 
 const EMPTY = {
@@ -39,20 +42,12 @@ const EMPTY = {
     'beliefscope serve --sweep sweep',
   ],
 };
-/** @type {Column} */
-const SEEDS = {
-  key: 'seeds',
-  title: 'seeds',
-  help: 'Number of checkpoints; their standard deviation is behind ±',
-  number: true,
-  content: (row) => String('members' in row ? row.members.length : 1),
-};
 const EPISODES = 50; // listed for a checkpoint, the worst first
 
 const BODY = `
   <div class="top">
     <label class="picker">Sweep <select class="sweep" aria-label="Sweep"></select></label>
-    <label class="picker" title="Mean over seeds: of the checkpoints whose training and provenance differ by the seed only, with their standard deviation">Rows <select class="rows" aria-label="Rows"><option value="checkpoints">each checkpoint</option><option value="seeds">mean over seeds</option></select></label>
+    <label class="picker" title="Mean over seeds: of the checkpoints whose training and provenance differ by seeds and addresses of runs only, with their standard deviation">Rows <select class="rows" aria-label="Rows"><option value="checkpoints">each checkpoint</option><option value="seeds">mean over seeds</option></select></label>
     <label class="picker">Steps <select class="steps" aria-label="Steps"></select></label>
     <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees>2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions such as nees&gt;2"></label>
     <a class="csv" download>CSV</a>
@@ -122,7 +117,8 @@ export class Experiments {
         this.#load();
         return;
       }
-      if (['match', 'sort', 'x', 'y', 'rows'].some((key) => changed.has(key))) this.#draw();
+      if (['match', 'sort', 'x', 'y', 'rows', 'pinned'].some((key) => changed.has(key)))
+        this.#draw();
       if (changed.has('cell') || changed.has('rows')) this.#showSelected();
     });
   }
@@ -210,8 +206,8 @@ export class Experiments {
     const picker = fill('.sweep', names, sweep.name);
     if (picker.parentElement) picker.parentElement.hidden = names.length < 2;
     fill('.steps', ['all', ...sweep.phases.filter((name) => name !== 'all')], this.#steps);
-    fill('.x', [...NUMBER_KEYS, ...kinds.map(levelName)], state.x);
-    fill('.y', NUMBER_KEYS, state.y);
+    fill('.x', [...this.#numbers, ...kinds.map(levelName)], state.x);
+    fill('.y', this.#numbers, state.y);
     element('.rows', HTMLSelectElement, this.#host).value = state.rows;
     element('.match', HTMLInputElement, this.#host).value = state.match;
     element('.csv', HTMLAnchorElement, this.#host).href = api.experimentsCsv(
@@ -228,23 +224,33 @@ export class Experiments {
     const rows = sortRows(groups, (row) => valueOf(row, sort.name), sort.down);
     const more = this.#count > this.#rows.length ? `, ${this.#rows.length} are listed` : '';
     html('.about', this.#host).textContent =
-      unknownConditions(state.match) ||
+      unknownConditions(state.match, this.#numbers) ||
       `${matched.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
-    const columns = columnsOf(this.#rows, state.rows === 'seeds');
-    const heads = columns.map(({ key, title, help, number }) =>
-      sortHeading(
+    const pinned = state.pinned.split(',').filter(Boolean);
+    const columns = columnsOf(this.#rows, state.rows === 'seeds', pinned);
+    const heads = columns.map(({ key, title, help, number }, i) => {
+      const head = sortHeading(
         { name: key, title, help, number },
         sort,
         (next) => this.#store.set({ sort: sortText(next) }),
         number,
-      ),
-    );
+      );
+      if (i > 0) head.append(this.#pinButton(key, title, pinned));
+      return head;
+    });
     element('.checkpoints thead', HTMLTableSectionElement, this.#host).replaceChildren(
       create('tr', {}, ...heads),
     );
     this.#body.replaceChildren(...rows.map((row) => this.#tableRow(row, columns)));
+    this.#stick(heads, columns.filter(({ key }) => pinned.includes(key)).length);
     this.#matching = rows;
     this.#mark();
+  }
+
+  /** Names of the columns with numbers. @returns {string[]} */
+  get #numbers() {
+    const entries = differingEntries(this.#rows).filter((name) => isNumeric(this.#rows, name));
+    return [...NUMBER_KEYS, ...entries];
   }
 
   #drawChart() {
@@ -257,6 +263,42 @@ export class Experiments {
       selected: cell,
       select: (row) => this.#select(row),
     });
+  }
+
+  /**
+   * @param {string} key
+   * @param {string} title
+   * @param {string[]} pinned
+   */
+  #pinButton(key, title, pinned) {
+    const isPinned = pinned.includes(key);
+    const button = create('button', { type: 'button', className: 'quiet pin', textContent: '⇤' });
+    button.title = isPinned ? 'Release this column' : 'Keep this column at the left';
+    button.ariaLabel = `Pin ${title}`;
+    button.ariaPressed = String(isPinned);
+    button.addEventListener('click', () => {
+      const others = pinned.filter((name) => name !== key);
+      this.#store.set({ pinned: (isPinned ? others : [...others, key]).join() });
+    });
+    return button;
+  }
+
+  /**
+   * Keeps the first column and those pinned at the left of the table when it scrolls.
+   * @param {HTMLElement[]} heads
+   * @param {number} count of pinned columns
+   */
+  #stick(heads, count) {
+    const lines = [...this.#host.querySelectorAll('.checkpoints tr')];
+    let left = 0;
+    for (let i = 1; i <= count; i++) {
+      left += heads[i - 1].offsetWidth;
+      for (const line of lines) {
+        const cell = /** @type {HTMLElement} */ (line.children[i]);
+        cell.classList.add('pinned');
+        cell.style.left = `${left}px`;
+      }
+    }
   }
 
   /** Names of all filters; their order sets the colours. */
@@ -278,7 +320,9 @@ export class Experiments {
     for (const { content, number } of columns.slice(1)) {
       const cell = line.insertCell();
       cell.className = number ? 'number' : '';
-      cell.textContent = content(row);
+      const text = content(row);
+      if (isAddress(text)) cell.append(externalLink(text));
+      else cell.textContent = text;
     }
     return line;
   }
@@ -421,47 +465,10 @@ export class Experiments {
   }
 }
 
-/** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow | SeedGroup) => string}} Column */
-
-/**
- * Columns of the table; texts that are equal in all rows are left out.
- * @param {ExperimentRow[]} rows
- * @param {boolean} areGroups whether each displayed row is a mean over checkpoints
- * @returns {Column[]}
- */
-function columnsOf(rows, areGroups) {
-  const units = [...new Set(rows.map(({ unit }) => unit))];
-  const texts = /** @type {const} */ (['filter', 'task', 'faults']).filter(
-    (key) => new Set(rows.map((row) => row[key])).size > 1 && !(areGroups && key === 'filter'),
-  );
-  return [
-    {
-      key: 'name',
-      title: areGroups ? 'filter' : 'checkpoint',
-      help: areGroups ? 'Checkpoints that differ by their seed' : 'Name of the file',
-      number: false,
-      content: ({ name }) => name,
-    },
-    ...texts.map((key) => ({
-      key,
-      title: key,
-      help: displayName(key),
-      number: false,
-      content: (/** @type {ExperimentRow} */ row) => row[key] || 'none',
-    })),
-    ...(areGroups ? [SEEDS] : []),
-    ...NUMBER_KEYS.map((key) => ({ key, ...NUMBERS[key] })).map(
-      ({ key, title, help, hasUnit, format }) => ({
-        key,
-        title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
-        help,
-        number: true,
-        content: (/** @type {ExperimentRow | SeedGroup} */ row) => {
-          const spread = 'spread' in row ? row.spread[key] : undefined;
-          const more = spread === undefined ? '' : ` ± ${format(spread)}`;
-          return `${format(row[key])}${more}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`;
-        },
-      }),
-    ),
-  ];
+/** @param {string} address */
+function externalLink(address) {
+  const textContent = address.replace(/^https?:\/\//, '');
+  const link = create('a', { href: address, target: '_blank', rel: 'noopener', textContent });
+  link.addEventListener('click', (event) => event.stopPropagation()); // does not select the row
+  return link;
 }

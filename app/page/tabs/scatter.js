@@ -10,7 +10,7 @@ import { fixed, significant } from '../core/units.js';
 import { colourOf, estimatorOf } from '../widgets/filter_colours.js';
 import { extent, padded } from '../widgets/plots.js';
 import { cellOf, faultLevel } from './experiment_groups.js';
-import { NUMBERS } from './experiment_rows.js';
+import { NUMBERS, numberOf } from './experiment_rows.js';
 
 const MARGIN = { left: scaled(44), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
 const TICKS = 5;
@@ -133,14 +133,15 @@ export function coloured(mark, { filter }, filters) {
  * @param {string} name
  */
 function axis(rows, name) {
-  const key = /** @type {NumberKey} */ (name in NUMBERS ? name : 'error');
-  const { title, hasUnit } = NUMBERS[key];
+  const exists = name in NUMBERS || rows.some((row) => numberOf(row, name) !== null);
+  const key = /** @type {NumberKey} */ (exists ? name : 'error');
+  const { title, hasUnit } = NUMBERS[key] ?? { title: name, hasUnit: false };
   const units = [...new Set(rows.map(({ unit }) => unit))];
   return {
     title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
     ...scale(
       rows,
-      (row) => row[key],
+      (row) => numberOf(row, key),
       (row) => ('spread' in row ? (row.spread[key] ?? 0) : 0),
     ),
   };

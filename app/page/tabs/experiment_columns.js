@@ -1,0 +1,75 @@
+/** Columns of the table of the Experiments tab. */
+
+/** @import { ExperimentRow } from '../types/server.js' */
+/** @import { SeedGroup } from './experiment_groups.js' */
+
+import { displayName } from '../core/units.js';
+import { differingEntries, isAddress, isNumeric, isSeed } from './experiment_provenance.js';
+import { NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
+
+/** @type {Column} */
+const SEEDS = {
+  key: 'seeds',
+  title: 'seeds',
+  help: 'Number of checkpoints; their standard deviation is behind ±',
+  number: true,
+  content: (row) => String('members' in row ? row.members.length : 1),
+};
+/** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow | SeedGroup) => string}} Column */
+
+/**
+ * Columns of the table, the pinned ones first; texts and provenance that are equal in all rows are left out.
+ * @param {ExperimentRow[]} rows
+ * @param {boolean} areGroups whether each displayed row is a mean over checkpoints
+ * @param {string[]} pinned keys of the columns beside the first one
+ * @returns {Column[]}
+ */
+export function columnsOf(rows, areGroups, pinned) {
+  const units = [...new Set(rows.map(({ unit }) => unit))];
+  const texts = /** @type {const} */ (['filter', 'task', 'faults']).filter(
+    (key) => new Set(rows.map((row) => row[key])).size > 1 && !(areGroups && key === 'filter'),
+  );
+  const entries = differingEntries(rows).filter(
+    (name) => !areGroups || !(isSeed(name) || isAddress(valueOf(rows[0], name))),
+  );
+  /** @type {Column[]} */
+  const [first, ...others] = [
+    {
+      key: 'name',
+      title: areGroups ? 'filter' : 'checkpoint',
+      help: areGroups ? 'Checkpoints that differ by their seed' : 'Name of the file',
+      number: false,
+      content: ({ name }) => name,
+    },
+    ...texts.map((key) => ({
+      key,
+      title: key,
+      help: displayName(key),
+      number: false,
+      content: (/** @type {ExperimentRow} */ row) => row[key] || 'none',
+    })),
+    ...(areGroups ? [SEEDS] : []),
+    ...NUMBER_KEYS.map((key) => ({ key, ...NUMBERS[key] })).map(
+      ({ key, title, help, hasUnit, format }) => ({
+        key,
+        title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
+        help,
+        number: true,
+        content: (/** @type {ExperimentRow | SeedGroup} */ row) => {
+          const spread = 'spread' in row ? row.spread[key] : undefined;
+          const more = spread === undefined ? '' : ` ± ${format(spread)}`;
+          return `${format(row[key])}${more}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`;
+        },
+      }),
+    ),
+    ...entries.map((name) => ({
+      key: name,
+      title: name,
+      help: `${name} in the provenance of the checkpoint`,
+      number: isNumeric(rows, name),
+      content: (/** @type {ExperimentRow} */ row) => String(valueOf(row, name) ?? '–'),
+    })),
+  ];
+  const at = (/** @type {Column} */ { key }) => pinned.indexOf(key) >>> 0; // those not pinned last, in their order
+  return [first, ...others.sort((a, b) => at(a) - at(b))];
+}

@@ -1,0 +1,67 @@
+/** The provenance of the checkpoints of a sweep, such as their training settings, as columns. */
+
+/** @import { ExperimentRow } from '../types/server.js' */
+
+/** @typedef {string | number | boolean | null} Entry */
+
+const MOST_COLUMNS = 30;
+
+/** @type {WeakMap<ExperimentRow, Record<string, Entry>>} */
+const parsed = new WeakMap();
+
+/**
+ * Entries of a row by name: `model.width` of `{"model": {"width": 64}}`. Lists are JSON text.
+ * @param {ExperimentRow} row
+ */
+export function provenanceOf(row) {
+  const entries = parsed.get(row) ?? flattened(JSON.parse(row.provenance || '{}'));
+  parsed.set(row, entries);
+  return entries;
+}
+
+/**
+ * Names of the entries that differ between rows, in the order of the rows.
+ * @param {ExperimentRow[]} rows
+ */
+export function differingEntries(rows) {
+  /** @type {Map<string, Set<Entry>>} */
+  const values = new Map();
+  for (const row of rows)
+    for (const name of Object.keys(provenanceOf(row)))
+      values.set(name, values.get(name) ?? new Set());
+  for (const row of rows)
+    for (const [name, set] of values) set.add(provenanceOf(row)[name] ?? null);
+  return [...values.keys()]
+    .filter((name) => Number(values.get(name)?.size) > 1)
+    .slice(0, MOST_COLUMNS);
+}
+
+/**
+ * Whether all values of an entry are numbers or missing.
+ * @param {ExperimentRow[]} rows
+ * @param {string} name
+ */
+export const isNumeric = (rows, name) =>
+  rows.every((row) => typeof (provenanceOf(row)[name] ?? 0) === 'number');
+
+/** Whether an entry is a random seed: `seed`, or `data.seed` of nested entries. @param {string} name */
+export const isSeed = (name) => name.split('.').at(-1) === 'seed';
+
+/** Whether a value is the address of a page, such as that of a run. @param {unknown} value */
+export const isAddress = (value) => typeof value === 'string' && /^https?:\/\//.test(value);
+
+/**
+ * @param {Record<string, unknown>} tree
+ * @param {string} [prefix]
+ * @returns {Record<string, Entry>}
+ */
+function flattened(tree, prefix = '') {
+  return Object.assign(
+    {},
+    ...Object.entries(tree).map(([key, value]) => {
+      if (value && typeof value === 'object' && !Array.isArray(value))
+        return flattened(/** @type {Record<string, unknown>} */ (value), `${prefix}${key}.`);
+      return { [`${prefix}${key}`]: Array.isArray(value) ? JSON.stringify(value) : value };
+    }),
+  );
+}
