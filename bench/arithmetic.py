@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from beliefscope.filters.models.networks import IMAGE_CHUNK, ROW_CHUNK
+from beliefscope.filters.models.networks import CELLS_CHUNK, ROW_CHUNK
 
 UNITS, CHANNELS, IMAGE = 64, 32, 32
 
@@ -54,11 +54,11 @@ def cpu_seconds(function: Callable[[], object]) -> float:
 
 
 @torch.no_grad()
-def measure_rate(images: int = IMAGE_CHUNK, cells: int = IMAGE) -> Rate:
-    """The rates now: a layer of ROW_CHUNK x 64 x 64, and a 3 x 3 convolution of 32 channels over ``images`` images."""
+def measure_rate() -> Rate:
+    """The rates now: a layer of ROW_CHUNK x 64 x 64, and a 3 x 3 convolution of 32 channels over CELLS_CHUNK cells."""
     linear, rows = nn.Linear(UNITS, UNITS, bias=False), torch.randn(ROW_CHUNK, UNITS)
     convolution = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    maps = torch.randn(images, CHANNELS, cells, cells).contiguous(memory_format=torch.channels_last)
+    maps = torch.randn(CELLS_CHUNK // IMAGE**2, CHANNELS, IMAGE, IMAGE).contiguous(memory_format=torch.channels_last)
     return Rate(_rate(lambda: linear(rows), 300), _rate(lambda: convolution(maps), 3))
 
 

@@ -13,8 +13,8 @@ from torch.nn import functional
 Pooling = Literal["flatten", "spatial-softmax", "mean"]
 Networks = Literal["default", "authors"]
 
-IMAGE_CHUNK = 128
-"""Images encoded at once: enough to use all cores, few enough to stay in the CPU caches."""
+CELLS_CHUNK = 1 << 15
+"""Cells of feature maps convolved at once: enough to use all cores, few enough to stay in the CPU caches."""
 
 ROW_CHUNK = 1024
 """Particles or map cells evaluated at once, so that their activations stay in the CPU caches."""
@@ -141,6 +141,7 @@ class ImageEncoder(nn.Module):
     resolution.
 
     Attributes:
+        chunk: number of images to encode at once.
         table: (images + 1, units) cached features of each training image and, last, of a black one; only while the
             encoder is frozen during training.
         images: image indices (...) to images (..., H, W), standardised; only while the encoder is trained on indices.
@@ -171,6 +172,7 @@ class ImageEncoder(nn.Module):
         # With channels last, convolutions on a CPU take two thirds of the time.
         self.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         cells = -(-shape[0] // stride) * -(-shape[1] // stride)
+        self.chunk = max(1, CELLS_CHUNK // cells)
         size, self.pooling = {
             "flatten": (8 * cells, nn.Flatten()),
             "spatial-softmax": (16, SpatialSoftmax()),
@@ -221,7 +223,7 @@ class Encoders(nn.Module):
                 assert encoder.table is not None
                 features.append(encoder.table[observed])
             elif isinstance(encoder, ImageEncoder):
-                parts = [encoder(part) for part in observed.flatten(0, 1).split(IMAGE_CHUNK)]
+                parts = [encoder(part) for part in observed.flatten(0, 1).split(encoder.chunk)]
                 features.append(torch.cat(parts).unflatten(0, observed.shape[:2]))
             else:
                 features.append(encoder(observed))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.models.networks import IMAGE_CHUNK, ImageEncoder
+from beliefscope.filters.models.networks import ImageEncoder
 
 Images = Mapping[str, Tensor]
 """Modality -> (P, H, W) uint8, all different."""
@@ -83,4 +83,5 @@ def weights_key(encoder: ImageEncoder) -> bytes:
 @torch.no_grad()
 def encode_images(filter_: Filter, modality: str, encoder: ImageEncoder, images: Tensor) -> Tensor:
     """(P, units) features of images (P, H, W), uint8."""
-    return torch.cat([encoder(filter_.statistics.standardise(modality, part)) for part in images.split(IMAGE_CHUNK)])
+    parts = images.split(encoder.chunk)
+    return torch.cat([encoder(filter_.statistics.standardise(modality, part)) for part in parts])

@@ -18,7 +18,7 @@ import {
   sortText,
   unknownConditions,
 } from '../../app/page/tabs/experiment_rows.js';
-import { niceStep } from '../../app/page/tabs/scatter.js';
+import { niceStep, scale } from '../../app/page/tabs/scatter.js';
 
 const ROW = {
   name: 'run-1',
@@ -121,6 +121,31 @@ test('steps of ticks are 1, 2 or 5 times a power of ten, and at least as large a
     assert.ok(nice >= step * (1 - 1e-12) && nice <= 2.5 * step);
     assert.match(nice.toExponential(6), /^[125]\.000000e/);
   }
+});
+
+test('an axis is logarithmic if positive values differ by more than a factor of 100', () => {
+  /** @param {number[]} values */
+  const axisOf = (...values) =>
+    scale(
+      values.map((error) => ({ ...ROW, error })),
+      ({ error }) => error,
+      () => 0,
+    );
+  const texts = (/** @type {ReturnType<typeof axisOf>} */ axis) => axis.ticks.map(axis.text);
+  assert.deepEqual(texts(axisOf(1e-5, 1e-2)), ['0.00001', '0.0001', '0.001', '0.01']);
+  assert.deepEqual(texts(axisOf(1, 5)), ['1', '2', '3', '4', '5']);
+  for (const values of [
+    [1e-5, 3e-4, 1e-2],
+    [0, 1, 500],
+    [-1, 2, 900],
+    [2, 2],
+  ]) {
+    const axis = axisOf(...values);
+    const places = [...values, ...axis.ticks].map(axis.share);
+    assert.ok(places.every((share) => share >= -1e-9 && share <= 1 + 1e-9));
+    assert.deepEqual(values.map(axis.share), values.map(axis.share).sort());
+  }
+  assert.ok(Math.abs(axisOf(1e-5, 1e-2).share(10 ** -3.5) - 0.5) < 1e-12);
 });
 
 /** @param {object[]} changes of `ROW`, each with another checkpoint */

@@ -4,7 +4,13 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { displayName } from '../core/units.js';
-import { differingEntries, isAddress, isNumeric, isSeed } from './experiment_provenance.js';
+import {
+  differingEntries,
+  entryText,
+  isAddress,
+  isNumeric,
+  isSeed,
+} from './experiment_provenance.js';
 import { NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @type {Column} */
@@ -67,7 +73,7 @@ export function columnsOf(rows, areGroups, pinned) {
       title: name,
       help: `${name} in the provenance of the checkpoint`,
       number: isNumeric(rows, name),
-      content: (/** @type {ExperimentRow} */ row) => String(valueOf(row, name) ?? '–'),
+      content: (/** @type {ExperimentRow} */ row) => entryText(valueOf(row, name)),
     })),
   ];
   const at = (/** @type {Column} */ { key }) => pinned.indexOf(key) >>> 0; // those not pinned last, in their order

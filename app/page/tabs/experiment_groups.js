@@ -3,7 +3,7 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { NumberKey } from './experiment_rows.js' */
 
-import { isAddress, isSeed, provenanceOf } from './experiment_provenance.js';
+import { entryText, isAddress, isSeed, provenanceOf } from './experiment_provenance.js';
 import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
 
 /**
@@ -145,7 +145,7 @@ const LONGEST_VALUE = 24; // characters of a setting in the name of a group
 /** @param {[string, unknown]} setting */
 function labelOf([key, value]) {
   if (key === 'fine-tuning') return 'fine-tuned';
-  const text = typeof value === 'string' ? value : JSON.stringify(value);
+  const text = typeof value === 'object' ? JSON.stringify(value) : entryText(value);
   return `${key} ${key === 'data' ? text.slice(0, 8) : text.slice(0, LONGEST_VALUE)}`;
 }
 

@@ -44,6 +44,15 @@ export function differingEntries(rows) {
 export const isNumeric = (rows, name) =>
   rows.every((row) => typeof (provenanceOf(row)[name] ?? 0) === 'number');
 
+/**
+ * Formats an entry, a number with up to five significant digits.
+ * @param {unknown} value
+ */
+export function entryText(value) {
+  if (typeof value === 'number') return String(Number(value.toPrecision(5))).replaceAll('-', '−');
+  return String(value ?? '–');
+}
+
 /** Whether an entry is a random seed: `seed`, or `data.seed` of nested entries. @param {string} name */
 export const isSeed = (name) => name.split('.').at(-1) === 'seed';
 

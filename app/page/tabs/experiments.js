@@ -27,7 +27,7 @@ import {
 import { columnsOf } from './experiment_columns.js';
 import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
 import { differingEntries, isAddress, isNumeric } from './experiment_provenance.js';
-import { coloured, drawScatter, levelName } from './scatter.js';
+import { coloured, drawScatter, levelName, markPoint } from './scatter.js';
 
 const EMPTY = {
   title: 'No sweep yet',
@@ -42,6 +42,7 @@ const EMPTY = {
     'beliefscope serve --sweep sweep',
   ],
 };
+const ROWS_AT_ONCE = 200; // drawn before the table is scrolled
 const EPISODES = 50; // listed for a checkpoint, the worst first
 
 const BODY = `
@@ -75,7 +76,9 @@ export class Experiments {
   #sweeps = null;
   /** Rows of the sweep and steps in `#loaded`. @type {ExperimentRow[]} */
   #rows = [];
-  /** Displayed rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
+  /** Columns of the table. @type {Column[]} */
+  #columns = [];
+  /** Matching rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
   #matching = [];
   #count = 0;
   #loaded = '';
@@ -95,6 +98,11 @@ export class Experiments {
     host.innerHTML = BODY;
     this.#body = element('.checkpoints tbody', HTMLTableSectionElement, host);
     navigateRows(this.#body);
+    const scroll = html('.scroll', host);
+    scroll.addEventListener('scroll', () => {
+      const below = scroll.scrollHeight - scroll.scrollTop - scroll.clientHeight;
+      if (below < scroll.clientHeight) this.#addRows(ROWS_AT_ONCE);
+    });
     new ResizeObserver(() => this.#drawChart()).observe(html('.chart', host));
     this.#listenToPickers();
     html('.compare', host).addEventListener('click', () =>
@@ -241,10 +249,26 @@ export class Experiments {
     element('.checkpoints thead', HTMLTableSectionElement, this.#host).replaceChildren(
       create('tr', {}, ...heads),
     );
-    this.#body.replaceChildren(...rows.map((row) => this.#tableRow(row, columns)));
-    this.#stick(heads, columns.filter(({ key }) => pinned.includes(key)).length);
+    this.#body.replaceChildren();
     this.#matching = rows;
+    this.#columns = columns;
+    this.#addRows(ROWS_AT_ONCE);
+    this.#drawChart();
     this.#mark();
+  }
+
+  /**
+   * Adds the next rows to the table, which has the first ones until it is scrolled.
+   * @param {number} count
+   */
+  #addRows(count) {
+    const drawn = this.#body.rows.length;
+    const filters = this.#filters;
+    const lines = this.#matching
+      .slice(drawn, drawn + count)
+      .map((row) => this.#tableRow(row, filters));
+    this.#body.append(...lines);
+    if (lines.length) this.#stick();
   }
 
   /** Names of the columns with numbers. @returns {string[]} */
@@ -260,9 +284,9 @@ export class Experiments {
       y,
       kinds: faultKinds(this.#rows),
       filters: this.#filters,
-      selected: cell,
       select: (row) => this.#select(row),
     });
+    markPoint(html('.chart', this.#host), cell);
   }
 
   /**
@@ -283,22 +307,19 @@ export class Experiments {
     return button;
   }
 
-  /**
-   * Keeps the first column and those pinned at the left of the table when it scrolls.
-   * @param {HTMLElement[]} heads
-   * @param {number} count of pinned columns
-   */
-  #stick(heads, count) {
-    const lines = [...this.#host.querySelectorAll('.checkpoints tr')];
-    let left = 0;
-    for (let i = 1; i <= count; i++) {
-      left += heads[i - 1].offsetWidth;
-      for (const line of lines) {
-        const cell = /** @type {HTMLElement} */ (line.children[i]);
+  /** Keeps the first column and those pinned at the left of the table when it scrolls. */
+  #stick() {
+    const pinned = this.#store.state.pinned.split(',');
+    const count = this.#columns.filter(({ key }) => pinned.includes(key)).length;
+    const lines = [...element('.checkpoints', HTMLTableElement, this.#host).rows];
+    const widths = [...lines[0].cells].slice(0, count).map((cell) => cell.offsetWidth);
+    for (const line of lines)
+      widths.reduce((left, width, i) => {
+        const cell = line.cells[i + 1];
         cell.classList.add('pinned');
-        cell.style.left = `${left}px`;
-      }
-    }
+        cell.style.left = `${left + width}px`;
+        return left + width;
+      }, 0);
   }
 
   /** Names of all filters; their order sets the colours. */
@@ -308,16 +329,16 @@ export class Experiments {
 
   /**
    * @param {ExperimentRow | SeedGroup} row
-   * @param {Column[]} columns
+   * @param {string[]} filters their order sets the colours
    */
-  #tableRow(row, columns) {
+  #tableRow(row, filters) {
     const button = create('button', { type: 'button', className: 'quiet', textContent: row.name });
     button.title = `${row.name}: its worst episodes`;
-    const dot = coloured(create('span', { className: 'dot' }), row, this.#filters);
+    const dot = coloured(create('span', { className: 'dot' }), row, filters);
     const line = create('tr', {}, create('th', { scope: 'row' }, dot, button));
     line.dataset.cell = cellOf(row);
     line.addEventListener('click', () => this.#select(row)); // also clicks on the button, which serves the keyboard
-    for (const { content, number } of columns.slice(1)) {
+    for (const { content, number } of this.#columns.slice(1)) {
       const cell = line.insertCell();
       cell.className = number ? 'number' : '';
       const text = content(row);
@@ -339,12 +360,15 @@ export class Experiments {
   }
 
   #mark() {
+    const { cell } = this.#store.state;
+    const missing = this.#matching.findIndex((row) => cellOf(row) === cell) + 1;
+    this.#addRows(Math.max(0, missing - this.#body.rows.length));
     for (const line of this.#body.rows) {
-      const here = line.dataset.cell === this.#store.state.cell;
+      const here = line.dataset.cell === cell;
       line.classList.toggle('here', here);
       if (here) setTabStop(line, false);
     }
-    this.#drawChart();
+    markPoint(html('.chart', this.#host), cell);
   }
 
   /** Lists the episodes of the selected checkpoint, or the checkpoints of the selected group. */

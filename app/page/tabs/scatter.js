@@ -14,14 +14,15 @@ import { NUMBERS, numberOf } from './experiment_rows.js';
 
 const MARGIN = { left: scaled(44), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
 const TICKS = 5;
+const LINEAR_RATIO = 100;
 const RADIUS = scaled(4);
 const SMALLEST = scaled(80); // px
 
 /** @typedef {ExperimentRow | SeedGroup} Row */
 /**
  * x, y: names of the quantities; x can be `levelName` of one of the kinds of faults, whose levels are joined by lines. filters: their
- * order sets the colours. selected: cell of the selected row.
- * @typedef {{x: string, y: string, kinds: string[], filters: string[], selected: string, select: (row: Row) => void}} Choices
+ * order sets the colours.
+ * @typedef {{x: string, y: string, kinds: string[], filters: string[], select: (row: Row) => void}} Choices
  */
 
 /**
@@ -30,7 +31,7 @@ const SMALLEST = scaled(80); // px
  * @param {Choices} choices
  */
 export function drawScatter(host, rows, choices) {
-  const { kinds, filters, selected, select } = choices;
+  const { kinds, filters, select } = choices;
   const kind = kinds.find((name) => levelName(name) === choices.x);
   const x = kind === undefined ? axis(rows, choices.x) : levelAxis(rows, kind);
   const y = axis(rows, choices.y);
@@ -49,12 +50,12 @@ export function drawScatter(host, rows, choices) {
   for (const value of x.ticks)
     svg.append(
       line('grid', right(value), MARGIN.top, right(value), height - MARGIN.bottom),
-      text(fixed(value, x.decimals), right(value), height - MARGIN.bottom + scaled(13), 'middle'),
+      text(x.text(value), right(value), height - MARGIN.bottom + scaled(13), 'middle'),
     );
   for (const value of y.ticks)
     svg.append(
       line('grid', MARGIN.left, up(value), width - MARGIN.right, up(value)),
-      text(fixed(value, y.decimals), MARGIN.left - scaled(5), up(value) + scaled(4), 'end'),
+      text(y.text(value), MARGIN.left - scaled(5), up(value) + scaled(4), 'end'),
     );
   svg.append(text(x.title, (MARGIN.left + width) / 2, height - scaled(4), 'middle'));
   const side = text(y.title, 0, 0, 'middle');
@@ -81,7 +82,6 @@ export function drawScatter(host, rows, choices) {
       r: RADIUS,
       'data-cell': cellOf(row),
     });
-    point.classList.toggle('here', cellOf(row) === selected);
     const [spreadX, spreadY] = [dx, dy].map((spread) =>
       spread ? ` ± ${significant(spread)}` : '',
     );
@@ -96,6 +96,16 @@ export function drawScatter(host, rows, choices) {
     mark(point);
   }
   host.replaceChildren(svg);
+}
+
+/**
+ * Highlights the point of a row.
+ * @param {HTMLElement} host
+ * @param {string} cell
+ */
+export function markPoint(host, cell) {
+  for (const point of host.querySelectorAll('circle'))
+    point.classList.toggle('here', point.dataset.cell === cell);
 }
 
 /**
@@ -165,28 +175,56 @@ const levelAxis = (rows, kind) => ({
 export const levelName = (kind) => `level:${kind}`;
 
 /**
- * Values, range and ticks of an axis.
+ * Values, range and ticks of an axis, logarithmic if positive values differ by more than LINEAR_RATIO.
  * @param {Row[]} rows
  * @param {(row: Row) => number | null} value
  * @param {(row: Row) => number} spread standard deviation
  */
-function scale(rows, value, spread) {
+export function scale(rows, value, spread) {
   const ends = rows.flatMap((row) => {
     const centre = value(row);
     return centre === null ? [] : [centre - spread(row), centre + spread(row)];
   });
-  const [low, high] = padded(extent(ends));
-  const step = niceStep((high - low) / TICKS);
-  const first = Math.ceil(low / step);
-  const count = Math.floor(high / step) - first + 1;
-  return {
-    value,
-    spread,
-    ticks: Array.from({ length: count }, (_, i) => (first + i) * step),
-    decimals: Math.max(0, -Math.floor(Math.log10(step))),
-    share: (/** @type {number} */ point) => (point - low) / (high - low),
-  };
+  const [least, greatest] = extent(ends);
+  const isLog = least > 0 && greatest > LINEAR_RATIO * least;
+  const place = isLog ? Math.log10 : Number;
+  const [low, high] = padded([place(least), place(greatest)]);
+  return { value, spread, ...(isLog ? powersOfTen : multiples)(low, high), share };
+
+  /** @param {number} point */
+  function share(point) {
+    return (place(point) - low) / (high - low);
+  }
 }
+
+/**
+ * Ticks at multiples of a nice step.
+ * @param {number} low
+ * @param {number} high
+ */
+function multiples(low, high) {
+  const step = niceStep((high - low) / TICKS);
+  const decimals = Math.max(0, -Math.floor(Math.log10(step)));
+  const ticks = integers(low / step, high / step).map((i) => i * step);
+  return { ticks, text: (/** @type {number} */ tick) => fixed(tick, decimals) };
+}
+
+/**
+ * @param {number} low exponent
+ * @param {number} high exponent
+ */
+const powersOfTen = (low, high) => ({
+  ticks: integers(low, high).map((power) => 10 ** power),
+  text: (/** @type {number} */ tick) => String(Number(tick.toPrecision(1))).replaceAll('-', '−'),
+});
+
+/**
+ * The integers from low to high.
+ * @param {number} low
+ * @param {number} high
+ */
+const integers = (low, high) =>
+  Array.from({ length: Math.floor(high) - Math.ceil(low) + 1 }, (_, i) => Math.ceil(low) + i);
 
 /** The smallest of 1, 2 and 5 times a power of ten that is at least this. @param {number} step */
 export function niceStep(step) {
