@@ -41,18 +41,18 @@ def survey_of(
         by: a score that must apply to the filter.
         engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
 
-    Raises BadInput after the first episode if ``by`` does not apply, as ``trace``, and for several workers with an
+    Raises BadInput after the first episodes if ``by`` does not apply, as ``trace``, and for several workers with an
     external filter that has no build function.
     """
     indices = list(episodes)
     longest = data.most_steps(indices) if isinstance(data, Dataset) else max((len(data[i]) for i in indices), default=0)
     faults.check(checkpoint.task, longest)
     settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
-    if by is not None:
-        try_score(by, checkpoint, data, indices[:1], **settings)
     blocks = [indices[i : i + BLOCK] for i in range(0, len(indices), BLOCK)]
     scores: list[EpisodeScores] = []
     for _, finished in run_blocks(partial(_scores, checkpoint, data, settings), blocks, engine, workers, progress):
+        if by is not None and finished:
+            check_applies(by, finished[0].run["refused"].get(by))
         scores += finished
     return Survey.from_episodes(scores)
 
@@ -73,12 +73,6 @@ def find_score(by: str, task: Task) -> Score:
     scores = scores_of(task)
     check_name(f"score of task {task.name!r}", by, scores)
     return scores[by]
-
-
-def try_score(by: str, checkpoint: Checkpoint, data: Episodes, indices: Sequence[int], **settings: Any) -> None:
-    """Raise BadInput if the score does not apply to runs over these episodes: cheaper than finding out after all."""
-    for run in trace_all(checkpoint, data, indices, **settings):
-        check_applies(by, find_score(by, checkpoint.task).why_not(run))
 
 
 def check_applies(by: str, reason: str | None) -> None:

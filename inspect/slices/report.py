@@ -16,7 +16,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
-from beliefscope.inspect.failures.survey import check_applies, find_score, try_score
+from beliefscope.inspect.failures.survey import check_applies, find_score
 from beliefscope.inspect.slices.covariates import EpisodeCovariates, join_covariates
 from beliefscope.inspect.slices.search import ALPHA, Candidate, Condition, Index, find_candidates
 from beliefscope.inspect.statistics.intervals import jackknife
@@ -160,7 +160,6 @@ def find_slices(
     indices = list(episodes)
     check_episodes(len(indices))
     settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
-    try_score(by, checkpoint, data, indices[:1], **settings)
     runs = trace_all(checkpoint, data, indices, **settings, progress=lambda share: progress(0.8 * share))
     return slices_of(runs, by, alpha=alpha, progress=lambda share: progress(0.8 + 0.2 * share))
 
@@ -176,7 +175,11 @@ def slices_of(
 
     Raises BadInput for an unknown score, one that does not apply, and as ``Survey.from_episodes``.
     """
-    parts = [(EpisodeScores.from_trace(trace), EpisodeCovariates.from_trace(trace)) for trace in traces]
+    parts: list[tuple[EpisodeScores, EpisodeCovariates]] = []
+    for trace in traces:
+        if not parts:  # before all of them are computed
+            check_applies(by, find_score(by, trace.task).why_not(trace))
+        parts.append((EpisodeScores.from_trace(trace), EpisodeCovariates.from_trace(trace)))
     if not parts:
         raise BadInput("the search for slices needs at least one trace")
     survey = Survey.from_episodes(scores for scores, _ in parts)
