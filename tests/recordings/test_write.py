@@ -280,35 +280,6 @@ def test_inconsistent_maps(trace: Trace, new_map: MapMaker, tmp_path: Path) -> N
     assert not list(tmp_path.iterdir())
 
 
-FULL = """
-import resource, sys
-sys.path.insert(0, {folder!r})
-from conftest import make_trace
-from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.write import write_recording
-trace = make_trace("pf", steps=100)
-for limit in {limits}:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-    try:
-        write_recording(trace, {path!r})
-        sys.exit("written")
-    except BadInput as error:
-        assert "could not write the complete file" in str(error), error
-"""
-
-
-@pytest.mark.long  # ten seconds
-def test_full_disk_raises(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-    size = write_recording(new_trace("pf", steps=100), path).stat().st_size
-    path.unlink()
-    limits = [int(share * size) for share in (0.3, 0.98)]  # chunk boundaries vary by up to 0.3 % of the size
-    script = FULL.format(folder=str(Path(__file__).parent), path=str(path), limits=limits)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert not list(tmp_path.iterdir())
-
-
 def test_threads_of_rerun_end(trace: Trace, tmp_path: Path) -> None:
     def threads() -> int:
         return len(os.listdir("/proc/self/task"))

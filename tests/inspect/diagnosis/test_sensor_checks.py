@@ -156,11 +156,14 @@ def test_windows_that_deviate_are_adjacent() -> None:
         ("torque_bias=0.3", "level/torque"),
         (
             "force_drift=0.4",
-            "drift/force level/force stuck noise unflagged agreement lag/contact axes lever size direction",
+            "drift/force level/force stuck noise roughness unflagged agreement lag/contact axes lever size direction",
         ),
         ("delay=image:steps=4", "lag/image shift offset hand sharpness occlusion"),
         ("image_underexposed=0.5", "brightness occlusion sharpness shift offset hand frozen lag/image"),
-        ("contact_delayed=3", "lag/contact agreement unflagged share level drift change size lever axes direction"),
+        (
+            "contact_delayed=3",
+            "lag/contact agreement unflagged share level drift change size roughness lever axes direction",
+        ),
     ],
 )
 def test_other_statistics_do_not_change(task: str, faults: str, own: str) -> None:
