@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from glob import glob
@@ -100,8 +100,13 @@ class Inputs:
         """
         cells: list[Cell] = []
         used: set[Path] = set()
+        hashes: set[str] = set()
         for path in self.checkpoints:
             checkpoint = _checkpoint(path)
+            provenance_of(path)  # an invalid one is reported before the work
+            if checkpoint.hash in hashes:  # a copy, such as the best checkpoint that is also the last
+                continue
+            hashes.add(checkpoint.hash)
             for data_path in self.data or (sample_path(checkpoint.task),):
                 data = _dataset(data_path, checkpoint.task)
                 if difference(checkpoint.task, data.task):
@@ -123,22 +128,28 @@ class Inputs:
         return list(dict.fromkeys(cells))
 
 
-def describe_checkpoint(path: Path) -> Row:
-    """The row of a checkpoint: name, task, training and provenance.
+def provenance_of(path: Path) -> Mapping[str, Any]:
+    """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one.
 
-    A file beside the checkpoint with the suffix ``.json`` may have further provenance, such as the configuration of
-    the training or the address of a tracker's run. Raises BadInput if it is not a JSON object.
+    It is the configuration of the training, for example, or the address of a tracker's run. Raises BadInput if it is
+    not a JSON object.
     """
+    beside = path.with_suffix(".json")
+    if not beside.is_file():
+        return {}
+    try:
+        provenance = json.loads(beside.read_text())
+    except ValueError as error:
+        raise BadInput(f"{beside} is not JSON: {error}") from None
+    if not isinstance(provenance, dict):
+        raise BadInput(f"{beside} contains {type(provenance).__name__}, expected a JSON object of key: value")
+    return provenance
+
+
+def describe_checkpoint(path: Path) -> Row:
+    """The row of a checkpoint: name, task, training and provenance. Raises BadInput as ``provenance_of``."""
     checkpoint = _checkpoint(path)
-    record, beside = dict(checkpoint.record), path.with_suffix(".json")
-    provenance: Any = {}
-    if beside.is_file():
-        try:
-            provenance = json.loads(beside.read_text())
-        except ValueError as error:
-            raise BadInput(f"{beside} is not JSON: {error}") from None
-        if not isinstance(provenance, dict):
-            raise BadInput(f"{beside} contains {type(provenance).__name__}, expected a JSON object of key: value")
+    record, provenance = dict(checkpoint.record), provenance_of(path)
     return {
         "checkpoint": checkpoint.hash,
         "name": path.stem,

@@ -173,9 +173,19 @@ OVERVIEW = {
 DOCUMENTS = ["training", "provenance"]
 """Columns of the overview with JSON documents, which a table for reading leaves out."""
 
+KEYS = {
+    RESULTS: "checkpoint, data, faults, seed, particles, episode, phase",
+    CHECKPOINTS: "checkpoint",
+    DATASETS: "data",
+}
+"""Columns that identify a row of a table."""
+
+ASCENDING = ("name", "filter", "task", "faults", "unit", "coverage95")
+"""Columns of the overview that are sorted in ascending order: texts, and one whose low values are bad."""
+
 _OVERVIEW_QUERY = (
     f"SELECT {', '.join(f'{expression} AS {name}' for name, expression in OVERVIEW.items())} "
-    f"FROM {RESULTS} r JOIN (SELECT DISTINCT ON (checkpoint) * FROM {CHECKPOINTS}) c USING (checkpoint) "
+    f"FROM {RESULTS} r JOIN {CHECKPOINTS} c USING (checkpoint) "
     "WHERE r.phase = ? GROUP BY r.checkpoint, r.data, r.faults"
 )
 
@@ -188,11 +198,14 @@ def as_csv(rows: pa.Table) -> bytes:
 
 
 def write_rows(rows: pa.Table, path: Path) -> None:
-    """Write a table as ``.csv`` or ``.parquet``."""
-    if path.suffix == ".csv":
-        write_atomically(path, as_csv(rows))
-    else:
-        _write(rows, path)
+    """Write a table as ``.csv`` or ``.parquet``. Raises BadInput for columns that such a file cannot have."""
+    try:
+        if path.suffix == ".csv":
+            write_atomically(path, as_csv(rows))
+        else:
+            _write(rows, path)
+    except pa.ArrowException as error:
+        raise BadInput(f"cannot write {str(path)!r}: {error}; cast the columns in the query") from None
 
 
 class Experiments:
@@ -202,8 +215,11 @@ class Experiments:
     """
 
     def __init__(self, folders: Iterable[Path]) -> None:
-        """Raises BadInput for a folder without results, and for damaged ones."""
-        self.folders = tuple(Path(folder).resolve() for folder in folders)
+        """Rows that several sweeps have are counted once.
+
+        Raises BadInput for a folder without results, and for damaged ones.
+        """
+        self.folders = tuple(dict.fromkeys(Path(folder).resolve() for folder in folders))
         for folder in self.folders:
             if not (folder / f"{RESULTS}.parquet").is_file():
                 raise BadInput(f"{folder} has no results of a sweep; write them: beliefscope sweep ... -o {folder}")
@@ -214,6 +230,8 @@ class Experiments:
                 rows = self._database.read_parquet(files, union_by_name=True)
                 if table == RESULTS and "worst_time" not in rows.columns:  # of earlier versions
                     rows = rows.project("*, NULL::DOUBLE AS worst_time")
+                if len(self.folders) > 1 or table != RESULTS:  # costs time in a large table
+                    rows = self._database.sql(f"SELECT DISTINCT ON ({KEYS[table]}) * FROM rows")
                 rows.create_view(table)
             except duckdb.Error as error:
                 raise BadInput(f"damaged results of a sweep: {error}") from None
@@ -232,16 +250,19 @@ class Experiments:
             raise BadInput(f"query {sql!r}: {str(error).strip()}") from None
         if relation is None:  # no statement, or one without a result
             raise BadInput(f"query {sql!r} has no result; write one that starts with SELECT")
+        if equal := sorted({name for name in relation.columns if relation.columns.count(name) > 1}):
+            raise BadInput(f"query {sql!r}: several columns are named {', '.join(equal)}; rename them with AS")
         return relation.to_arrow_table()
 
     def overview(self, phase: str = "all", sort: str = "error") -> pa.Table:
-        """Results of each checkpoint, data set and faults in a phase, highest values of the column ``sort`` first.
+        """Results of each checkpoint, data set and faults in a phase, the worst values of the column ``sort`` first.
 
         Errors are pooled over steps: ``sqrt(sum(steps error^2) / sum(steps))``; NEES and coverage are averages over
         steps. Raises BadInput for an unknown column.
         """
         check_name("column of the overview", sort, OVERVIEW)
-        order = f"{sort} DESC NULLS LAST, name, checkpoint, data, faults"
+        direction = "ASC" if sort in ASCENDING else "DESC"
+        order = f"{sort} {direction} NULLS LAST, name, checkpoint, data, faults"
         return self.query(f"{_OVERVIEW_QUERY} ORDER BY {order}", [phase])
 
     def phases(self) -> list[str]:

@@ -79,7 +79,8 @@ def routes(store: TraceStore) -> APIRouter:
     @router.get("/api/experiments/{sweep}/episodes")
     def episodes(sweep: str, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> EpisodeResults:
         rows = tables(sweep).episodes(checkpoint, data, faults, phase).slice(0, LARGEST).to_pylist()
-        return EpisodeResults(episodes=[EpisodeResult(**as_json(row)) for row in rows])
+        results = [EpisodeResult(**as_json(row)) for row in rows]
+        return EpisodeResults(episodes=results, opened_seed=store.settings.seed)
 
     @router.get("/api/experiments/{sweep}/results.csv")
     def results_as_csv(sweep: str, phase: str = "all") -> Response:

@@ -89,6 +89,22 @@ test('entries of the provenance that differ are columns, which conditions compar
   assert.deepEqual(matched('model.width>=32 tracker/2'), ['run-1']);
 });
 
+test('an entry named like a column does not replace its values', () => {
+  const rows = TRAINED.map((row, i) => ({ ...row, provenance: JSON.stringify({ error: i + 7 }) }));
+  assert.deepEqual(differingEntries(rows), ['provenance.error']);
+  assert.equal(matching(rows, 'provenance.error>7').length, 1);
+  assert.equal(matching(rows, 'error<7').length, 2);
+});
+
+test('the level of a fault is not its first step', () => {
+  const rows = ['force_bias=5:from=20', 'drop=haptics:from=50', 'blackout=0.4'];
+  assert.deepEqual(faultKinds(rows.map((faults) => ({ ...ROW, faults }))), [
+    'force_bias:from=20',
+    'blackout',
+  ]);
+  assert.equal(faultLevel({ ...ROW, faults: rows[0] }, 'force_bias:from=20'), 5);
+});
+
 test('pinned columns are the first, in the order of pinning, and no column is lost', () => {
   const keys = (/** @type {string[]} */ ...pinned) =>
     columnsOf(TRAINED, false, pinned).map(({ key }) => key);

@@ -197,6 +197,28 @@ def test_unusable_inputs(inputs: Inputs, run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "sweep").exists()
 
 
+def test_rows_of_several_sweeps_are_counted_once(sweep: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(sweep, tmp_path / "copy"))
+    counts = ["name", "faults", "episodes", "steps", "worst"]
+    once = Experiments([sweep]).overview().select(counts)
+    assert Experiments([sweep, sweep]).overview().select(counts).equals(once)
+    assert Experiments([sweep, copy]).overview().select(counts).equals(once)
+
+
+def test_copies_of_a_checkpoint_run_once(inputs: Inputs, tmp_path: Path) -> None:
+    (path, *_) = inputs.checkpoints
+    copy = Path(shutil.copy(path, tmp_path / "copy.safetensors"))
+    assert replace(inputs, checkpoints=(path, copy)).cells() == replace(inputs, checkpoints=(path,)).cells()
+    copy.with_suffix(".json").write_text("[1]")
+    with pytest.raises(BadInput, match="expected a JSON object"):
+        replace(inputs, checkpoints=(path, copy)).cells()
+
+
+def test_low_coverage_is_the_worst(sweep: Path) -> None:
+    coverage = Experiments([sweep]).overview(sort="coverage95")["coverage95"].to_pylist()
+    assert coverage == sorted(coverage)
+
+
 def test_sweeps_of_different_tasks_are_joined(sweep: Path, tmp_path: Path) -> None:
     with open_dataset(sample_path("push")) as sample:
         write_dataset(tmp_path / "push.h5", sample.task, [sample[sample.held_out()[0]]])

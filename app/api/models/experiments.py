@@ -74,6 +74,7 @@ class EpisodeResult(Reply):
 
 
 class EpisodeResults(Reply):
-    """Results of a checkpoint by episode, largest errors first."""
+    """Results of a checkpoint by episode and seed, largest errors first. opened_seed: of the runs on the page."""
 
     episodes: list[EpisodeResult]
+    opened_seed: int

@@ -1,3 +1,5 @@
+import json
+from decimal import Decimal
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
@@ -9,8 +11,8 @@ def experiments(
     phase: str = opt.option("NAME", "Steps to compare: all, a group such as contact, or blackout.", "all"),
     sort: str = opt.option("COLUMN", "Column of the overview that ranks the checkpoints, worst first.", "error"),
     top: int = opt.option("N", "Number of rows.", 20, parser=opt.integer(1)),
-    sql: str = opt.option(
-        "QUERY", "An SQL query (DuckDB) of the tables results, checkpoints and datasets instead.", ""
+    sql: str | None = opt.option(
+        "QUERY", "An SQL query (DuckDB) of the tables results, checkpoints and datasets instead.", None
     ),
     output: Path | None = opt.output_file("FILE", "Write all rows to a file: .csv or .parquet.", ".csv", ".parquet"),
 ) -> console.Result:
@@ -29,15 +31,20 @@ def experiments(
     from beliefscope.recordings.sweep_table import DOCUMENTS, Experiments, write_rows
 
     tables = Experiments(sweeps)
-    rows = tables.query(sql) if sql else tables.overview(phase, sort)
-    if sql == "" and not len(rows):
+    rows = tables.query(sql) if sql is not None else tables.overview(phase, sort)
+    if sql is None and not len(rows):
         raise BadInput(f"no steps in phase {phase!r}. Available: {', '.join(tables.phases())}")
     if output is not None:
         write_rows(rows, output)
     shown = rows.slice(0, top)
     more = f"\n{len(rows) - top} more rows: --top {len(rows)}" if len(rows) > top else ""
-    document = {"rows": shown.to_pylist(), "count": len(rows)}
-    if sql:
+    document = {"rows": json.loads(json.dumps(shown.to_pylist(), default=_json)), "count": len(rows)}
+    if sql is not None:
         return console.Result(document, console.arrow("Results", shown) + more, output)
     text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(DOCUMENTS))
     return console.Result(document, text + more, output)
+
+
+def _json(value: object) -> object:
+    """A value of a database for JSON: decimals are numbers, and dates, times and others texts."""
+    return float(value) if isinstance(value, Decimal) else str(value)

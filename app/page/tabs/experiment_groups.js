@@ -71,10 +71,11 @@ export function faultLevel({ faults }, kind) {
   return found?.kind === kind ? found.level : null;
 }
 
-/** Splits a single fault at its last number. @param {string} faults */
+/** Splits a single fault at its last number, apart from its first and last step. @param {string} faults */
 function levelOf(faults) {
-  const [, kind, level] = faults.match(/^([^,]*?)=?(-?\d+(?:\.\d+)?)$/) ?? [];
-  return kind === undefined ? undefined : { kind, level: Number(level) };
+  const [, fault, steps] = faults.match(/^([^,]*?)((?::(?:from|to)=\d+)*)$/) ?? [];
+  const [, kind, level] = fault?.match(/^(.*?)=?(-?\d+(?:\.\d+)?)$/) ?? [];
+  return kind === undefined ? undefined : { kind: kind + steps, level: Number(level) };
 }
 
 /**

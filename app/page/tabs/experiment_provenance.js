@@ -4,7 +4,7 @@
 
 /** @typedef {string | number | boolean | null} Entry */
 
-const MOST_COLUMNS = 30;
+const MOST_COLUMNS = 100;
 
 /** @type {WeakMap<ExperimentRow, Record<string, Entry>>} */
 const parsed = new WeakMap();
@@ -14,7 +14,7 @@ const parsed = new WeakMap();
  * @param {ExperimentRow} row
  */
 export function provenanceOf(row) {
-  const entries = parsed.get(row) ?? flattened(JSON.parse(row.provenance || '{}'));
+  const entries = parsed.get(row) ?? named(row, flattened(JSON.parse(row.provenance || '{}')));
   parsed.set(row, entries);
   return entries;
 }
@@ -58,6 +58,19 @@ export const isSeed = (name) => name.split('.').at(-1) === 'seed';
 
 /** Whether a value is the address of a page, such as that of a run. @param {unknown} value */
 export const isAddress = (value) => typeof value === 'string' && /^https?:\/\//.test(value);
+
+/**
+ * Entries named like a column of the row get the prefix `provenance.`.
+ * @param {ExperimentRow} row
+ * @param {Record<string, Entry>} entries
+ */
+const named = (row, entries) =>
+  Object.fromEntries(
+    Object.entries(entries).map(([name, value]) => [
+      name in row ? `provenance.${name}` : name,
+      value,
+    ]),
+  );
 
 /**
  * @param {Record<string, unknown>} tree

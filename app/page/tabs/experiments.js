@@ -84,6 +84,8 @@ export class Experiments {
   #loaded = '';
   /** Episodes of the selected row. @type {EpisodeResult[]} */
   #episodes = [];
+  /** Seed of the runs that the page opens. */
+  #openedSeed = 0;
   #body;
 
   /**
@@ -234,7 +236,7 @@ export class Experiments {
     html('.about', this.#host).textContent =
       unknownConditions(state.match, this.#numbers) ||
       `${matched.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
-    const pinned = state.pinned.split(',').filter(Boolean);
+    const pinned = pinnedColumns(state);
     const columns = columnsOf(this.#rows, state.rows === 'seeds', pinned);
     const heads = columns.map(({ key, title, help, number }, i) => {
       const head = sortHeading(
@@ -302,14 +304,15 @@ export class Experiments {
     button.ariaPressed = String(isPinned);
     button.addEventListener('click', () => {
       const others = pinned.filter((name) => name !== key);
-      this.#store.set({ pinned: (isPinned ? others : [...others, key]).join() });
+      const names = isPinned ? others : [...others, key];
+      this.#store.set({ pinned: names.map(encodeURIComponent).join() });
     });
     return button;
   }
 
   /** Keeps the first column and those pinned at the left of the table when it scrolls. */
   #stick() {
-    const pinned = this.#store.state.pinned.split(',');
+    const pinned = pinnedColumns(this.#store.state);
     const count = this.#columns.filter(({ key }) => pinned.includes(key)).length;
     const lines = [...element('.checkpoints', HTMLTableElement, this.#host).rows];
     const widths = [...lines[0].cells].slice(0, count).map((cell) => cell.offsetWidth);
@@ -384,16 +387,20 @@ export class Experiments {
     if (group && members) this.#showMembers(group.name, members);
     if (!row || !sweep) return;
     try {
-      const { episodes } = await api.experimentEpisodes(sweep.name, row, this.#steps);
+      const { episodes, opened_seed: seed } = await api.experimentEpisodes(
+        sweep.name,
+        row,
+        this.#steps,
+      );
       if (row !== this.#selected) return;
-      this.#episodes = episodes;
+      [this.#episodes, this.#openedSeed] = [episodes, seed];
     } catch (error) {
       html('.problems', this.#host).textContent = messageOf(error);
       return;
     }
     const faults = row.faults && `, ${row.faults}`;
     html('.episodes h4', this.#host).textContent =
-      `${row.name}${faults}: ${this.#episodes.length} episodes, the worst first`;
+      `${row.name}${faults}: ${this.#episodes.length} results, the worst first`;
     const items = this.#episodes
       .slice(0, EPISODES)
       .map((episode) => this.#episodeItem(row, episode));
@@ -426,23 +433,31 @@ export class Experiments {
    */
   #episodeItem(
     row,
-    { episode, error, unit, worst, worst_step: step, worst_time: time, nees, policy },
+    { episode, seed, error, unit, worst, worst_step: step, worst_time: time, nees, policy },
   ) {
-    const link = create('a', { textContent: `Episode ${episode}, ${stepLabel(step, time)}` });
+    const textContent = `Episode ${episode}, ${stepLabel(step, time)}`;
     const patch = (/** @type {string} */ filter) => ({
       ...this.#runOf(row, filter),
       episode,
       step,
       tab: 'scene',
     });
-    link.href = permalink({ ...this.#store.state, ...patch(row.catalog_name ?? row.name) });
-    link.addEventListener('click', (event) => {
-      if (event.ctrlKey || event.metaKey || event.shiftKey) return;
-      event.preventDefault();
-      this.#openRow((_, filter) => patch(filter));
-    });
+    const isOpened = seed === this.#openedSeed;
+    const link = create(isOpened ? 'a' : 'span', { textContent });
+    if (link instanceof HTMLAnchorElement) {
+      // The address of a checkpoint that is not in the catalog yet would open another one in a new tab.
+      link.href = row.catalog_name
+        ? permalink({ ...this.#store.state, ...patch(row.catalog_name) })
+        : '#';
+      link.addEventListener('click', (event) => {
+        if (row.catalog_name && (event.ctrlKey || event.metaKey || event.shiftKey)) return;
+        event.preventDefault();
+        this.#openRow((_, filter) => patch(filter));
+      });
+    } else link.title = `This server runs seed ${this.#openedSeed}: serve with --seed ${seed}`;
     const values = [`RMSE ${fixed(error, 2)} ${unit}`, `worst ${fixed(worst, 2)} ${unit}`];
     if (nees !== null) values.push(`NEES ${significant(nees)}`);
+    if (!isOpened) values.push(`seed ${seed}, not of this server`);
     return create(
       'li',
       {},
@@ -496,3 +511,6 @@ function externalLink(address) {
   link.addEventListener('click', (event) => event.stopPropagation()); // does not select the row
   return link;
 }
+
+/** Keys of the pinned columns, which may contain commas. @param {State} state */
+const pinnedColumns = ({ pinned }) => pinned.split(',').filter(Boolean).map(decodeURIComponent);

@@ -393,11 +393,13 @@ export interface components {
         };
         /**
          * EpisodeResults
-         * @description Results of a checkpoint by episode, largest errors first.
+         * @description Results of a checkpoint by episode and seed, largest errors first. opened_seed: of the runs on the page.
          */
         EpisodeResults: {
             /** Episodes */
             episodes: components["schemas"]["EpisodeResult"][];
+            /** Opened Seed */
+            opened_seed: number;
         };
         /**
          * EpisodeSummary
