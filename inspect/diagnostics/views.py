@@ -11,6 +11,8 @@ import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date, time, timedelta
+from decimal import Decimal
 from typing import Any, Literal
 
 import numpy as np
@@ -174,7 +176,10 @@ def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Val
 
 
 def as_json(value: Any) -> Any:
-    """Dataclasses, arrays and mappings as JSON values; tasks as their names; non-finite floats as None."""
+    """Dataclasses, arrays, mappings and values of a database as JSON values.
+
+    Tasks are their names, non-finite numbers None, dates and times text.
+    """
     if isinstance(value, Task):
         return value.name
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -185,4 +190,8 @@ def as_json(value: Any) -> Any:
         return as_json(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
         return [as_json(item) for item in value]
+    if isinstance(value, Decimal):
+        return as_json(float(value))
+    if isinstance(value, date | time | timedelta | bytes):
+        return str(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value

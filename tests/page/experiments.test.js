@@ -8,7 +8,7 @@ import {
   seedGroups,
 } from '../../app/page/tabs/experiment_groups.js';
 import { columnsOf } from '../../app/page/tabs/experiment_columns.js';
-import { differingEntries } from '../../app/page/tabs/experiment_provenance.js';
+import { differingEntries, provenanceOf } from '../../app/page/tabs/experiment_provenance.js';
 import {
   comparedWith,
   matching,
@@ -94,6 +94,13 @@ test('an entry named like a column does not replace its values', () => {
   assert.deepEqual(differingEntries(rows), ['provenance.error']);
   assert.equal(matching(rows, 'provenance.error>7').length, 1);
   assert.equal(matching(rows, 'error<7').length, 2);
+});
+
+test('entries of a group are those of its members', () => {
+  const rows = rowsOf({ provenance: '{"spread": 2}' }, { provenance: '{"spread": 2}' });
+  const [group] = seedGroups(rows);
+  assert.equal(group.members.length, 2);
+  assert.deepEqual(provenanceOf(group), provenanceOf(rows[0]));
 });
 
 test('the level of a fault is not its first step', () => {

@@ -214,6 +214,18 @@ def test_copies_of_a_checkpoint_run_once(inputs: Inputs, tmp_path: Path) -> None
         replace(inputs, checkpoints=(path, copy)).cells()
 
 
+def test_values_of_a_database_are_json(run: Run, sweep: Path) -> None:
+    sql = "SELECT sum(steps) AS total, DATE '2026-01-31' AS day, [1, 2] AS list FROM results"
+    code, out, _ = run("experiments --json - --sql", sql, sweep)
+    (row,) = json.loads(out)["rows"]
+    assert code == 0
+    assert row["total"] == sum(Experiments([sweep]).query("SELECT steps FROM results")["steps"].to_pylist())
+    assert (row["day"], row["list"]) == ("2026-01-31", [1, 2])
+    code, _, error = run("experiments --sql", "SELECT 1 AS a, 2 AS a", sweep)
+    assert code == 2
+    assert "several columns are named a" in error
+
+
 def test_low_coverage_is_the_worst(sweep: Path) -> None:
     coverage = Experiments([sweep]).overview(sort="coverage95")["coverage95"].to_pylist()
     assert coverage == sorted(coverage)

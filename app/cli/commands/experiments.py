@@ -1,5 +1,3 @@
-import json
-from decimal import Decimal
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
@@ -38,13 +36,8 @@ def experiments(
         write_rows(rows, output)
     shown = rows.slice(0, top)
     more = f"\n{len(rows) - top} more rows: --top {len(rows)}" if len(rows) > top else ""
-    document = {"rows": json.loads(json.dumps(shown.to_pylist(), default=_json)), "count": len(rows)}
+    document = {"rows": shown.to_pylist(), "count": len(rows)}
     if sql is not None:
         return console.Result(document, console.arrow("Results", shown) + more, output)
     text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(DOCUMENTS))
     return console.Result(document, text + more, output)
-
-
-def _json(value: object) -> object:
-    """A value of a database for JSON: decimals are numbers, and dates, times and others texts."""
-    return float(value) if isinstance(value, Decimal) else str(value)

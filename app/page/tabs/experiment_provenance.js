@@ -1,6 +1,7 @@
 /** The provenance of the checkpoints of a sweep, such as their training settings, as columns. */
 
 /** @import { ExperimentRow } from '../types/server.js' */
+/** @import { SeedGroup } from './experiment_groups.js' */
 
 /** @typedef {string | number | boolean | null} Entry */
 
@@ -10,10 +11,12 @@ const MOST_COLUMNS = 100;
 const parsed = new WeakMap();
 
 /**
- * Entries of a row by name: `model.width` of `{"model": {"width": 64}}`. Lists are JSON text.
- * @param {ExperimentRow} row
+ * Entries of a row, or of the first member of a group, by name: `model.width` of `{"model": {"width": 64}}`. Lists are
+ * JSON text.
+ * @param {ExperimentRow | SeedGroup} displayed
  */
-export function provenanceOf(row) {
+export function provenanceOf(displayed) {
+  const row = 'members' in displayed ? displayed.members[0] : displayed;
   const entries = parsed.get(row) ?? named(row, flattened(JSON.parse(row.provenance || '{}')));
   parsed.set(row, entries);
   return entries;

@@ -47,8 +47,8 @@ export const NUMBER_KEYS = /** @type {NumberKey[]} */ (Object.keys(NUMBERS));
  * @param {string} column
  */
 export function valueOf(row, column) {
-  const values = /** @type {Record<string, string | number | null>} */ ({ ...row });
-  const value = column in values ? values[column] : provenanceOf(row)[column];
+  const value =
+    column in row ? row[/** @type {keyof ExperimentRow} */ (column)] : provenanceOf(row)[column];
   return typeof value === 'boolean' ? String(value) : (value ?? null);
 }
 

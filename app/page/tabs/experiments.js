@@ -76,6 +76,8 @@ export class Experiments {
   #sweeps = null;
   /** Rows of the sweep and steps in `#loaded`. @type {ExperimentRow[]} */
   #rows = [];
+  /** Names of the columns with numbers. @type {string[]} */
+  #numbers = [];
   /** Columns of the table. @type {Column[]} */
   #columns = [];
   /** Matching rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
@@ -186,6 +188,8 @@ export class Experiments {
       const { rows, count } = await api.experiments(sweep.name, this.#steps);
       if (wanted !== `${this.#sweep?.name} ${this.#steps}`) return; // another choice was made meanwhile
       [this.#rows, this.#count, this.#loaded] = [rows, count, wanted];
+      const entries = differingEntries(rows).filter((name) => isNumeric(rows, name));
+      this.#numbers = [...NUMBER_KEYS, ...entries];
       setPanelState(this.#host, 'ready');
       this.#fillPickers(sweep);
       this.#draw();
@@ -271,12 +275,6 @@ export class Experiments {
       .map((row) => this.#tableRow(row, filters));
     this.#body.append(...lines);
     if (lines.length) this.#stick();
-  }
-
-  /** Names of the columns with numbers. @returns {string[]} */
-  get #numbers() {
-    const entries = differingEntries(this.#rows).filter((name) => isNumeric(this.#rows, name));
-    return [...NUMBER_KEYS, ...entries];
   }
 
   #drawChart() {
