@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fastapi import APIRouter
 from fastapi.responses import Response
@@ -18,10 +18,9 @@ from beliefscope.app.api.models.experiments import (
 from beliefscope.app.api.models.training import FilterName
 from beliefscope.app.api.studies import catalog_names
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.runs.catalog import short_names
+from beliefscope.app.runs.sweep_filters import load_sweep_filter, sweep_folders
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.diagnostics.views import as_json
 
 if TYPE_CHECKING:
@@ -34,18 +33,10 @@ LARGEST = 2000
 def routes(store: TraceStore) -> APIRouter:
     router = APIRouter()
 
-    def sweeps() -> dict[str, Any]:
-        """Folders by name: those given to the server, and those in the workspace."""
-        given = store.settings.sweeps
-        paths = {folder.resolve() for folder in given.values()}
-        found = sorted(store.settings.workspace.glob("*/results.parquet"))
-        others = [path.parent for path in found if path.parent.resolve() not in paths]
-        return {**given, **short_names(others, given)}
-
     def tables(name: str) -> Tables:
         from beliefscope.recordings.sweep_table import Experiments as Tables  # pyarrow and DuckDB are slow to import
 
-        folder = sweeps().get(name)
+        folder = sweep_folders(store.settings).get(name)
         if folder is None:
             raise NotFound(f"Sweep {name!r} does not exist.")
         return Tables([folder])
@@ -53,7 +44,7 @@ def routes(store: TraceStore) -> APIRouter:
     @router.get("/api/experiments")
     def list_sweeps() -> SweepList:
         entries, problems = [], []
-        for name in sweeps():
+        for name in sweep_folders(store.settings):
             try:
                 entries.append(_info(name, tables(name)))
             except BadInput as error:
@@ -91,16 +82,11 @@ def routes(store: TraceStore) -> APIRouter:
 
     @router.post("/api/experiments/{sweep}/{checkpoint}")
     def open_checkpoint(sweep: str, checkpoint: str) -> FilterName:
-        path = tables(sweep).path("checkpoints", "checkpoint", checkpoint)
-        loaded = load_checkpoint(path, store.settings.definitions)
-        if loaded.hash != checkpoint:
-            raise BadInput(f"{str(path)!r} was changed after the sweep")
-        name = catalog_names(store).get((loaded.task.name, checkpoint))
-        if name is None:
-            names = store.filters(loaded.task.name)
-            name = path.stem if path.stem not in names else f"{path.stem}-{checkpoint[:8]}"
+        name, loaded, path = load_sweep_filter(tables(sweep), checkpoint, store.settings)
+        listed = catalog_names(store).get((loaded.task.name, checkpoint))
+        if listed is None:
             store.add_filter(loaded.task.name, name, loaded, path, first=False)
-        return FilterName(filter=name)
+        return FilterName(filter=listed or name)
 
     return router
 

@@ -19,6 +19,7 @@ from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.sweep_filters import find_sweep_filter
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.workspace.healthy_records import HealthyRecords
@@ -69,10 +70,18 @@ class TraceStore:
         with self._lock:
             return self._catalogs[1]
 
-    def catalog(self) -> dict[str, Any]:
-        """``tasks`` that can be displayed, the ``problems``, and ``examples``."""
+    def catalog(self, task: str = "", filter_: str = "") -> dict[str, Any]:
+        """``tasks`` that can be displayed, the ``problems``, and ``examples``.
+
+        task, filter_: a filter to include if a sweep has it.
+        """
         with self._lock:
             catalogs, problems = self._catalogs
+            if task in catalogs and filter_:
+                try:
+                    self._add_sweep_filter(task, filter_)
+                except BadInput as error:
+                    problems = [*problems, str(error)]
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
             return {"tasks": tasks, "problems": problems, "examples": list(map(asdict, self._examples()))}
 
@@ -186,18 +195,18 @@ class TraceStore:
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
         """With the healthy record of the workspace, if it was measured. Raises BadInput for an unknown name."""
         with self._lock:
-            return self.healthy_records.complete(self._catalog(task).filter(filter_))
+            return self.healthy_records.complete(self._filter(task, filter_))
 
     def measured_record(self, task: str, filter_: str) -> str | None:
         """Which data the healthy record of the workspace is from; None if there is none. Raises as ``checkpoint``."""
         with self._lock:
-            record = self.healthy_records.get(self._catalog(task).filter(filter_).hash)
+            record = self.healthy_records.get(self._filter(task, filter_).hash)
             return None if record is None else str(record.get("data"))
 
     def record_version(self, task: str, filter_: str) -> int | None:
         """Version of the healthy record of the workspace; None if there is none. Raises as ``checkpoint``."""
         with self._lock:
-            return self.healthy_records.version(self._catalog(task).filter(filter_).hash)
+            return self.healthy_records.version(self._filter(task, filter_).hash)
 
     def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
         """Name and data set; the task's first for an empty name. Raises BadInput for an unknown name."""
@@ -236,6 +245,15 @@ class TraceStore:
         if task not in catalogs:
             raise unknown_name("task", task, catalogs)
         return catalogs[task]
+
+    def _filter(self, task: str, name: str) -> Checkpoint:
+        self._add_sweep_filter(task, name)
+        return self._catalog(task).filter(name)
+
+    def _add_sweep_filter(self, task: str, name: str) -> None:
+        """Add the filter to the catalog if only a sweep has it. Raises BadInput if its file is missing or changed."""
+        if name not in self._catalog(task).filters and (item := find_sweep_filter(task, name, self.settings)):
+            self.add_filter(task, name, *item, first=False)
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
         """The recorded live run, if the selection is exactly that run."""

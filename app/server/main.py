@@ -50,7 +50,7 @@ from beliefscope.app.server.security import Guard
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.timeouts import MAX_HEAD, UNREAD_TIMEOUT, HTTPProtocol, WebSocketProtocol
 from beliefscope.app.server.vendor_files import UPLOT_FILES, viewer_wasm
-from beliefscope.app.views.memory import freeze_heap, limit_malloc_arenas
+from beliefscope.app.views.memory import freeze_heap, limit_malloc_arenas, unfreeze_heap
 from beliefscope.app.views.registry import Views
 from beliefscope.app.workspace.partial_files import delete_abandoned_parts
 from beliefscope.app.workspace.recordings import RecordingFolder
@@ -97,6 +97,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         # A thread in C++ code at interpreter exit aborts the process.
         if warm:
             await asyncio.to_thread(warming.join)
+            unfreeze_heap()
 
     app = FastAPI(
         title="Beliefscope",

@@ -17,7 +17,7 @@ start().catch((error) => messages.show('start', showError(error)));
 
 async function start() {
   const [catalog, live] = await Promise.all([
-    api.catalog(),
+    loadCatalog(),
     api.liveRuns().catch(() => ({ runs: [], tasks: [] })),
   ]);
   addLiveRuns(catalog, live);
@@ -38,6 +38,16 @@ async function start() {
     });
   messages.show('link', problems.join('\n'));
   new Page(catalog, new Store(state), live, messages);
+}
+
+/** Loads the catalog, with the link's checkpoint of a sweep, which a new server does not list. */
+async function loadCatalog() {
+  const catalog = await api.catalog();
+  const query = new URLSearchParams(location.search);
+  const [task, filter] = [query.get('task'), query.get('filter')];
+  const filters = catalog.tasks.find(({ name }) => name === task)?.filters;
+  if (!task || !filter || !/-[0-9a-f]{8}$/.test(filter)) return catalog;
+  return filters?.some(({ name }) => name === filter) ? catalog : api.catalog({ task, filter });
 }
 
 /**

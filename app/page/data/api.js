@@ -113,8 +113,13 @@ function path(parts, query) {
   return query ? `/api/${text}?${new URLSearchParams(query)}` : `/api/${text}`;
 }
 
-/** @returns {Promise<Catalog>} */
-export const catalog = () => get('/api/catalog');
+/**
+ * Gets the catalog.
+ * @param {Record<string, string>} [included] `task` and `filter` of a checkpoint that only a sweep has
+ * @returns {Promise<Catalog>}
+ */
+export const catalog = (included) =>
+  get(included ? `/api/catalog?${new URLSearchParams(included)}` : '/api/catalog');
 
 /**
  * @param {string} task

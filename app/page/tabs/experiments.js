@@ -443,12 +443,9 @@ export class Experiments {
     const isOpened = seed === this.#openedSeed;
     const link = create(isOpened ? 'a' : 'span', { textContent });
     if (link instanceof HTMLAnchorElement) {
-      // The address of a checkpoint that is not in the catalog yet would open another one in a new tab.
-      link.href = row.catalog_name
-        ? permalink({ ...this.#store.state, ...patch(row.catalog_name) })
-        : '#';
+      link.href = permalink({ ...this.#store.state, ...patch(filterName(row)) });
       link.addEventListener('click', (event) => {
-        if (row.catalog_name && (event.ctrlKey || event.metaKey || event.shiftKey)) return;
+        if (event.ctrlKey || event.metaKey || event.shiftKey) return;
         event.preventDefault();
         this.#openRow((_, filter) => patch(filter));
       });
@@ -493,7 +490,9 @@ export class Experiments {
       return;
     }
     try {
-      const { filter } = await api.addSweepFilter(sweep.name, row.checkpoint);
+      const filter = this.#catalog.read_only
+        ? filterName(row)
+        : (await api.addSweepFilter(sweep.name, row.checkpoint)).filter;
       // Loads the catalog again.
       location.assign(`/${permalink({ ...this.#store.state, ...patch(row, filter) })}`);
     } catch (error) {
@@ -501,6 +500,13 @@ export class Experiments {
     }
   }
 }
+
+/**
+ * Name of a row's filter in the catalog; one that is not listed yet is added when the page opens with this name.
+ * @param {ExperimentRow} row
+ */
+const filterName = ({ catalog_name, name, checkpoint }) =>
+  catalog_name ?? `${name}-${checkpoint.slice(0, 8)}`;
 
 /** @param {string} address */
 function externalLink(address) {

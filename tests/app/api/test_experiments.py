@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -70,15 +71,55 @@ def test_checkpoints_are_added_to_the_catalog_once(
     with open_client(replace(settings, sweeps={"mine": sweep}, data={}, checkpoints={})) as client:
         mine = load_checkpoint(sweep / "mine.safetensors").hash
         assert client.post(f"/api/experiments/mine/{info_hash('image-ekf')}").json() == {"filter": "image-ekf"}
+        name = f"mine-{mine[:8]}"
         for _ in range(2):
-            assert client.post(f"/api/experiments/mine/{mine}").json() == {"filter": "mine"}
+            assert client.post(f"/api/experiments/mine/{mine}").json() == {"filter": name}
         (door,) = (task for task in client.get("/api/catalog").json()["tasks"] if task["name"] == "door")
-        assert [f["name"] for f in door["filters"]].count("mine") == 1
+        assert [f["name"] for f in door["filters"]].count(name) == 1
         rows = client.get("/api/experiments/mine").json()["rows"]
-        assert {row["catalog_name"] for row in rows} == {"mine", "image-ekf"}
+        assert {row["catalog_name"] for row in rows} == {name, "image-ekf"}
         assert {row["data_name"] for row in rows} == {None}, "the episodes are not served"
         assert client.post(f"/api/experiments/mine/{'0' * 64}").status_code == 400
         assert client.get("/api/experiments/none").status_code == 404
+
+
+def test_names_of_checkpoints_are_valid_in_another_server(
+    settings: Settings, sweep: Path, open_client: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(sweep, copy)
+    file = sweep / "mine.safetensors"
+    content = file.read_bytes()
+    name = f"mine-{load_checkpoint(file).hash[:8]}"
+    new_server = replace(settings, sweeps={"mine": copy}, data={}, checkpoints={})
+
+    def catalog(client: TestClient) -> tuple[list[str], list[str]]:
+        """Names of the filters, and problems."""
+        reply = client.get("/api/catalog", params={"task": "door", "filter": name}).json()
+        (door,) = (task for task in reply["tasks"] if task["name"] == "door")
+        return [filter_["name"] for filter_ in door["filters"]], reply["problems"]
+
+    with open_client(new_server) as client:
+        assert client.get(f"/api/trace/door/{name}/0").status_code in (200, 202)
+    with open_client(new_server) as client:
+        filters, problems = catalog(client)
+        assert filters[1:].count(name) == 1, "listed after the default"
+        assert problems == []
+        assert client.get("/api/trace/door/mine-00000000/0").status_code == 400
+    try:
+        save_checkpoint(load_checkpoint(shipped("door", "image-ekf")).filter, "image-ekf", {}, file)
+        with open_client(new_server) as client:
+            filters, (problem,) = catalog(client)
+            assert name not in filters
+            assert "mine.safetensors' was changed after the sweep" in problem
+            assert problem in client.get(f"/api/trace/door/{name}/0").json()["error"]
+        file.unlink()
+        with open_client(new_server) as client:
+            (problem,) = catalog(client)[1]
+            assert problem.startswith(f"filter '{name}' of sweep 'mine': checkpoint")
+            assert problem.endswith("mine.safetensors' does not exist")
+    finally:
+        file.write_bytes(content)
 
 
 def test_sweeps_of_the_workspace(settings: Settings, sweep: Path, open_client: Callable[..., TestClient]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,8 @@ from starlette.testclient import TestClient
 
 from beliefscope import __version__
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server import main
+from beliefscope.app.views.memory import freeze_heap
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.trace import load_trace
 
@@ -211,3 +214,20 @@ def test_first_trace_is_computed_at_startup(settings: Settings, open_client: Ope
         while not list((settings.workspace / "traces").glob("door-crossmodal-ekf-episode1-*.trace")):
             assert time.monotonic() < deadline
             time.sleep(0.05)
+
+
+def test_stopped_server_leaves_no_frozen_objects(
+    settings: Settings, open_client: OpenClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At exit, DuckDB reports objects that are never freed as leaks."""
+    frozen: list[int] = []
+
+    def warm(*_: object) -> None:
+        freeze_heap()
+        frozen.append(gc.get_freeze_count())
+
+    monkeypatch.setattr(main, "_warm", warm)
+    with open_client(settings, warm=True):
+        pass
+    assert frozen[0] > 0
+    assert gc.get_freeze_count() == 0

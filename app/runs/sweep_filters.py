@@ -1,0 +1,68 @@
+"""Checkpoints of sweeps as filters. Their names identify them in any server with the sweep, also after a restart."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from beliefscope.app.runs.catalog import short_names
+from beliefscope.app.runs.settings import Settings
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
+
+if TYPE_CHECKING:
+    from beliefscope.recordings.sweep_table import Experiments
+
+HASH_DIGITS = 8
+"""Digits of the checkpoint's hash at the end of a name."""
+
+NAME = re.compile(rf"(.+)-([0-9a-f]{{{HASH_DIGITS}}})", re.DOTALL)
+
+
+def sweep_folders(settings: Settings) -> dict[str, Path]:
+    """Folders of sweeps by name: those given to the server, and those in the workspace."""
+    given = settings.sweeps
+    paths = {folder.resolve() for folder in given.values()}
+    tables = sorted(settings.workspace.glob("*/results.parquet"))
+    others = [path.parent for path in tables if path.parent.resolve() not in paths]
+    return {**given, **short_names(others, given)}
+
+
+def load_sweep_filter(sweep: Experiments, checkpoint: str, settings: Settings) -> tuple[str, Checkpoint, Path]:
+    """Name, filter and file of the checkpoint with this hash.
+
+    Raises BadInput for an unknown hash, and for a file that is missing or was changed.
+    """
+    path = sweep.path("checkpoints", "checkpoint", checkpoint)
+    loaded = load_checkpoint(path, settings.definitions)
+    if loaded.hash != checkpoint:
+        raise BadInput(f"checkpoint {str(path)!r} was changed after the sweep, from {checkpoint[:12]}")
+    return f"{path.stem}-{checkpoint[:HASH_DIGITS]}", loaded, path
+
+
+def find_sweep_filter(task: str, name: str, settings: Settings) -> tuple[Checkpoint, Path] | None:
+    """Filter and file of a name from ``load_sweep_filter``; None if no sweep of the server has it.
+
+    Raises BadInput if the file is missing or was changed.
+    """
+    match = NAME.fullmatch(name)
+    folders = sweep_folders(settings) if match else {}
+    if match is None or not folders:
+        return None
+    from beliefscope.recordings.sweep_table import Experiments  # pyarrow and DuckDB are slow to import
+
+    problem: BadInput | None = None
+    for sweep, folder in folders.items():
+        with suppress(BadInput):  # damaged tables; the list of sweeps reports them
+            tables = Experiments([folder])
+            query = "SELECT checkpoint FROM checkpoints WHERE task = ? AND name = ? AND starts_with(checkpoint, ?)"
+            for row in tables.query(query, [task, *match.groups()]).to_pylist():
+                try:
+                    return load_sweep_filter(tables, row["checkpoint"], settings)[1:]
+                except BadInput as error:
+                    problem = problem or BadInput(f"filter {name!r} of sweep {sweep!r}: {error}")
+    if problem is not None:
+        raise problem
+    return None
