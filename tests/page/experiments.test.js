@@ -7,16 +7,25 @@ import {
   faultLevel,
   seedGroups,
 } from '../../app/page/tabs/experiment_groups.js';
-import { columnsOf } from '../../app/page/tabs/experiment_columns.js';
-import { differingEntries, provenanceOf } from '../../app/page/tabs/experiment_provenance.js';
+import { columnsOf, entryColumns } from '../../app/page/tabs/experiment_columns.js';
+import { worstOfSeed } from '../../app/page/tabs/experiment_episodes.js';
+import { matching } from '../../app/page/tabs/experiment_filter.js';
+import { groupEntries, namesText } from '../../app/page/tabs/experiment_group_menu.js';
+import {
+  differingEntries,
+  isNumeric,
+  provenanceOf,
+  settingEntries,
+} from '../../app/page/tabs/experiment_provenance.js';
 import {
   comparedWith,
-  matching,
   NUMBER_KEYS,
+  numberOf,
   parseSort,
   rowKey,
   sortText,
-  unknownConditions,
+  sortValue,
+  unknownChoice,
 } from '../../app/page/tabs/experiment_rows.js';
 import { niceStep, scale } from '../../app/page/tabs/scatter.js';
 
@@ -44,7 +53,7 @@ const ROW = {
 };
 const ROWS = [ROW, { ...ROW, name: 'run-2', faults: '', nees: null, error: 0.7 }];
 /** @param {string} text */
-const names = (text) => matching(ROWS, text).map(({ name }) => name);
+const names = (text) => matching(ROWS, text).rows.map(({ name }) => name);
 
 test('words match in any text, conditions match numbers, and more of them never match more', () => {
   assert.deepEqual(names(''), ['run-1', 'run-2']);
@@ -57,12 +66,93 @@ test('words match in any text, conditions match numbers, and more of them never 
   for (const key of NUMBER_KEYS) assert.equal(names(`${key}<-1e9`).length, 0);
 });
 
-test('conditions on columns that do not exist are reported', () => {
+/** Checkpoints with provenance of several forms, as JSON that is stored with escapes. */
+const RECORDED = [
+  { seed: 0, lr: '1e-3', operator: 'S\u00f8ren', 'model.weird key': 'a b', debug: true, note: 'x' },
+  { seed: 1, lr: 3e-4, operator: 'Mu\u0308ller', 'model.weird key': 'c', debug: false },
+  { seed: 10, lr: 'auto', operator: 'M\u00fcller', RMSE: 'own' },
+].map((provenance, i) => ({
+  ...ROW,
+  name: `run-${i}`,
+  error: 3 + i,
+  checkpoint: String(i).repeat(64),
+  provenance: JSON.stringify(provenance).replace(
+    /[^\x20-\x7e]/g,
+    (letter) => `\\u${letter.charCodeAt(0).toString(16).padStart(4, '0')}`,
+  ),
+}));
+/** Indices of the matching rows. @param {string} text */
+const places = (text) => {
+  const { rows, problem } = matching(RECORDED, text);
+  assert.equal(problem, '', text);
+  return rows.map(({ name }) => Number(name.at(-1))).join('');
+};
+
+test('conditions have spaces, single equals signs, titles, units, quotes and numbers as text', () => {
+  for (const text of ['seed=1', 'seed == 1', 'SEED = 1.0', 'lr=3e-4', 'lr < 5E-4', '"seed"="1"'])
+    assert.equal(places(text), '1', text);
+  for (const text of ['"RMSE, cm">4', 'error ≥4.5']) assert.equal(places(text), '2', text);
+  assert.equal(places('NEES>2 Nees/N<3 "95 % coverage" <= 90%'), '012');
+  assert.equal(places('coverage95<90%'), '');
+  assert.equal(places('lr>0'), '01', 'numbers stored as text are numbers, other texts none');
+  assert.equal(places('lr=auto'), '2');
+  assert.equal(places('lr!=0.001'), '12');
+  assert.equal(places('debug=TRUE'), '0');
+  assert.equal(places('note!=y'), '0', 'a missing value meets no condition');
+  assert.equal(places('"model.weird key"="A b"'), '0');
+  assert.equal(places('operator=m\u00fcller'), '12', 'in any Unicode form');
+  assert.equal(places('M\u00dcLLER seed>1'), '2');
+  assert.equal(places('"a b" s\u00f8'), '0');
+  assert.equal(places('checkpoint=run-2'), '2');
+  assert.equal(places('faults = blackout=0.4'), '012');
+  assert.equal(places('blackout=0.4'), '012', 'a fault is a word');
+  assert.equal(places('RMSE=own'), '2', 'an entry precedes a title');
+});
+
+test('what is wrong with a condition is reported, and no row matches', () => {
+  const problem = (/** @type {string} */ text) => {
+    const result = matching(RECORDED, text);
+    assert.equal(result.rows.length, 0);
+    return result.problem;
+  };
   assert.match(
-    unknownConditions('ekf neez>2 nees>2 (  momentum<=1', [...NUMBER_KEYS, 'lr']),
-    /^No column with numbers for neez>2, momentum<=1\. .*nees.* lr\.$/,
+    problem('run neez > 2 nees>1'),
+    /^“neez > 2”: there is no column neez\. Columns: error, nees, .* and \d+ more\. Quote names with spaces\.$/,
   );
-  assert.equal(unknownConditions('ekf nees>2 lr<1e-3 nees> (', [...NUMBER_KEYS, 'lr']), '');
+  assert.equal(problem('nees>two'), '“nees>two”: two is not a number; compare texts with = or !=.');
+  assert.equal(problem('nees >'), '“nees >”: the value after > is missing.');
+  assert.match(problem('>2'), /^“>2”: the column before > is missing/);
+  assert.equal(problem('run "a b'), '“"a b”: the closing quotation mark is missing.');
+  assert.match(problem('blackout=0.7'), /there is no column blackout/);
+  assert.match(problem('a>1 b<2'), /“a>1”.*“b<2”/);
+});
+
+test('columns with numbers as text are sorted and drawn as numbers', () => {
+  const rows = [{ n: '1e1' }, { n: 9 }, {}].map((provenance, i) => ({
+    ...ROW,
+    checkpoint: String(i).repeat(64),
+    provenance: JSON.stringify(provenance),
+  }));
+  assert.ok(isNumeric(rows, 'n'));
+  assert.ok(!isNumeric(RECORDED, 'lr'));
+  assert.deepEqual(
+    rows.map((row) => numberOf(row, 'n')),
+    [10, 9, null],
+  );
+  assert.deepEqual(
+    RECORDED.map((row) => sortValue(row, 'lr', false)),
+    ['1e-3', '0.0003', 'auto'],
+  );
+});
+
+test('a choice that does not exist is named with the available ones', () => {
+  assert.equal(unknownChoice('Sweep', 'b', ['', 'a', 'b'], 'a'), '');
+  assert.equal(
+    unknownChoice('Sweep', 'c', ['', 'a', 'b'], 'a is displayed'),
+    'Sweep “c” does not exist here: a is displayed. Available: a, b.',
+  );
+  const many = Array.from({ length: 40 }, (_, i) => `p${i}`);
+  assert.match(unknownChoice('Quantity', 'c', many, 'e'), /p11 and 28 more\.$/);
 });
 
 const TRAINED = [
@@ -77,14 +167,15 @@ const TRAINED = [
 
 test('entries of the provenance that differ are columns, which conditions compare', () => {
   assert.deepEqual(differingEntries(TRAINED), ['lr', 'model.width', 'run', 'debug']);
-  const columns = columnsOf(TRAINED, false, []);
+  const columns = columnsOf(TRAINED, false, differingEntries(TRAINED), []);
   const texts = (/** @type {string} */ key) =>
     TRAINED.map((row) => columns.find((column) => column.key === key)?.content(row));
   assert.deepEqual(texts('model.width'), ['32', '64']);
   assert.deepEqual(texts('debug'), ['true', '–']);
   const number = (/** @type {string} */ key) => columns.find((c) => c.key === key)?.number;
   assert.deepEqual(['lr', 'run', 'debug'].map(number), [true, false, false]);
-  const matched = (/** @type {string} */ text) => matching(TRAINED, text).map(({ name }) => name);
+  const matched = (/** @type {string} */ text) =>
+    matching(TRAINED, text).rows.map(({ name }) => name);
   assert.deepEqual(matched('lr<5e-3'), ['run-0']);
   assert.deepEqual(matched('model.width>=32 tracker/2'), ['run-1']);
 });
@@ -92,13 +183,13 @@ test('entries of the provenance that differ are columns, which conditions compar
 test('an entry named like a column does not replace its values', () => {
   const rows = TRAINED.map((row, i) => ({ ...row, provenance: JSON.stringify({ error: i + 7 }) }));
   assert.deepEqual(differingEntries(rows), ['provenance.error']);
-  assert.equal(matching(rows, 'provenance.error>7').length, 1);
-  assert.equal(matching(rows, 'error<7').length, 2);
+  assert.equal(matching(rows, 'provenance.error>7').rows.length, 1);
+  assert.equal(matching(rows, 'error<7').rows.length, 2);
 });
 
 test('entries of a group are those of its members', () => {
   const rows = rowsOf({ provenance: '{"spread": 2}' }, { provenance: '{"spread": 2}' });
-  const [group] = seedGroups(rows);
+  const [group] = seedGroups(rows, ['spread']);
   assert.equal(group.members.length, 2);
   assert.deepEqual(provenanceOf(group), provenanceOf(rows[0]));
 });
@@ -114,7 +205,7 @@ test('the level of a fault is not its first step', () => {
 
 test('pinned columns are the first, in the order of pinning, and no column is lost', () => {
   const keys = (/** @type {string[]} */ ...pinned) =>
-    columnsOf(TRAINED, false, pinned).map(({ key }) => key);
+    columnsOf(TRAINED, false, differingEntries(TRAINED), pinned).map(({ key }) => key);
   assert.deepEqual(keys('lr', 'nees').slice(0, 4), ['name', 'lr', 'nees', 'error']);
   assert.deepEqual(keys('missing'), keys());
   assert.deepEqual(keys('lr', 'nees').sort(), keys().sort());
@@ -182,7 +273,7 @@ test('checkpoints that differ by their seed are one group with mean and standard
     { error: 9, provenance: '{"lr": 2}' },
     { error: 5, provenance: '{"lr": 1}', faults: '' },
   );
-  const groups = seedGroups(rows);
+  const groups = seedGroups(rows, settingEntries(rows));
   assert.deepEqual(
     groups.map(({ name, members, error }) => [name, members.length, error]),
     [
@@ -193,9 +284,13 @@ test('checkpoints that differ by their seed are one group with mean and standard
   );
   assert.ok(Math.abs(Number(groups[0].spread.error) - Math.SQRT2) < 1e-12, 'sample deviation');
   assert.deepEqual([groups[0].nees, groups[1].spread], [null, {}]);
-  assert.equal(seedGroups([...rows].reverse()).length, 3);
+  assert.equal(seedGroups([...rows].reverse(), ['lr']).length, 3);
   assert.equal(new Set(groups.map(cellOf)).size, 3);
-  assert.equal(cellOf(seedGroups([rows[1], rows[0]])[0]), cellOf(groups[0]), 'whatever the order');
+  assert.equal(
+    cellOf(seedGroups([rows[1], rows[0]], ['lr'])[0]),
+    cellOf(groups[0]),
+    'whatever the order',
+  );
 });
 
 test('a fine-tuned checkpoint is no seed of its base', () => {
@@ -207,7 +302,7 @@ test('a fine-tuned checkpoint is no seed of its base', () => {
     { training: tuned(0) },
     { training: tuned(1) },
   );
-  const groups = seedGroups(rows).map(({ name, members }) => [name, members.length]);
+  const groups = seedGroups(rows, []).map(({ name, members }) => [name, members.length]);
   assert.deepEqual(groups, [
     ['crossmodal-ekf', 1],
     ['crossmodal-ekf, fine-tuned', 2],
@@ -227,4 +322,84 @@ test('faults of one kind have levels, and no fault has level 0', () => {
   assert.deepEqual(faultKinds(rows), ['blackout', 'force_bias:x']);
   const levels = rows.map((row) => faultLevel(row, 'blackout'));
   assert.deepEqual(levels, [0, 0.4, 0.8, null, null, null]);
+});
+
+/** @param {Record<string, unknown>[]} entries provenance of checkpoints */
+const recorded = (...entries) =>
+  rowsOf(...entries.map((provenance) => ({ provenance: JSON.stringify(provenance) })));
+
+test('seeds, addresses, dates, and texts and ids of every checkpoint do not distinguish groups', () => {
+  const rows = recorded(
+    ...[0, 1, 2, 3].map((i) => ({
+      dir: `/runs/${i}`,
+      date: `2026-11-2${i % 2}T10:00`,
+      random_seed: i,
+      trainSeed: i,
+      seed: { value: i },
+      run_id: 100 + i,
+      url: `https://tracker/${i % 2}`,
+      env_id: i < 2 ? 'door' : 'push',
+      lr: ['1e-3', 3e-4][i % 2],
+      dropout: 0.1 * i,
+      width: 64,
+      seeding: i < 2 ? 'grid' : 'random',
+    })),
+    {},
+  );
+  assert.deepEqual(settingEntries(rows), ['env_id', 'lr', 'dropout', 'seeding']);
+  assert.deepEqual(groupEntries(rows, ''), settingEntries(rows));
+  assert.deepEqual(groupEntries(rows, namesText(['lr', 'run_id', 'gone'])), ['run_id', 'lr']);
+  assert.deepEqual(groupEntries(rows, ','), []);
+  const twice = [...rows, ...rows.map((row) => ({ ...row, faults: '' }))];
+  assert.deepEqual(settingEntries(twice), settingEntries(rows), 'each checkpoint counts once');
+});
+
+test('a checkpoint without provenance does not make columns of equal entries', () => {
+  assert.deepEqual(differingEntries(recorded({ a: 1, b: 1 }, {}, { a: 1, b: 2 })), ['b']);
+  assert.deepEqual(differingEntries(recorded({ a: 1 }, {})), []);
+});
+
+test('at most 100 entries are columns, the pinned ones among them, and conditions use all', () => {
+  const keys = Array.from({ length: 130 }, (_, i) => `p${i}`);
+  const rows = recorded(...[1, 2].map((value) => Object.fromEntries(keys.map((k) => [k, value]))));
+  const { entries, count } = entryColumns(rows, ['p120']);
+  assert.deepEqual(
+    [entries.length, count, entries.at(-1), entries.at(-2)],
+    [100, 130, 'p120', 'p98'],
+  );
+  assert.equal(matching(rows, 'p129>1').rows.length, 1);
+});
+
+test('groups are named by the fewest settings that distinguish them', () => {
+  const rows = recorded(
+    ...[
+      [32, 1, 'a'],
+      [32, 2, 'a'],
+      [64, 1, 'b'],
+      [64, 2, 'b'],
+      [64, 3, 'b'],
+    ].map(([width, lr, twin]) => ({ aaa: twin, width, lr })),
+  );
+  const labels = seedGroups(rows, settingEntries(rows)).map(({ name }) => name);
+  assert.deepEqual(labels.slice(0, 2), [
+    'crossmodal-ekf, lr 1, aaa a',
+    'crossmodal-ekf, lr 2, aaa a',
+  ]);
+  assert.equal(new Set(labels).size, 5);
+  assert.deepEqual(
+    seedGroups(rows, ['width']).map(({ name, members }) => [name, members.length]),
+    [
+      ['crossmodal-ekf, width 32', 2],
+      ['crossmodal-ekf, width 64', 3],
+    ],
+  );
+});
+
+test('the worst episode of a seed is found, and whether another seed has a worse one', () => {
+  const episode = (/** @type {number} */ seed, /** @type {number} */ worst) =>
+    /** @type {any} */ ({ seed, worst });
+  const episodes = [episode(0, 1), episode(1, 5), episode(0, 4)];
+  assert.deepEqual(worstOfSeed(episodes, 0), { result: episodes[2], isExceeded: true });
+  assert.deepEqual(worstOfSeed(episodes, 1), { result: episodes[1], isExceeded: false });
+  assert.equal(worstOfSeed(episodes, 2).result, undefined);
 });

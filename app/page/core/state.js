@@ -61,6 +61,7 @@ import { displayName } from './units.js';
  * @property {string} x quantity of the x axis of the results. @property {string} y of the y axis
  * @property {string} cell selected result
  * @property {string} rows of the results: each of the `checkpoints`, or their mean over `seeds`
+ * @property {string} groups entries of the provenance that distinguish the groups, comma-separated; empty for the default
  * @property {string} pin step whose maps are the reference of the displayed ones, URL-encoded; empty for none
  * @property {boolean} playing
  * @property {number} speed
@@ -119,6 +120,7 @@ const TEXTS = {
   match: '',
   sort: '-error',
   pinned: '',
+  groups: '',
   x: 'error',
   y: 'nees',
   cell: '',
@@ -346,7 +348,7 @@ class LinkReader {
     if (text === null) return fallback;
     const value = options.includes(text) ? text : OLD_VALUES[text];
     if (options.includes(value)) return value;
-    this.#report(key, text, `Available: ${options.join(', ')}.`);
+    this.#report(key, text, `Available: ${[...new Set(options)].join(', ')}.`);
     return fallback;
   }
 

@@ -4,13 +4,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { displayName } from '../core/units.js';
-import {
-  differingEntries,
-  entryText,
-  isAddress,
-  isNumeric,
-  isSeed,
-} from './experiment_provenance.js';
+import { differingEntries, entryText, isNumeric } from './experiment_provenance.js';
 import { NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @type {Column} */
@@ -23,27 +17,40 @@ const SEEDS = {
 };
 /** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow | SeedGroup) => string}} Column */
 
+const MOST_ENTRIES = 100;
+
 /**
- * Columns of the table, the pinned ones first; texts and provenance that are equal in all rows are left out.
+ * Entries of the provenance that are columns: of those that differ, the pinned ones and the first others.
+ * @param {ExperimentRow[]} rows
+ * @param {string[]} pinned keys of columns
+ */
+export function entryColumns(rows, pinned) {
+  const entries = differingEntries(rows);
+  const isPinned = (/** @type {string} */ name) => pinned.includes(name);
+  const first = [...entries.filter(isPinned), ...entries.filter((name) => !isPinned(name))];
+  const listed = new Set(first.slice(0, MOST_ENTRIES));
+  return { entries: entries.filter((name) => listed.has(name)), count: entries.length };
+}
+
+/**
+ * Columns of the table, the pinned ones first; texts that are equal in all rows are left out.
  * @param {ExperimentRow[]} rows
  * @param {boolean} areGroups whether each displayed row is a mean over checkpoints
+ * @param {string[]} entries of the provenance
  * @param {string[]} pinned keys of the columns beside the first one
  * @returns {Column[]}
  */
-export function columnsOf(rows, areGroups, pinned) {
+export function columnsOf(rows, areGroups, entries, pinned) {
   const units = [...new Set(rows.map(({ unit }) => unit))];
   const texts = /** @type {const} */ (['filter', 'task', 'faults']).filter(
     (key) => new Set(rows.map((row) => row[key])).size > 1 && !(areGroups && key === 'filter'),
-  );
-  const entries = differingEntries(rows).filter(
-    (name) => !areGroups || !(isSeed(name) || isAddress(valueOf(rows[0], name))),
   );
   /** @type {Column[]} */
   const [first, ...others] = [
     {
       key: 'name',
       title: areGroups ? 'filter' : 'checkpoint',
-      help: areGroups ? 'Checkpoints that differ by their seed' : 'Name of the file',
+      help: areGroups ? 'Filter, and the settings that distinguish its groups' : 'Name of the file',
       number: false,
       content: ({ name }) => name,
     },

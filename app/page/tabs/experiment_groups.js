@@ -3,7 +3,7 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { NumberKey } from './experiment_rows.js' */
 
-import { entryText, isAddress, isSeed, provenanceOf } from './experiment_provenance.js';
+import { entryText, numberIn, provenanceOf } from './experiment_provenance.js';
 import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
 
 /**
@@ -15,16 +15,16 @@ import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
 const SPREAD_KEYS = ['error', 'nees', 'coverage95', 'worst'];
 
 /**
- * Joins the checkpoints that differ by their seed only: same filter, training and provenance apart from
- * seeds and addresses of runs.
+ * Joins the checkpoints with equal filter, training and values of the named entries of the provenance.
  * Numbers are means over the checkpoints, and `spread` their sample standard deviations.
  * @param {ExperimentRow[]} rows
+ * @param {string[]} entries
  * @returns {SeedGroup[]}
  */
-export function seedGroups(rows) {
+export function seedGroups(rows, entries) {
   /** @type {Map<string, ExperimentRow[]>} */
   const groups = new Map();
-  const settings = new Map(rows.map((row) => [row, settingsOf(row)]));
+  const settings = new Map(rows.map((row) => [row, settingsOf(row, entries)]));
   for (const [row, text] of settings) {
     const key = JSON.stringify([text, row.task, row.data, row.faults]);
     if (!groups.get(key)?.push(row)) groups.set(key, [row]);
@@ -67,8 +67,8 @@ export const faultKinds = (rows) =>
  */
 export function faultLevel({ faults }, kind) {
   if (!faults) return 0;
-  const found = levelOf(faults);
-  return found?.kind === kind ? found.level : null;
+  const fault = levelOf(faults);
+  return fault?.kind === kind ? fault.level : null;
 }
 
 /** Splits a single fault at its last number, apart from its first and last step. @param {string} faults */
@@ -81,14 +81,15 @@ function levelOf(faults) {
 /**
  * Filter, and the settings of its training without the seed, as text.
  * @param {ExperimentRow} row
+ * @param {string[]} entries of the provenance that are settings
  */
-function settingsOf(row) {
+function settingsOf(row, entries) {
   const { finetuned, plan, ...trained } = entriesOf(row.training);
   const { seed: _, ...tuning } = finetuned ?? {};
-  // In the order of the names of groups, which mention the first differences.
+  const provenance = provenanceOf(row);
   const settings = [
-    ...Object.entries(provenanceOf(row)).filter(isSetting).sort(),
-    ...(finetuned ? [['fine-tuning', tuning]] : []),
+    ...entries.map((name) => [name, numberIn(provenance[name]) ?? provenance[name] ?? null]),
+    ...(finetuned ? [[FINE_TUNING, tuning]] : []),
     ...Object.entries(trained).sort(),
     ...Object.entries(plan ?? {}).sort(),
   ];
@@ -99,53 +100,60 @@ function settingsOf(row) {
   ]);
 }
 
-/** Whether an entry of the provenance is neither a seed nor the address of a run. @param {[string, unknown]} entry */
-const isSetting = ([name, value]) => !isSeed(name) && !isAddress(value);
-
 /** @param {string} text JSON of an object @returns {Record<string, any>} */
 const entriesOf = (text) => JSON.parse(text || '{}');
 
 /**
- * Names of the groups by their settings: the filter, and the values in which groups of the same filter differ.
+ * Names of the groups by their settings: the filter, and the fewest settings, up to MOST_LABELS, that distinguish the
+ * groups of the filter.
  * @param {string[]} texts of the settings
  */
 function namesOf(texts) {
-  const all = new Map(
-    [...new Set(texts)].map((text) => [
-      text,
-      /** @type {[string, [string, unknown][]]} */ (JSON.parse(text)),
-    ]),
-  );
-  /** Values by filter and key. @type {Map<string, Set<string>>} */
-  const values = new Map();
-  /** Number of settings by filter, and by filter and key. @type {Map<string, number>} */
-  const counts = new Map();
-  const count = (/** @type {string} */ name) => counts.set(name, (counts.get(name) ?? 0) + 1);
-  for (const [filter, settings] of all.values()) {
-    count(filter);
-    for (const [key, value] of settings) {
-      const place = `${filter} ${key}`;
-      count(place);
-      values.set(place, (values.get(place) ?? new Set()).add(JSON.stringify(value)));
+  /** Settings of each filter. @type {Map<string, Map<string, Map<string, unknown>>>} */
+  const filters = new Map();
+  for (const text of new Set(texts)) {
+    const [filter, settings] = /** @type {[string, [string, unknown][]]} */ (JSON.parse(text));
+    filters.set(filter, (filters.get(filter) ?? new Map()).set(text, new Map(settings)));
+  }
+  /** @type {Map<string, string>} */
+  const names = new Map();
+  for (const [filter, groups] of filters) {
+    const keys = distinguishing([...groups.values()]);
+    for (const [text, settings] of groups) {
+      const labels = keys.filter((key) => settings.has(key));
+      names.set(text, [filter, ...labels.map((key) => labelOf(key, settings.get(key)))].join(', '));
     }
   }
-  const differs = (/** @type {string} */ filter, /** @type {string} */ key) =>
-    Number(values.get(`${filter} ${key}`)?.size) > 1 ||
-    counts.get(`${filter} ${key}`) !== counts.get(filter);
-  return new Map(
-    [...all].map(([text, [filter, settings]]) => {
-      const labels = settings.filter(([key]) => differs(filter, key)).map(labelOf);
-      return [text, [filter, ...labels.slice(0, MOST_LABELS)].join(', ')];
-    }),
-  );
+  return names;
 }
 
 const MOST_LABELS = 3;
 const LONGEST_VALUE = 24; // characters of a setting in the name of a group
+const FINE_TUNING = 'fine-tuning';
 
-/** @param {[string, unknown]} setting */
-function labelOf([key, value]) {
-  if (key === 'fine-tuning') return 'fine-tuned';
+/**
+ * Keys of settings, each of which divides the groups into as many parts as possible.
+ * @param {Map<string, unknown>[]} groups
+ */
+function distinguishing(groups) {
+  const all = [...new Set(groups.flatMap((settings) => [...settings.keys()]))];
+  /** @type {string[]} */
+  const keys = [];
+  const parts = (/** @type {string[]} */ names) =>
+    new Set(groups.map((settings) => JSON.stringify(names.map((name) => settings.get(name))))).size;
+  while (keys.length < MOST_LABELS && parts(keys) < groups.length) {
+    const counts = all.map((key) => parts([...keys, key]));
+    keys.push(all[counts.indexOf(Math.max(...counts))]);
+  }
+  return keys;
+}
+
+/**
+ * @param {string} key
+ * @param {unknown} value
+ */
+function labelOf(key, value) {
+  if (key === FINE_TUNING) return 'fine-tuned';
   const text = typeof value === 'object' ? JSON.stringify(value) : entryText(value);
   return `${key} ${key === 'data' ? text.slice(0, 8) : text.slice(0, LONGEST_VALUE)}`;
 }

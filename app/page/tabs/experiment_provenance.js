@@ -5,7 +5,8 @@
 
 /** @typedef {string | number | boolean | null} Entry */
 
-const MOST_COLUMNS = 100;
+const NUMBER = /^[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?$/i;
+const DATE = /^\d{4}-\d{2}-\d{2}(?:[T _]|$)/;
 
 /** @type {WeakMap<ExperimentRow, Record<string, Entry>>} */
 const parsed = new WeakMap();
@@ -23,29 +24,83 @@ export function provenanceOf(displayed) {
 }
 
 /**
- * Names of the entries that differ between rows, in the order of the rows.
+ * Values of each entry by checkpoint, in the order of the rows. Checkpoints without provenance are left out.
  * @param {ExperimentRow[]} rows
  */
-export function differingEntries(rows) {
-  /** @type {Map<string, Set<Entry>>} */
-  const values = new Map();
-  for (const row of rows)
-    for (const name of Object.keys(provenanceOf(row)))
-      values.set(name, values.get(name) ?? new Set());
-  for (const row of rows)
-    for (const [name, set] of values) set.add(provenanceOf(row)[name] ?? null);
-  return [...values.keys()]
-    .filter((name) => Number(values.get(name)?.size) > 1)
-    .slice(0, MOST_COLUMNS);
+function entryValues(rows) {
+  const checkpoints = new Map(rows.map((row) => [row.checkpoint, provenanceOf(row)]));
+  const all = [...checkpoints.values()].filter((entries) => Object.keys(entries).length);
+  return new Map(
+    [...new Set(all.flatMap(Object.keys))].map((name) => [
+      name,
+      all.map((entries) => entries[name] ?? null),
+    ]),
+  );
 }
 
 /**
- * Whether all values of an entry are numbers or missing.
+ * Names of all entries, in the order of the rows.
+ * @param {ExperimentRow[]} rows
+ */
+export const entryNames = (rows) => [
+  ...new Set(rows.flatMap((row) => Object.keys(provenanceOf(row)))),
+];
+
+/**
+ * Names of the entries that differ between the checkpoints with provenance.
+ * @param {ExperimentRow[]} rows
+ */
+export const differingEntries = (rows) =>
+  [...entryValues(rows)].filter(([, values]) => new Set(values).size > 1).map(([name]) => name);
+
+/**
+ * Names of the entries that distinguish settings of the training rather than its runs. All differing ones but seeds,
+ * addresses, dates, and texts and numeric ids that differ for every checkpoint.
+ * @param {ExperimentRow[]} rows
+ */
+export function settingEntries(rows) {
+  return [...entryValues(rows)]
+    .filter(([name, values]) => {
+      const known = values.filter((value) => value !== null);
+      if (new Set(values).size < 2 || hasWord(name, 'seed')) return false;
+      if (known.every(isAddress) || known.every((value) => DATE.test(String(value)))) return false;
+      // A number that always differs can be a setting that was drawn at random, such as a learning rate.
+      const isRun = hasWord(name, 'id') || known.some((value) => numberIn(value) === null);
+      return !isRun || new Set(known).size < known.length || known.length < 2;
+    })
+    .map(([name]) => name);
+}
+
+/**
+ * Whether a name has a word: `random_seed`, `trainSeed` and `data.seed` have the word seed.
+ * @param {string} name
+ * @param {string} word
+ */
+const hasWord = (name, word) =>
+  name
+    .replace(/([a-z])([A-Z])/g, '$1 $2')
+    .toLowerCase()
+    .split(/[^a-z]+/)
+    .includes(word);
+
+/**
+ * Whether an entry has numbers, also stored as text, and no other values.
  * @param {ExperimentRow[]} rows
  * @param {string} name
  */
-export const isNumeric = (rows, name) =>
-  rows.every((row) => typeof (provenanceOf(row)[name] ?? 0) === 'number');
+export function isNumeric(rows, name) {
+  const known = rows.map((row) => provenanceOf(row)[name] ?? null).filter((v) => v !== null);
+  return known.length > 0 && known.every((value) => numberIn(value) !== null);
+}
+
+/**
+ * The finite number that a value is or that its text states; otherwise null.
+ * @param {unknown} value
+ */
+export function numberIn(value) {
+  const number = typeof value === 'string' && NUMBER.test(value) ? Number(value) : value;
+  return typeof number === 'number' && Number.isFinite(number) ? number : null;
+}
 
 /**
  * Formats an entry, a number with up to five significant digits.
@@ -55,9 +110,6 @@ export function entryText(value) {
   if (typeof value === 'number') return String(Number(value.toPrecision(5))).replaceAll('-', '−');
   return String(value ?? '–');
 }
-
-/** Whether an entry is a random seed: `seed`, or `data.seed` of nested entries. @param {string} name */
-export const isSeed = (name) => name.split('.').at(-1) === 'seed';
 
 /** Whether a value is the address of a page, such as that of a run. @param {unknown} value */
 export const isAddress = (value) => typeof value === 'string' && /^https?:\/\//.test(value);

@@ -1,10 +1,10 @@
-/** Rows of the Experiments tab: quantities, filtering by words and conditions, and the order as text. */
+/** Rows of the Experiments tab: quantities, values of their columns, and the order as text. */
 
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
 import { fixed, percent } from '../core/units.js';
-import { provenanceOf } from './experiment_provenance.js';
+import { numberIn, provenanceOf } from './experiment_provenance.js';
 
 /** @typedef {'error' | 'nees' | 'coverage95' | 'worst' | 'episodes' | 'steps'} NumberKey */
 /** @typedef {{title: string, help: string, hasUnit: boolean, format: (value: number | null) => string}} NumberColumn */
@@ -42,7 +42,7 @@ export const NUMBERS = {
 export const NUMBER_KEYS = /** @type {NumberKey[]} */ (Object.keys(NUMBERS));
 
 /**
- * Value of a column, by which rows are sorted: of the row itself or of its provenance.
+ * Value of a column: of the row itself or of its provenance.
  * @param {ExperimentRow} row
  * @param {string} column
  */
@@ -57,9 +57,18 @@ export function valueOf(row, column) {
  * @param {ExperimentRow} row
  * @param {string} column
  */
-export function numberOf(row, column) {
+export const numberOf = (row, column) => numberIn(valueOf(row, column));
+
+/**
+ * Value by which rows are sorted.
+ * @param {ExperimentRow} row
+ * @param {string} column
+ * @param {boolean} hasNumbers whether the column has numbers only
+ */
+export function sortValue(row, column, hasNumbers) {
   const value = valueOf(row, column);
-  return typeof value === 'number' ? value : null;
+  if (hasNumbers) return numberIn(value);
+  return value === null ? null : String(value);
 }
 
 /**
@@ -68,31 +77,6 @@ export function numberOf(row, column) {
  */
 export const rowKey = ({ checkpoint, data, faults }) =>
   `${checkpoint.slice(0, 12)}.${data.slice(0, 12)}.${faults}`;
-
-/** @type {Record<string, (value: number, limit: number) => boolean>} */
-const COMPARISONS = {
-  '>': (value, limit) => value > limit,
-  '<': (value, limit) => value < limit,
-  '>=': (value, limit) => value >= limit,
-  '<=': (value, limit) => value <= limit,
-};
-
-const CONDITION = /^([^<>=]+)(>=|<=|>|<)(-?[\d.]+(?:e-?\d+)?)$/i;
-
-/**
- * Reports the conditions, such as `neez>2`, whose column does not exist; empty without any.
- * @param {string} text
- * @param {string[]} columns names of the columns with numbers
- */
-export function unknownConditions(text, columns) {
-  const unknown = text.split(/\s+/).filter((word) => {
-    const [, key] = word.match(CONDITION) ?? [];
-    return key !== undefined && !columns.includes(key);
-  });
-  return unknown.length
-    ? `No column with numbers for ${unknown.join(', ')}. Columns: ${columns.join(', ')}.`
-    : '';
-}
 
 /**
  * The comparison of the displayed run with a row: by filter or, if both have the same one, by sensor faults.
@@ -105,27 +89,20 @@ export const comparedWith = ({ faults }, filter, displayed) =>
     ? `faults=${encodeURIComponent(faults)}`
     : `filter=${encodeURIComponent(filter)}`;
 
+const LISTED = 12; // names in a message
+
 /**
- * Returns the rows that contain all words, in any text or the provenance, and meet all conditions such as `nees>2`.
- * @param {ExperimentRow[]} rows
- * @param {string} text
+ * Reports a choice that does not exist; empty for an available one.
+ * @param {string} kind such as Sweep
+ * @param {string} name
+ * @param {string[]} available
+ * @param {string} effect what the page displays instead
  */
-export function matching(rows, text) {
-  const tests = text
-    .split(/\s+/)
-    .filter(Boolean)
-    .map((word) => {
-      const [, key, sign, limit] = word.match(CONDITION) ?? [];
-      if (rows.some((row) => numberOf(row, key) !== null))
-        return (/** @type {ExperimentRow} */ row) => {
-          const value = numberOf(row, key);
-          return value !== null && COMPARISONS[sign](value, Number(limit));
-        };
-      const part = word.toLowerCase();
-      return (/** @type {ExperimentRow} */ { name, filter, task, faults, provenance }) =>
-        [name, filter, task, faults, provenance].some((t) => t.toLowerCase().includes(part));
-    });
-  return rows.filter((row) => tests.every((test) => test(row)));
+export function unknownChoice(kind, name, available, effect) {
+  if (available.includes(name)) return '';
+  const names = available.filter(Boolean);
+  const more = names.length > LISTED ? ` and ${names.length - LISTED} more` : '';
+  return `${kind} “${name}” does not exist here: ${effect}. Available: ${names.slice(0, LISTED).join(', ')}${more}.`;
 }
 
 /**

@@ -1,32 +1,32 @@
 /** The Experiments tab: checkpoints of a sweep as a sortable, filterable table and a scatter plot, and their episodes. */
 
 /** @import { State, Store } from '../core/state.js' */
-/** @import { Catalog, EpisodeResult, ExperimentRow, SweepInfo } from '../types/server.js' */
+/** @import { Catalog, ExperimentRow, SweepInfo } from '../types/server.js' */
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { create, element, html, messageOf } from '../core/dom.js';
-import { permalink } from '../core/state.js';
-import { fixed, sentence, significant, stepLabel } from '../core/units.js';
+import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
+import { columnsOf, entryColumns } from './experiment_columns.js';
+import { EpisodePanel } from './experiment_episodes.js';
+import { matching } from './experiment_filter.js';
+import { GroupMenu, groupEntries, namesIn, namesText } from './experiment_group_menu.js';
+import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
+import { isAddress, isNumeric } from './experiment_provenance.js';
 import {
-  matching,
   NUMBER_KEYS,
   NUMBERS,
   parseSort,
   rowKey,
   sortText,
-  valueOf,
-  unknownConditions,
-  comparedWith,
+  sortValue,
+  unknownChoice,
 } from './experiment_rows.js';
-import { columnsOf } from './experiment_columns.js';
-import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
-import { differingEntries, isAddress, isNumeric } from './experiment_provenance.js';
 import { coloured, drawScatter, levelName, markPoint } from './scatter.js';
 
 const EMPTY = {
@@ -43,14 +43,14 @@ const EMPTY = {
   ],
 };
 const ROWS_AT_ONCE = 200; // drawn before the table is scrolled
-const EPISODES = 50; // listed for a checkpoint, the worst first
 
 const BODY = `
   <div class="top">
     <label class="picker">Sweep <select class="sweep" aria-label="Sweep"></select></label>
-    <label class="picker" title="Mean over seeds: of the checkpoints whose training and provenance differ by seeds and addresses of runs only, with their standard deviation">Rows <select class="rows" aria-label="Rows"><option value="checkpoints">each checkpoint</option><option value="seeds">mean over seeds</option></select></label>
+    <label class="picker" title="Mean over seeds: of the checkpoints with equal filter, training and grouping entries of the provenance, with their standard deviation">Rows <select class="rows" aria-label="Rows"><option value="checkpoints">each checkpoint</option><option value="seeds">mean over seeds</option></select></label>
+    <button type="button" class="group-by text" popovertarget="experiment-groups" aria-haspopup="dialog" title="Entries of the provenance that distinguish groups of checkpoints" hidden></button>
     <label class="picker">Steps <select class="steps" aria-label="Steps"></select></label>
-    <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees>2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions such as nees&gt;2"></label>
+    <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees > 2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions with &gt; &lt; &gt;= &lt;= = or !=, such as nees &gt; 2 or seed = 1. Quote names and texts with spaces: &quot;95 % coverage&quot; &lt; 90%"></label>
     <a class="csv" download>CSV</a>
   </div>
   <p class="problems" role="alert"></p>
@@ -63,13 +63,19 @@ const BODY = `
   <div class="scroll" tabindex="-1"><table class="checkpoints"><thead></thead><tbody></tbody></table></div>
   <section class="episodes" aria-label="Episodes of the selected checkpoint" hidden>
     <div class="bar"><h4></h4><button type="button" class="compare">Compare with it</button><button type="button" class="diagnose">Diagnose</button></div>
+    <p class="seeds"></p>
     <ol></ol>
   </section>
-  <p class="note"></p>`;
+  <p class="note"></p>
+  <div id="experiment-groups" class="group-menu" popover role="dialog" aria-label="Entries that distinguish groups">
+    <p>Checkpoints with equal values of the selected entries, filter and training are one group.</p>
+    <p class="none">No entry of the provenance differs.</p>
+    <ul></ul>
+    <button type="button" class="reset">Default</button>
+  </div>`;
 
 export class Experiments {
   #host;
-  #catalog;
   #store;
   #open = false;
   /** @type {SweepInfo[] | null} */
@@ -83,11 +89,11 @@ export class Experiments {
   /** Matching rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
   #matching = [];
   #count = 0;
+  /** Sweeps that cannot be read, one sentence each. @type {string[]} */
+  #problems = [];
   #loaded = '';
-  /** Episodes of the selected row. @type {EpisodeResult[]} */
-  #episodes = [];
-  /** Seed of the runs that the page opens. */
-  #openedSeed = 0;
+  #episodes;
+  #groupMenu;
   #body;
 
   /**
@@ -97,7 +103,6 @@ export class Experiments {
    */
   constructor(host, catalog, store) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#store = store;
     host.innerHTML = BODY;
     this.#body = element('.checkpoints tbody', HTMLTableSectionElement, host);
@@ -109,29 +114,19 @@ export class Experiments {
     });
     new ResizeObserver(() => this.#drawChart()).observe(html('.chart', host));
     this.#listenToPickers();
-    html('.compare', host).addEventListener('click', () =>
-      this.#openRow((row, filter) => ({
-        tab: 'compare',
-        // the sensor faults are compared if the filter is the same
-        against: comparedWith(row, filter, store.state.filter),
-      })),
+    this.#episodes = new EpisodePanel(html('.episodes', host), catalog, store, (problem) =>
+      this.#report(problem),
     );
-    html('.diagnose', host).addEventListener('click', () =>
-      this.#openRow((row, filter) => ({
-        ...this.#runOf(row, filter),
-        tab: 'diagnosis',
-        over: 'held-out',
-      })),
-    );
+    this.#groupMenu = new GroupMenu(host, (groups) => store.set({ groups }));
     store.listen((_, changed) => {
       if (!this.#open) return;
       if (['sweep', 'steps'].some((key) => changed.has(key))) {
         this.#load();
         return;
       }
-      if (['match', 'sort', 'x', 'y', 'rows', 'pinned'].some((key) => changed.has(key)))
+      if (['match', 'sort', 'x', 'y', 'rows', 'groups', 'pinned'].some((key) => changed.has(key)))
         this.#draw();
-      if (changed.has('cell') || changed.has('rows')) this.#showSelected();
+      if (['cell', 'rows', 'groups'].some((key) => changed.has(key))) this.#showSelected();
     });
   }
 
@@ -177,7 +172,8 @@ export class Experiments {
     try {
       const { sweeps, problems } = await api.sweeps();
       this.#sweeps = sweeps;
-      html('.problems', this.#host).textContent = problems.map(sentence).join(' ');
+      this.#problems = problems.map(sentence);
+      this.#report(this.#problems.join(' '));
       const sweep = this.#sweep;
       if (!sweep) {
         setPanelState(this.#host, 'empty');
@@ -188,8 +184,8 @@ export class Experiments {
       const { rows, count } = await api.experiments(sweep.name, this.#steps);
       if (wanted !== `${this.#sweep?.name} ${this.#steps}`) return; // another choice was made meanwhile
       [this.#rows, this.#count, this.#loaded] = [rows, count, wanted];
-      const entries = differingEntries(rows).filter((name) => isNumeric(rows, name));
-      this.#numbers = [...NUMBER_KEYS, ...entries];
+      const { entries } = entryColumns(rows, []);
+      this.#numbers = [...NUMBER_KEYS, ...entries.filter((name) => isNumeric(rows, name))];
       setPanelState(this.#host, 'ready');
       this.#fillPickers(sweep);
       this.#draw();
@@ -232,16 +228,26 @@ export class Experiments {
 
   #draw() {
     const { state } = this.#store;
+    const areGroups = state.rows === 'seeds';
+    const pinned = namesIn(state.pinned);
+    const grouping = groupEntries(this.#rows, state.groups);
+    const { entries, count } = entryColumns(this.#rows, pinned);
+    const columns = columnsOf(this.#rows, areGroups, areGroups ? grouping : entries, pinned);
     const sort = parseSort(state.sort);
     const matched = matching(this.#rows, state.match);
-    const groups = state.rows === 'seeds' ? seedGroups(matched) : matched;
-    const rows = sortRows(groups, (row) => valueOf(row, sort.name), sort.down);
+    const groups = areGroups ? seedGroups(matched.rows, grouping) : matched.rows;
+    const hasNumbers = this.#numbers.includes(sort.name);
+    const rows = sortRows(groups, (row) => sortValue(row, sort.name, hasNumbers), sort.down);
     const more = this.#count > this.#rows.length ? `, ${this.#rows.length} are listed` : '';
+    const cut =
+      entries.length < count
+        ? ` ${entries.length} of ${count} entries of the provenance are columns; Show and pinned columns use all.`
+        : '';
     html('.about', this.#host).textContent =
-      unknownConditions(state.match, this.#numbers) ||
-      `${matched.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
-    const pinned = pinnedColumns(state);
-    const columns = columnsOf(this.#rows, state.rows === 'seeds', pinned);
+      matched.problem ||
+      `${matched.rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.${areGroups ? '' : cut}`;
+    this.#report([...this.#problems, ...this.#unknownChoices(columns)].join(' '));
+    this.#groupMenu.show(this.#rows, state.groups, areGroups);
     const heads = columns.map(({ key, title, help, number }, i) => {
       const head = sortHeading(
         { name: key, title, help, number },
@@ -249,7 +255,8 @@ export class Experiments {
         (next) => this.#store.set({ sort: sortText(next) }),
         number,
       );
-      if (i > 0) head.append(this.#pinButton(key, title, pinned));
+      // beside the title, at the side away from the values' edge
+      if (i > 0) head[number ? 'prepend' : 'append'](this.#pinButton(key, title, pinned));
       return head;
     });
     element('.checkpoints thead', HTMLTableSectionElement, this.#host).replaceChildren(
@@ -275,6 +282,26 @@ export class Experiments {
       .map((row) => this.#tableRow(row, filters));
     this.#body.append(...lines);
     if (lines.length) this.#stick();
+  }
+
+  /**
+   * Reports choices of the address that this sweep does not have, and what is displayed instead.
+   * @param {Column[]} columns
+   */
+  #unknownChoices(columns) {
+    const { sweep, steps, x, y, sort } = this.#store.state;
+    const levels = faultKinds(this.#rows).map(levelName);
+    const sweeps = (this.#sweeps ?? []).map(({ name }) => name);
+    const phases = this.#sweep?.phases ?? [];
+    const keys = columns.map(({ key }) => key);
+    const sorted = parseSort(sort).name;
+    return [
+      unknownChoice('Sweep', sweep, ['', ...sweeps], `the first sweep is displayed`),
+      unknownChoice('Phase', steps, ['all', ...phases], 'all steps are displayed'),
+      unknownChoice('Quantity', x, [...this.#numbers, ...levels], 'the x axis is RMSE'),
+      unknownChoice('Quantity', y, this.#numbers, 'the y axis is RMSE'),
+      unknownChoice('Column', sorted, [...keys, ...this.#numbers], 'the rows are not sorted'),
+    ].filter(Boolean);
   }
 
   #drawChart() {
@@ -303,14 +330,14 @@ export class Experiments {
     button.addEventListener('click', () => {
       const others = pinned.filter((name) => name !== key);
       const names = isPinned ? others : [...others, key];
-      this.#store.set({ pinned: names.map(encodeURIComponent).join() });
+      this.#store.set({ pinned: namesText(names) });
     });
     return button;
   }
 
   /** Keeps the first column and those pinned at the left of the table when it scrolls. */
   #stick() {
-    const pinned = pinnedColumns(this.#store.state);
+    const pinned = namesIn(this.#store.state.pinned);
     const count = this.#columns.filter(({ key }) => pinned.includes(key)).length;
     const lines = [...element('.checkpoints', HTMLTableElement, this.#host).rows];
     const widths = [...lines[0].cells].slice(0, count).map((cell) => cell.offsetWidth);
@@ -355,11 +382,6 @@ export class Experiments {
     this.#store.set({ cell: cell === this.#store.state.cell ? '' : cell });
   }
 
-  /** @returns {ExperimentRow | undefined} */
-  get #selected() {
-    return this.#rows.find((row) => rowKey(row) === this.#store.state.cell);
-  }
-
   #mark() {
     const { cell } = this.#store.state;
     const missing = this.#matching.findIndex((row) => cellOf(row) === cell) + 1;
@@ -373,140 +395,19 @@ export class Experiments {
   }
 
   /** Lists the episodes of the selected checkpoint, or the checkpoints of the selected group. */
-  async #showSelected() {
+  #showSelected() {
     this.#mark();
     const { cell } = this.#store.state;
-    const group = this.#matching.find((row) => cellOf(row) === cell);
-    const row = this.#selected;
-    const [sweep, section] = [this.#sweep, html('.episodes', this.#host)];
-    const members = group && 'members' in group ? group.members : null;
-    section.hidden = !row && !members;
-    for (const button of ['.compare', '.diagnose']) html(button, section).hidden = Boolean(members);
-    if (group && members) this.#showMembers(group.name, members);
-    if (!row || !sweep) return;
-    try {
-      const { episodes, opened_seed: seed } = await api.experimentEpisodes(
-        sweep.name,
-        row,
-        this.#steps,
-      );
-      if (row !== this.#selected) return;
-      [this.#episodes, this.#openedSeed] = [episodes, seed];
-    } catch (error) {
-      html('.problems', this.#host).textContent = messageOf(error);
-      return;
-    }
-    const faults = row.faults && `, ${row.faults}`;
-    html('.episodes h4', this.#host).textContent =
-      `${row.name}${faults}: ${this.#episodes.length} results, the worst first`;
-    const items = this.#episodes
-      .slice(0, EPISODES)
-      .map((episode) => this.#episodeItem(row, episode));
-    html('.episodes ol', this.#host).replaceChildren(...items);
+    const group = this.#matching.find((row) => cellOf(row) === cell && 'members' in row);
+    const row = this.#rows.find((other) => rowKey(other) === cell);
+    this.#episodes.show(this.#sweep?.name ?? '', this.#steps, group ?? row);
   }
 
-  /**
-   * Lists the checkpoints of a group.
-   * @param {string} name
-   * @param {ExperimentRow[]} members
-   */
-  #showMembers(name, members) {
-    const faults = members[0].faults && `, ${members[0].faults}`;
-    html('.episodes h4', this.#host).textContent =
-      `${name}${faults}: mean of ${members.length} checkpoints, the worst first`;
-    const items = sortRows(members, ({ error }) => error, true).map((row) => {
-      const button = create('button', { type: 'button', className: 'text' }, row.name);
-      button.addEventListener('click', () =>
-        this.#store.set({ rows: 'checkpoints', cell: rowKey(row) }),
-      );
-      const values = `RMSE ${fixed(row.error, 2)} ${row.unit}, NEES ${significant(row.nees)}`;
-      return create('li', {}, button, create('span', { textContent: values }));
-    });
-    html('.episodes ol', this.#host).replaceChildren(...items);
-  }
-
-  /**
-   * @param {ExperimentRow} row
-   * @param {EpisodeResult} result
-   */
-  #episodeItem(
-    row,
-    { episode, seed, error, unit, worst, worst_step: step, worst_time: time, nees, policy },
-  ) {
-    const textContent = `Episode ${episode}, ${stepLabel(step, time)}`;
-    const patch = (/** @type {string} */ filter) => ({
-      ...this.#runOf(row, filter),
-      episode,
-      step,
-      tab: 'scene',
-    });
-    const isOpened = seed === this.#openedSeed;
-    const link = create(isOpened ? 'a' : 'span', { textContent });
-    if (link instanceof HTMLAnchorElement) {
-      link.href = permalink({ ...this.#store.state, ...patch(filterName(row)) });
-      link.addEventListener('click', (event) => {
-        if (event.ctrlKey || event.metaKey || event.shiftKey) return;
-        event.preventDefault();
-        this.#openRow((_, filter) => patch(filter));
-      });
-    } else link.title = `This server runs seed ${this.#openedSeed}: serve with --seed ${seed}`;
-    const values = [`RMSE ${fixed(error, 2)} ${unit}`, `worst ${fixed(worst, 2)} ${unit}`];
-    if (nees !== null) values.push(`NEES ${significant(nees)}`);
-    if (!isOpened) values.push(`seed ${seed}, not of this server`);
-    return create(
-      'li',
-      {},
-      link,
-      create('span', { textContent: [...values, policy].filter(Boolean).join(', ') }),
-    );
-  }
-
-  /**
-   * The displayed run of a row.
-   * @param {ExperimentRow} row
-   * @param {string} filter its name in the catalog
-   * @returns {Partial<State>}
-   */
-  #runOf({ task, faults, data_name: data, worst_episode: episode, worst_step: step }, filter) {
-    const names = this.#catalog.tasks.find(({ name }) => name === task);
-    const place = { episode: episode ?? 0, step: step ?? 0, against: '', playing: false };
-    return { task, filter, faults, data: data ?? names?.data[0]?.name ?? '', ...place };
-  }
-
-  /**
-   * Opens the selected checkpoint, which is added to the catalog if necessary.
-   * @param {(row: ExperimentRow, filter: string) => Partial<State>} patch
-   */
-  async #openRow(patch) {
-    const [row, sweep] = [this.#selected, this.#sweep];
-    if (!row || !sweep) return;
-    if (!row.data_name) {
-      html('.problems', this.#host).textContent =
-        `This server does not have the episodes of ${row.name} (data ${row.data.slice(0, 12)}): serve them with --data.`;
-      return;
-    }
-    if (row.catalog_name) {
-      this.#store.set(patch(row, row.catalog_name));
-      return;
-    }
-    try {
-      const filter = this.#catalog.read_only
-        ? filterName(row)
-        : (await api.addSweepFilter(sweep.name, row.checkpoint)).filter;
-      // Loads the catalog again.
-      location.assign(`/${permalink({ ...this.#store.state, ...patch(row, filter) })}`);
-    } catch (error) {
-      html('.problems', this.#host).textContent = messageOf(error);
-    }
+  /** @param {string} problem */
+  #report(problem) {
+    html('.problems', this.#host).textContent = problem;
   }
 }
-
-/**
- * Name of a row's filter in the catalog; one that is not listed yet is added when the page opens with this name.
- * @param {ExperimentRow} row
- */
-const filterName = ({ catalog_name, name, checkpoint }) =>
-  catalog_name ?? `${name}-${checkpoint.slice(0, 8)}`;
 
 /** @param {string} address */
 function externalLink(address) {
@@ -515,6 +416,3 @@ function externalLink(address) {
   link.addEventListener('click', (event) => event.stopPropagation()); // does not select the row
   return link;
 }
-
-/** Keys of the pinned columns, which may contain commas. @param {State} state */
-const pinnedColumns = ({ pinned }) => pinned.split(',').filter(Boolean).map(decodeURIComponent);
