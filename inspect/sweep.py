@@ -157,9 +157,15 @@ def describe_checkpoint(path: Path) -> Row:
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
         "kind": checkpoint.kind,
-        "training": json.dumps(record, sort_keys=True),
-        "provenance": json.dumps(provenance, sort_keys=True),
+        "training": _json_text(record),
+        "provenance": _json_text(provenance),
     }
+
+
+def _json_text(document: Mapping[str, Any]) -> str:
+    """JSON whose texts queries can search as they are: only lone surrogates, which UTF-8 lacks, are escaped."""
+    text = json.dumps(document, sort_keys=True, ensure_ascii=False)
+    return text.encode(errors="backslashreplace").decode()
 
 
 def describe_data(path: Path, checkpoint: Path) -> Row:

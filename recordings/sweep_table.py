@@ -271,6 +271,11 @@ class Experiments:
             name for (name,) in self._database.execute(f"SELECT DISTINCT phase FROM {RESULTS} ORDER BY 1").fetchall()
         ]
 
+    def provenance_keys(self) -> list[str]:
+        """Keys of the provenance of all checkpoints, in alphabetical order."""
+        keys = f"SELECT DISTINCT unnest(json_keys(provenance)) FROM {CHECKPOINTS} ORDER BY 1"
+        return [name for (name,) in self._database.execute(keys).fetchall()]
+
     def episodes(self, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> pa.Table:
         """The results of one checkpoint by episode and seed, largest error first."""
         return self.query(

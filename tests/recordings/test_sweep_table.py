@@ -20,7 +20,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
-from beliefscope.inspect.sweep import Inputs, summary
+from beliefscope.inspect.sweep import Inputs, describe_checkpoint, summary
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.sweep_table import RESULTS, Experiments, is_finished, run_sweep
 
@@ -144,6 +144,16 @@ def test_provenance_of_checkpoints(sweep: Path) -> None:
     ]
 
 
+def test_queries_find_any_text_of_the_provenance(tmp_path: Path) -> None:
+    provenance = {"operator": "Müller", "broken": "\ud800", "path": "C:\\runs"}
+    path = Path(shutil.copy(shipped("door", "image-ekf"), tmp_path / "a.safetensors"))
+    path.with_suffix(".json").write_text(json.dumps(provenance))
+    row = describe_checkpoint(path)
+    assert "Müller" in row["provenance"]
+    assert pa.array([row["provenance"]]).to_pylist() == [row["provenance"]], "valid UTF-8"
+    assert json.loads(row["provenance"]) == provenance
+
+
 @pytest.mark.parametrize(
     "sql",
     [
@@ -173,6 +183,11 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
     code, out, _ = run("experiments --top 1 -o", tmp_path / "all.csv", sweep)
     assert code == 0
     assert "3 more rows: --top 4" in out
+    assert "Not in this table: 2 entries of the provenance (lr, run)." in out
+    query = out.rpartition("--sql ")[2]
+    code, out, _ = run(f"experiments --sql {query.strip()} --json -", sweep)
+    assert code == 0
+    assert {row["value"] for row in json.loads(out)["rows"]} == {"0.001", None}
     assert len((tmp_path / "all.csv").read_text().splitlines()) == 5
     for line, message in {
         "--sql 'SELECT * FROM nowhere'": "nowhere",

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
@@ -40,4 +41,14 @@ def experiments(
     if sql is not None:
         return console.Result(document, console.arrow("Results", shown) + more, output)
     text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(DOCUMENTS))
-    return console.Result(document, text + more, output)
+    return console.Result(document, text + more + _provenance_note(tables.provenance_keys()), output)
+
+
+def _provenance_note(keys: Sequence[str], listed: int = 8) -> str:
+    """Line with the entries of the checkpoints' provenance, which the table does not have."""
+    if not keys:
+        return ""
+    names = ", ".join(keys[:listed]) + (f" and {len(keys) - listed} more" if len(keys) > listed else "")
+    key = keys[0].replace('"', '""').replace("'", "''")
+    example = f"SELECT name, provenance->>'{key}' AS value FROM checkpoints"
+    return f'\nNot in this table: {len(keys)} entries of the provenance ({names}). Query: --sql "{example}"'

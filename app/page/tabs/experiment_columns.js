@@ -20,7 +20,7 @@ const SEEDS = {
 const MOST_ENTRIES = 100;
 
 /**
- * Entries of the provenance that are columns: of those that differ, the pinned ones and the first others.
+ * Entries of the provenance that are columns, the pinned and the first others, and the number of differing entries.
  * @param {ExperimentRow[]} rows
  * @param {string[]} pinned keys of columns
  */

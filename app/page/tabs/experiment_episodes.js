@@ -118,7 +118,7 @@ export class EpisodePanel {
   #showMembers(name, members) {
     const faults = members[0].faults && `, ${members[0].faults}`;
     html('h4', this.#section).textContent =
-      `${name}${faults}: mean of ${members.length} checkpoints, the worst first`;
+      `${name}${faults}: ${members.length === 1 ? 'one checkpoint' : `mean of ${members.length} checkpoints, the worst first`}`;
     const items = sortRows(members, ({ error }) => error, true).map((row) => {
       const button = create('button', { type: 'button', className: 'text' }, row.name);
       button.addEventListener('click', () =>

@@ -86,6 +86,7 @@ export class GroupMenu {
         this.#focus(name);
       });
       const values = new Set(this.#rows.map((row) => valueOf(row, name)));
+      values.delete(null);
       const examples = [...values].slice(0, EXAMPLES).map(entryText).join(', ');
       const more = values.size > EXAMPLES ? `, … (${values.size})` : '';
       const example = create('span', { textContent: `${examples}${more}` });

@@ -132,7 +132,7 @@ const LONGEST_VALUE = 24; // characters of a setting in the name of a group
 const FINE_TUNING = 'fine-tuning';
 
 /**
- * Keys of settings, each of which divides the groups into as many parts as possible.
+ * Keys of settings that distinguish the groups; each divides them into as many parts as possible.
  * @param {Map<string, unknown>[]} groups
  */
 function distinguishing(groups) {

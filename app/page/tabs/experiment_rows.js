@@ -89,7 +89,7 @@ export const comparedWith = ({ faults }, filter, displayed) =>
     ? `faults=${encodeURIComponent(faults)}`
     : `filter=${encodeURIComponent(filter)}`;
 
-const LISTED = 12; // names in a message
+const LISTED = 8; // names in a message
 
 /**
  * Reports a choice that does not exist; empty for an available one.
@@ -100,7 +100,7 @@ const LISTED = 12; // names in a message
  */
 export function unknownChoice(kind, name, available, effect) {
   if (available.includes(name)) return '';
-  const names = available.filter(Boolean);
+  const names = [...new Set(available)].filter(Boolean);
   const more = names.length > LISTED ? ` and ${names.length - LISTED} more` : '';
   return `${kind} “${name}” does not exist here: ${effect}. Available: ${names.slice(0, LISTED).join(', ')}${more}.`;
 }

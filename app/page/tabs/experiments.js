@@ -216,8 +216,10 @@ export class Experiments {
     const picker = fill('.sweep', names, sweep.name);
     if (picker.parentElement) picker.parentElement.hidden = names.length < 2;
     fill('.steps', ['all', ...sweep.phases.filter((name) => name !== 'all')], this.#steps);
-    fill('.x', [...this.#numbers, ...kinds.map(levelName)], state.x);
-    fill('.y', this.#numbers, state.y);
+    const axis = (/** @type {'x' | 'y'} */ key, /** @type {string[]} */ quantities) =>
+      fill(`.${key}`, quantities, quantities.includes(state[key]) ? state[key] : 'error');
+    axis('x', [...this.#numbers, ...kinds.map(levelName)]);
+    axis('y', this.#numbers);
     element('.rows', HTMLSelectElement, this.#host).value = state.rows;
     element('.match', HTMLInputElement, this.#host).value = state.match;
     element('.csv', HTMLAnchorElement, this.#host).href = api.experimentsCsv(
@@ -243,7 +245,9 @@ export class Experiments {
       entries.length < count
         ? ` ${entries.length} of ${count} entries of the provenance are columns; Show and pinned columns use all.`
         : '';
-    html('.about', this.#host).textContent =
+    const about = html('.about', this.#host);
+    about.classList.toggle('wrong', matched.problem !== '');
+    about.textContent =
       matched.problem ||
       `${matched.rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.${areGroups ? '' : cut}`;
     this.#report([...this.#problems, ...this.#unknownChoices(columns)].join(' '));

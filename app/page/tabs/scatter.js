@@ -12,7 +12,7 @@ import { extent, padded } from '../widgets/plots.js';
 import { cellOf, faultLevel } from './experiment_groups.js';
 import { NUMBERS, numberOf } from './experiment_rows.js';
 
-const MARGIN = { left: scaled(44), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
+const MARGIN = { left: scaled(54), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
 const TICKS = 5;
 const LINEAR_RATIO = 100;
 const RADIUS = scaled(4);
