@@ -48,7 +48,7 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         return Health(status="ok", version=__version__, late=round(views.overdue(), 1))
 
     @router.get("/api/catalog", response_model=Catalog)
-    def catalog(request: Request, task: str = "", filter: str = "") -> dict[str, Any]:
+    def catalog(request: Request, task: str = "", filter: Annotated[tuple[str, ...], Query()] = ()) -> dict[str, Any]:
         server = {"version": __version__, "read_only": request.app.state.read_only, "faults": fault_catalog()}
         return {**server, **store.catalog(task, filter)}
 

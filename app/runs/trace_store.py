@@ -4,7 +4,7 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -70,18 +70,19 @@ class TraceStore:
         with self._lock:
             return self._catalogs[1]
 
-    def catalog(self, task: str = "", filter_: str = "") -> dict[str, Any]:
+    def catalog(self, task: str = "", filters: Sequence[str] = ()) -> dict[str, Any]:
         """``tasks`` that can be displayed, the ``problems``, and ``examples``.
 
-        task, filter_: a filter to include if a sweep has it.
+        task, filters: filters to include if a sweep has them.
         """
         with self._lock:
             catalogs, problems = self._catalogs
-            if task in catalogs and filter_:
+            problems = list(problems)
+            for name in filters if task in catalogs else ():
                 try:
-                    self._add_sweep_filter(task, filter_)
+                    self._add_sweep_filter(task, name)
                 except BadInput as error:
-                    problems = [*problems, str(error)]
+                    problems.append(str(error))
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
             return {"tasks": tasks, "problems": problems, "examples": list(map(asdict, self._examples()))}
 

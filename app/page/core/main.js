@@ -40,14 +40,16 @@ async function start() {
   new Page(catalog, new Store(state), live, messages);
 }
 
-/** Loads the catalog, with the link's checkpoint of a sweep, which a new server does not list. */
+/** Loads the catalog, with the link's checkpoints of sweeps, which a new server does not list. */
 async function loadCatalog() {
   const catalog = await api.catalog();
   const query = new URLSearchParams(location.search);
-  const [task, filter] = [query.get('task'), query.get('filter')];
-  const filters = catalog.tasks.find(({ name }) => name === task)?.filters;
-  if (!task || !filter || !/-[0-9a-f]{8}$/.test(filter)) return catalog;
-  return filters?.some(({ name }) => name === filter) ? catalog : api.catalog({ task, filter });
+  const task = catalog.tasks.find(({ name }) => name === query.get('task'));
+  const other = new URLSearchParams(query.get('against') ?? '').get('filter');
+  const unlisted = [query.get('filter') ?? '', other ?? ''].filter(
+    (text) => /-[0-9a-f]{8}$/.test(text) && !task?.filters.some(({ name }) => name === text),
+  );
+  return task && unlisted.length ? api.catalog(task.name, unlisted) : catalog;
 }
 
 /**

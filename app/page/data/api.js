@@ -115,11 +115,16 @@ function path(parts, query) {
 
 /**
  * Gets the catalog.
- * @param {Record<string, string>} [included] `task` and `filter` of a checkpoint that only a sweep has
+ * @param {string} [task]
+ * @param {string[]} [filters] of the task to include, although only a sweep has them
  * @returns {Promise<Catalog>}
  */
-export const catalog = (included) =>
-  get(included ? `/api/catalog?${new URLSearchParams(included)}` : '/api/catalog');
+export const catalog = (task, filters = []) =>
+  get(
+    task
+      ? `/api/catalog?${new URLSearchParams([['task', task], ...filters.map((name) => ['filter', name])])}`
+      : '/api/catalog',
+  );
 
 /**
  * @param {string} task
