@@ -82,6 +82,11 @@ test('unknown names are reported and replaced', () => {
   );
 });
 
+test('each tab is listed once for a link with an unknown one', () => {
+  const { problems } = parsePermalink('?tab=none', CATALOG);
+  assert.equal(problems[0].match(/scene/g)?.length, 1);
+});
+
 test('listeners are called once per frame with all changes', () => {
   const store = new Store(stateOf(''));
   /** @type {string[][]} */
