@@ -57,6 +57,12 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path:
         assert page.state["pinned"] == "width"
         assert panel.locator("tbody td a").first.get_attribute("href").startswith("https://tracker.example/")
         panel.locator("select.rows").select_option("seeds")
+        assert panel.locator(".group-by").text_content() == "Group by 1 of 2 entries…"  # without addresses
+        panel.locator(".group-by").click()
+        panel.get_by_role("checkbox", name="width").uncheck()
+        page.until("() => new URLSearchParams(location.search).get('groups') === ','")
+        page.page.keyboard.press("Escape")
+        assert "Sweep “none” does not exist here" in panel.locator(".problems").text_content()
         panel.locator("select.x").select_option("level:blackout")
         page.until("() => document.querySelectorAll('#experiments .curve').length === 2")  # one for each filter
         panel.locator("tbody button").first.click()
