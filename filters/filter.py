@@ -144,11 +144,11 @@ class Filter(nn.Module, ABC):
             raise BadInput(f"Modality {name!r} is not in this filter. Available: {', '.join(self.names)}.")
         return self.names.index(name)
 
-    def log_weights(self, batch: Batch) -> Tensor | None:
-        """(T, N, K, W) log beta, or None without a weight model."""
+    def log_weights(self, observations: Mapping[str, Tensor]) -> Tensor | None:
+        """(T, N, K, W) log beta from standardised observations, or None without a weight model."""
         if self.architecture.fusion not in WEIGHTED:
             return None
-        return self.get_submodule("weight_model")(self.observations(batch))
+        return self.get_submodule("weight_model")(observations)
 
     def observations(self, batch: Batch) -> dict[str, Tensor]:
         """Observations by modality, standardised, float32."""

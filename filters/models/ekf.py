@@ -108,7 +108,7 @@ class ExtendedKalmanFilter(Filter):
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(z, dim=2),
             noise=torch.stack(noise, dim=2),
-            log_weights=self.log_weights(batch),
+            log_weights=self.log_weights(observations),
         )
         return self.with_readings(evidence, batch)
 

@@ -13,8 +13,9 @@ from torch.nn import functional
 Pooling = Literal["flatten", "spatial-softmax", "mean"]
 Networks = Literal["default", "authors"]
 
-CELLS_CHUNK = 1 << 15
-"""Cells of feature maps convolved at once: enough to use all cores, few enough to stay in the CPU caches."""
+CELLS_CHUNK = 1 << 14
+"""Cells of feature maps convolved at once: enough to use all cores, few enough to stay in the CPU caches, and for the
+allocator to keep their memory: what it returns to the system is mapped page by page at the next layer."""
 
 ROW_CHUNK = 1024
 """Particles or map cells evaluated at once, so that their activations stay in the CPU caches."""
@@ -38,6 +39,12 @@ class Residual(nn.Module):
         y = self.second(functional.relu(self.first(x), inplace=True))
         return functional.relu(y.add_(x), inplace=True)
 
+    def in_place(self, x: Tensor) -> Tensor:
+        """The same without gradients, written over x."""
+        y = linear(self.first, x).relu_()
+        torch.addmm(x, y, self.second.weight.t(), out=x)
+        return x.add_(self.second.bias).relu_()
+
     def with_tangents(self, x: Tensor) -> Tensor:
         y = linear(self.second, relu_with_tangents(linear(self.first, x)))
         return relu_with_tangents(y + x)
@@ -58,12 +65,29 @@ class Stack(nn.Sequential):
 
     def forward(self, x: Tensor) -> Tensor:
         shape = x.shape[:-1]
+        if not torch.is_grad_enabled():
+            return self._without_gradients(x.reshape(-1, x.shape[-1])).view(*shape, -1)
         for layer in self:
             if not isinstance(layer, nn.ReLU):
                 # With more axes, a layer's output is a view: operations in place on it would copy its gradient.
                 x = x.reshape(-1, x.shape[-1])
             x = layer(x)
         return x.view(*shape, x.shape[-1])
+
+    def _without_gradients(self, x: Tensor) -> Tensor:
+        """Rows (B, d) in few buffers, which stay in the CPU caches, and without the cost of calling modules.
+
+        Their hooks are therefore called with gradients enabled only.
+        """
+        for layer in self:
+            if isinstance(layer, nn.ReLU):
+                x = x.relu_()
+            elif isinstance(layer, nn.Linear):
+                x = linear(layer, x)
+            else:
+                assert isinstance(layer, Residual)
+                x = layer.in_place(x)
+        return x
 
     def with_tangents(self, x: Tensor) -> Tensor:
         """``x + dx_i`` and, in the last row, x to ``f(x) + f'(x) dx_i`` and f(x): (n + 1, ..., d).

@@ -108,7 +108,7 @@ class MixtureParticleFilter(ParticleFilter):
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(parts, dim=2),
             noise=None,
-            log_weights=self.log_weights(batch),
+            log_weights=self.log_weights(observations),
         )
         return self.with_readings(evidence, batch)
 

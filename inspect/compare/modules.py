@@ -87,7 +87,7 @@ def module_changes(
 def module_outputs(filter_: Filter, batch: Batch) -> dict[str, list[Tensor]]:
     """Module -> flattened outputs by call, over one step (T = 1) from the true state of N trajectories."""
     generator = torch.Generator().manual_seed(0)
-    with _output_hooks(filter_) as outputs:
+    with torch.enable_grad(), _output_hooks(filter_) as outputs:  # without gradients, layers are not called as modules
         evidence, start = filter_.encode(batch), first_belief(filter_, batch)
         filter_.step(filter_.start(start, PARTICLES, generator), evidence[0], generator)
         if hasattr(filter_, "dynamics"):  # Kalman filters call its Jacobian, not the module

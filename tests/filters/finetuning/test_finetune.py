@@ -91,9 +91,12 @@ def test_cached_encoders_give_the_same_gradients(
     # One call for each trained encoder, none for frozen ones.
     assert len(calls) == encoders
     assert expected.keys() == cached.keys()
+    # Some gradients are zero but for rounding, such as that of a likelihood's constant.
+    rounding = 1e-6 * max(float(value.abs().max()) for value in expected.values())
     for key, value in expected.items():
         # Float32 sums in another order, through six steps of a filter: relative to the largest entry.
-        torch.testing.assert_close(cached[key], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
+        tolerance = max(1e-4 * float(value.abs().max()), rounding)
+        torch.testing.assert_close(cached[key], value, rtol=1e-3, atol=tolerance)
     assert len(expected) > 5
     assert not any(hasattr(m, "table") and (m.table is not None or m.images is not None) for m in filter_.modules())
 

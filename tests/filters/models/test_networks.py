@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import torch
+from torch import nn
 
 from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.networks import Residual, Stack
 from beliefscope.filters.models.resampling import effective_sample_size, multinomial, resample, soft, systematic
 
 
@@ -108,3 +110,16 @@ def test_effective_sample_size_of_uniform_and_one_hot_weights() -> None:
     one_hot[0, 7] = 0.0
     torch.testing.assert_close(effective_sample_size(uniform), torch.full((3,), 40.0))
     assert effective_sample_size(one_hot).item() == 1.0
+
+
+def test_stacks_have_equal_outputs_with_and_without_gradients() -> None:
+    """Without gradients, layers write over their inputs; the stack's own input must stay as it is."""
+    torch.manual_seed(0)
+    stack = Stack(nn.Linear(5, 16), nn.ReLU(inplace=True), Residual(16), Residual(16), nn.Linear(16, 2)).double()
+    inputs = torch.randn(3, 4, 5, dtype=torch.float64)
+    copy = inputs.clone()
+    expected = stack(inputs)
+    with torch.no_grad():
+        torch.testing.assert_close(stack(inputs), expected.detach(), rtol=1e-12, atol=1e-12)  # sums in another order
+    assert torch.equal(inputs, copy)
+    assert expected.shape == (3, 4, 2)
