@@ -5,12 +5,19 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from fastapi.responses import JSONResponse, Response
 
-from beliefscope.app.api.models.results import Comparison
+from beliefscope.app.api.models import ResultViews
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.compare.two_runs import compare_runs
+
+
+class Comparison(ResultViews):
+    """Comparison of two runs. edit: description of the intervention, or None."""
+
+    names: tuple[str, str]
+    edit: str | None
 
 
 def routes(store: TraceStore) -> APIRouter:

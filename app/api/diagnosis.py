@@ -14,14 +14,14 @@ from fastapi import APIRouter, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, key_over_episodes, result_or_job
-from beliefscope.app.api.models.catalog import JobReply, Progress
-from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob, HealthyRecord, SmallestRepair
+from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.diagnosis.cause import Evidence, Recovery
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.views import as_json
@@ -33,6 +33,94 @@ _computing = threading.Lock()  # one preliminary diagnosis at a time
 
 MAX_EPISODES = 10
 """Held-out episodes of a diagnosis: more take longer and change little."""
+
+
+@fields_of(Evidence)
+class DiagnosisEvidence(Reply):
+    """A deviation that supports a cause. low, high: healthy range. episode, step: moment that shows it best."""
+
+
+@fields_of(Recovery)
+class DiagnosisRecovery(Reply):
+    """Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats."""
+
+
+class DiagnosisCause(Reply):
+    """A ranked cause. cause: its name in the catalog. title: in words.
+
+    steps: first affected step, and first step after it; None for complete episodes.
+    """
+
+    cause: str
+    title: str
+    component: str
+    probability: float
+    episodes: list[int]
+    steps: list[int] | None
+    evidence: list[DiagnosisEvidence]
+    recovered: DiagnosisRecovery | None
+    next: str
+
+
+class Diagnosis(Reply):
+    """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
+
+    deviations: largest ones, whatever their cause.
+    miscalibrated: whether the healthy record itself is over- or underconfident.
+    statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
+    unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
+    """
+
+    state: Literal["healthy", "fault", "unsure"]
+    masked: bool
+    headline: str
+    causes: list[DiagnosisCause]
+    deviations: list[DiagnosisEvidence]
+    task: str
+    filter: str
+    checkpoint_hash: str
+    episodes: int
+    healthy_episodes: int
+    healthy_data: str = ""
+    miscalibrated: bool
+    statistics: dict[str, int]
+    unmeasured: list[str]
+    alarm_rate: float
+
+
+class DiagnosisJob(JobReply):
+    """Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone."""
+
+    preliminary: Diagnosis
+
+
+class RepairedInterval(Reply):
+    """The sensors to drop or restore, over the steps from the first to the last."""
+
+    sensors: list[str]
+    restored: bool
+    steps: list[int]
+
+
+class SmallestRepair(Reply):
+    """The smallest repair of the largest failure of a run. failure: first and last step, None if there is none.
+
+    error, repaired: RMS position error over the failure without and with the repair, m. bound: which it keeps, m.
+    """
+
+    sentence: str
+    failure: list[int] | None
+    bound: float
+    error: Number
+    repaired: Number
+    repair: RepairedInterval | None
+    replays: int
+
+
+class HealthyRecord(Reply):
+    """Which clean episodes the healthy record of a filter is from."""
+
+    data: str
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:

@@ -10,8 +10,7 @@ from fastapi import APIRouter, Depends, HTTPException, Request
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.jobs import result_or_job
-from beliefscope.app.api.models.catalog import JobReply, Progress
-from beliefscope.app.api.models.results import DiagnosticInfo, DiagnosticResult, TraceDiagnosticInfo
+from beliefscope.app.api.models import JobReply, Progress, Reply, ResultViews, fields_of
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.diagnostic_options import parse_options
@@ -26,6 +25,33 @@ from beliefscope.inspect.diagnostics.base import Entry
 
 RUN_PARAMETERS = ("faults", "data", "episodes")
 """Query parameters that are not options of the diagnostic."""
+
+
+class DiagnosticResult(ResultViews):
+    """Result of a diagnostic over one or more trajectories."""
+
+    trajectories: int
+
+
+class DiagnosticOption(Reply):
+    """An option of a diagnostic; an empty default means none."""
+
+    name: str
+    meaning: str
+    default: str
+
+
+@fields_of(Entry, "name", "title", "question", "slow")
+class DiagnosticInfo(Reply):
+    """A diagnostic. slow: computed by a job."""
+
+    options: list[DiagnosticOption]
+
+
+class TraceDiagnosticInfo(DiagnosticInfo):
+    """A diagnostic of one trace. why_not: why it is not available for this trace, or None."""
+
+    why_not: str | None
 
 
 def _entry(name: str) -> Entry:

@@ -8,8 +8,7 @@ from fastapi import APIRouter, Depends
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, key_over_episodes, result_or_job
-from beliefscope.app.api.models.catalog import JobReply, Progress
-from beliefscope.app.api.models.results import Failures
+from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
 from beliefscope.app.api.traces import finished_run
 from beliefscope.app.jobs.failures import failure_document
 from beliefscope.app.jobs.queue import Jobs
@@ -18,8 +17,89 @@ from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.inspect.failures import by_episode
+from beliefscope.inspect.failures.events import Event, PhaseStatistics
+from beliefscope.inspect.slices.report import ErrorSlice
+from beliefscope.inspect.slices.search import Condition
 
 Among = Literal["held-out", "all"]
+
+
+@fields_of(PhaseStatistics)
+class PhaseInfo(Reply):
+    """The steps of a phase compared with all others."""
+
+    over_represented: bool
+
+
+@fields_of(
+    Event, "episode", "step", "first", "last", "time", "first_time", "last_time", "phase", "other_phases", "error"
+)
+class FailureEvent(Reply):
+    """A failure event. error: per layer, m. link: the page's address that opens it. Times: s, or None."""
+
+    value: Number
+    nees: Number
+    ess: Number
+    effective_weights: list[Number] | None
+    link: str
+
+
+@fields_of(Condition)
+class SliceCondition(Reply):
+    """Values of a covariate: ``low < value <= high`` in its SI unit, either may be None; or a category."""
+
+
+@fields_of(ErrorSlice)
+class FailureSlice(Reply):
+    """A data slice with a larger score. worst: episode and step of the largest one."""
+
+    conditions: list[SliceCondition]
+
+
+class FailureSlices(Reply):
+    """Data slices in which a score is larger. summary: their number and the searched data, or why there are none."""
+
+    summary: str
+    rows: list[FailureSlice]
+
+
+class FailureScore(Reply):
+    """Failures ranked by one score. why_not: why the filter does not have it; the other fields are absent then."""
+
+    name: str
+    title: str
+    unit: str
+    shown: str
+    scale: float
+    why_not: str | None
+    verdict: str | None = None
+    threshold: Number = None
+    total: int | None = None
+    counts: dict[str, int] | None = None
+    phases: list[PhaseInfo] | None = None
+    events: list[FailureEvent] | None = None
+    slices: FailureSlices | None = None
+
+
+@fields_of(by_episode.EpisodeErrors)
+class EpisodeErrors(Reply):
+    """Position errors of one episode."""
+
+
+class Failures(Reply):
+    """Failures of a filter over a data set."""
+
+    task: str
+    filter: str
+    data: str
+    faults: str
+    among: Literal["held-out", "all"]
+    particles: int | None
+    steps: int
+    layers: list[str]
+    scores: list[FailureScore]
+    episodes: list[EpisodeErrors]
 
 
 @dataclass(frozen=True)

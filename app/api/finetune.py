@@ -2,31 +2,137 @@
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, HTTPException
 from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
-from beliefscope.app.api.models.catalog import Progress
-from beliefscope.app.api.models.training import FineTuneDetails, FineTuneOffer, FineTuneRunInfo
+from beliefscope.app.api.models import Number, Progress, Reply, ResultViews, fields_of
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.api.weaknesses import Weakness, weaknesses_of
 from beliefscope.app.jobs.finetune import catalog_name
-from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.finetuning.choices import choices
+from beliefscope.filters.finetuning.choices import Choices, choices
+from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.module_selection import select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.success import measures
 from beliefscope.filters.finetuning.training_data import simulated_episodes
+from beliefscope.inspect.compare.effects import Regression
+from beliefscope.inspect.compare.success import SliceChange, Success
 
 Action = Literal["promote", "save", "discard"]
+
+
+@dataclass(frozen=True)
+class FineTuneRunInfo(FineTuneRun):
+    """A fine-tuning run. finetuned: catalog name of its checkpoint. saved_as: its place in the catalog."""
+
+    job: Job | None
+    finetuned: str | None
+    saved_as: Literal["saved", "default"] | None
+
+
+@fields_of(Validation)
+class ValidationInfo(Reply):
+    """A validation."""
+
+    loss: Number
+
+
+class FineTuneProgress(Reply):
+    """Progress of a fine-tuning run. losses: (step, loss)."""
+
+    steps: int
+    losses: list[tuple[int, Number]]
+    validations: list[ValidationInfo]
+
+
+class FineTunedCheckpoint(Reply):
+    """A fine-tuned checkpoint. no_change: what to try, if the base checkpoint was best; else empty."""
+
+    name: str
+    hash: str
+    best_step: int
+    steps: int
+    seconds: float
+    no_change: str = ""
+
+
+@fields_of(Regression)
+class RegressionEvent(Reply):
+    """Consecutive steps with a larger error than before."""
+
+    link: str
+
+
+@fields_of(SliceChange)
+class SliceChangeInfo(Reply):
+    """Change of the criterion's measure in a slice."""
+
+    change: Number
+    low: Number
+    high: Number
+
+
+@fields_of(Success)
+class SuccessInfo(Reply):
+    """Outcome by the success criterion."""
+
+    slices: list[SliceChangeInfo]
+
+
+class FineTuneResult(Reply):
+    """Result of a fine-tuning run. frozen: modules with unchanged hashes. success: None without a criterion."""
+
+    success: SuccessInfo | None = None
+
+    finetuned: FineTunedCheckpoint
+    comparison: ResultViews
+    frozen: list[str]
+    events: list[RegressionEvent]
+
+
+@dataclass(frozen=True)
+class FineTuneRunSummary(FineTuneRunInfo):
+    """A fine-tuning run with its progress and its outcome by the success criterion."""
+
+    progress: FineTuneProgress | None
+    success: SuccessInfo | None
+
+
+class MeasureInfo(Reply):
+    """A measure of a success criterion. title: name of the quantity."""
+
+    name: str
+    title: str
+
+
+@dataclass(frozen=True)
+class FineTuneOffer(Choices):
+    """Options for fine-tuning a filter, and runs of its task.
+
+    simulated: number of training episodes that are simulated first; 0 if the data set has training episodes.
+    """
+
+    measures: list[MeasureInfo]
+    simulated: int
+    runs: list[FineTuneRunSummary]
+
+
+@dataclass(frozen=True)
+class FineTuneDetails(FineTuneRunInfo):
+    """A fine-tuning run with its progress and result."""
+
+    progress: FineTuneProgress | None
+    result: FineTuneResult | None
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:

@@ -3,28 +3,56 @@
 import io
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from fastapi import APIRouter
 from fastapi.responses import Response
 
 from beliefscope import __version__
-from beliefscope.app.api.models.training import Lineage as LineageReply, LineageMember
+from beliefscope.app.api.models import Number, Reply
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.compare.lineage import Ancestor, Lineage, export, lineage_of
+from beliefscope.inspect.compare.lineage import Ancestor, Lineage as Checkpoints, export, lineage_of
+
+
+class LineageMember(Reply):
+    """A checkpoint and its base.
+
+    Attributes:
+        catalog_name: its name in the catalog, or None. run: fine-tuning run of this workspace that wrote it, or None.
+        train, learned: trained modules and learned slices. rmse: by component, in cm or deg, on clean data.
+        before, after: slice -> RMSE by component on the test episodes of its fine-tuning.
+    """
+
+    hash: str
+    name: str
+    catalog_name: str | None
+    base: str | None
+    run: str | None
+    train: list[str]
+    learned: list[str]
+    rmse: Mapping[str, Number]
+    before: Mapping[str, Mapping[str, Number]]
+    after: Mapping[str, Mapping[str, Number]]
+
+
+class Lineage(Reply):
+    """Fine-tuned checkpoints and their ancestors, bases first."""
+
+    members: list[LineageMember]
 
 
 def routes(store: TraceStore) -> APIRouter:
     router = APIRouter()
 
     @router.get("/api/lineage/{task}")
-    def lineage(task: str) -> LineageReply:
+    def lineage(task: str) -> Lineage:
         names = {checkpoint.hash: name for name, checkpoint in store.filters(task).items()}
         members = _lineage(store, task).members.values()
-        return LineageReply(members=[_member(member, names, store) for member in members if member.task == task])
+        return Lineage(members=[_member(member, names, store) for member in members if member.task == task])
 
     @router.get("/api/lineage/{task}/{hash}.zip", response_class=Response)
     def archive(task: str, hash: str) -> Response:
@@ -42,7 +70,7 @@ def routes(store: TraceStore) -> APIRouter:
     return router
 
 
-def _lineage(store: TraceStore, task: str) -> Lineage:
+def _lineage(store: TraceStore, task: str) -> Checkpoints:
     """The workspace's fine-tuned checkpoints, those given to the server, and their ancestors.
 
     Raises BadInput for an unknown task.
@@ -52,7 +80,7 @@ def _lineage(store: TraceStore, task: str) -> Lineage:
     try:
         return lineage_of([*FineTuneRuns(store.settings.workspace).checkpoints(), *paths])
     except BadInput:  # no checkpoint
-        return Lineage({}, ())
+        return Checkpoints({}, ())
 
 
 def _member(checkpoint: Ancestor, names: dict[str, str], store: TraceStore) -> LineageMember:

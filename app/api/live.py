@@ -15,7 +15,7 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from beliefscope.app.api.models.traces import LiveList
+from beliefscope.app.api.models import LiveList
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import close_reason, describe_error
 from beliefscope.app.protocol.trace_format import columns

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,11 @@ from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
-from pydantic import NonNegativeInt
+from pydantic import ConfigDict, NonNegativeInt, with_config
 from starlette.requests import ClientDisconnect
 
 from beliefscope import __version__
-from beliefscope.app.api.models.catalog import JobReply, RequestBody
-from beliefscope.app.api.models.files import DeletedId, Freed, RecordingEntry, RecordingList, RunNames, WrittenRecording
+from beliefscope.app.api.models import DeletedId, Freed, JobReply, Reply, RequestBody
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.jobs.recording import write
 from beliefscope.app.protocol.etag import tagged_json
@@ -30,6 +30,7 @@ from beliefscope.app.runs.live_runs import LIVE_PREFIX, display_name
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.recordings import ENDING, Recording, RecordingFolder, free_space
+from beliefscope.app.workspace.trash import DeletedFile
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import Checkpoint
@@ -42,6 +43,50 @@ RESERVED_SPACE = 2 * 10**8  # bytes that uploads leave free on the disk
 CHECK_INTERVAL = 1 << 24  # uploaded bytes between checks of the free space
 MAGIC = b"RRF"  # first bytes of all versions of Rerun's files
 FREE_ROUNDING = 10**7  # bytes; keeps the ETag of the list stable
+
+
+class RunNames(Reply):
+    """Names of a filter and a data set in the catalog."""
+
+    filter: str
+    data: str
+
+
+@with_config(ConfigDict(json_schema_serialization_defaults_required=True))
+@dataclass(frozen=True, kw_only=True)
+class RecordingEntry(RecordingInfo):
+    """A recording, with its metadata once they have been read.
+
+    modified: ISO 8601. reading: whether its metadata are being read. run: the same run in the catalog, or None;
+    ``why_not`` explains why.
+    """
+
+    name: str
+    url: str
+    bytes: int
+    modified: str
+    reading: bool
+    run: RunNames | None
+    why_not: str
+
+
+class RecordingList(Reply):
+    """Recordings, newest first, and deleted ones. bytes, free, largest: used, free, and allowed for an upload."""
+
+    recordings: list[RecordingEntry]
+    deleted: list[DeletedFile]
+    bytes: int
+    free: int
+    largest: int
+
+
+class WrittenRecording(Reply):
+    """A recording of a run. seconds: that writing took; None if it existed."""
+
+    name: str
+    url: str
+    bytes: int
+    seconds: float | None
 
 
 class RecordingRequest(RequestBody):

@@ -7,13 +7,13 @@ from fastapi import APIRouter, Body, Request
 from fastapi.responses import FileResponse, Response
 from pydantic import Field, NonNegativeInt
 
-from beliefscope.app.api.models.catalog import JobReply, RequestBody
-from beliefscope.app.api.models.files import DeletedId, Freed, Name, ReportList
+from beliefscope.app.api.models import DeletedId, Freed, JobReply, Reply, RequestBody
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.workspace.reports import ReportFolder
+from beliefscope.app.workspace.reports import ReportEntry, ReportFolder
+from beliefscope.app.workspace.trash import DeletedFile
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.recordings.report.pdf import browser
@@ -24,6 +24,19 @@ PAGE_POLICY = (
 """Content security policy of a displayed report: no scripts; links open."""
 
 MAX_EVENTS, MAX_TITLE = 20, 200
+
+
+class ReportList(Reply):
+    """Reports, newest first, and deleted ones."""
+
+    reports: list[ReportEntry]
+    deleted: list[DeletedFile]
+
+
+class Name(Reply):
+    """Name of a restored report."""
+
+    name: str
 
 
 class ReportRequest(RequestBody):

@@ -6,16 +6,9 @@ from typing import Any
 from urllib.parse import quote
 
 from fastapi import APIRouter
+from pydantic import ConfigDict
 
-from beliefscope.app.api.models.catalog import JobReply
-from beliefscope.app.api.models.training import (
-    FilterName,
-    StudyFilter,
-    StudyInfo,
-    StudyList,
-    StudyTask,
-    TrainedSeed,
-)
+from beliefscope.app.api.models import FilterName, JobReply, Reply
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.catalog import short_names
@@ -26,9 +19,61 @@ from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.names import is_code
 from beliefscope.filters.training.plan import PLANS
+from beliefscope.filters.training.study_table import Row
 
 CatalogNames = Mapping[tuple[str, str], str]
 """(task, checkpoint hash) -> name of the filter in the catalog."""
+
+
+class TrainedSeed(Reply):
+    """A trained checkpoint of a study. file: whether it can be added to the catalog."""
+
+    seed: int
+    catalog_name: str | None
+    file: bool
+
+
+class StudyFilter(Reply):
+    """A filter of a study and its trained checkpoints."""
+
+    name: str
+    trained: list[TrainedSeed]
+
+
+class StudyTask(Reply):
+    """The part of a study for one task.
+
+    data: file of the training and evaluation data. offset_data: description of the data that rows with an offset start
+    were evaluated on; empty: as the others.
+    """
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)  # optional fields of rows are sent
+
+    name: str
+    data: str
+    offset_data: str
+    filters: list[StudyFilter]
+    rows: list[Row]
+
+
+class StudyInfo(Reply):
+    """A study. job: id of the job that trains its unfinished cells. why_not: why they cannot be trained here."""
+
+    name: str
+    preset: str
+    seeds: int
+    tasks: list[StudyTask]
+    unfinished: int
+    cells: int
+    job: str | None
+    why_not: str
+
+
+class StudyList(Reply):
+    """All studies. problems: one line per unreadable study."""
+
+    studies: list[StudyInfo]
+    problems: list[str]
 
 
 def all_studies(folders: Mapping[str, Path], workspace: Path) -> list[Study]:

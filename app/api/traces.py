@@ -1,26 +1,105 @@
 """Routes of the health check, the catalog and traces."""
 
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response
 
 from beliefscope import __version__
-from beliefscope.app.api.models.catalog import Catalog, EpisodeList, Health, Progress
-from beliefscope.app.api.models.traces import TraceHeader
+from beliefscope.app.api.models import Component, LiveRun, Progress, Reply, TaskInfo
 from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
+from beliefscope.app.protocol.messages import SceneLayer
+from beliefscope.app.runs.examples import Example
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
 from beliefscope.datasets import episode_list
-from beliefscope.datasets.faults.injection import Faults, fault_catalog
-from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
+from beliefscope.datasets.dataset import EpisodeSummary
+from beliefscope.datasets.faults.injection import FaultInfo, Faults, fault_catalog
+from beliefscope.inspect.maps.likelihood_map import Quantity
+from beliefscope.inspect.traces.sensors import DisplayedSensor, displayed_sensors, sensor_pixels
 
 TRACE_TIMEOUT = 0.25  # s that a request waits for a trace before it answers with the progress
 IN_PROGRESS: dict[int | str, dict[str, Any]] = {202: {"model": Progress}}
+
+
+class Health(Reply):
+    """Health check. late: s that maps and scenes are overdue."""
+
+    status: Literal["ok"]
+    version: str
+    late: float
+
+
+class EpisodeList(Reply):
+    """A part of the episodes of a data set that match a query. count: of all that match."""
+
+    count: int
+    episodes: list[EpisodeSummary]
+
+
+class Catalog(Reply):
+    """Everything the server can show.
+
+    examples: none on a server with the user's filters, data sets or tasks. problems: one line per unusable file.
+    """
+
+    version: str
+    read_only: bool
+    examples: list[Example]
+    faults: list[FaultInfo]
+    tasks: list[TaskInfo]
+    problems: list[str]
+
+
+class Column(Reply):
+    """A float32 array in the columns buffer; offset in bytes."""
+
+    name: str
+    shape: list[int]
+    offset: int
+
+
+class TraceHeader(Reply):
+    """Metadata of a trace.
+
+    Attributes:
+        groups: names of the groups of covariates, in the order of the column ``groups`` (T, G).
+        weight_width: 0 for a filter without weights. settings: of the run.
+        nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
+        no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
+            reasons. sensors: drawn ones.
+        no_diagnosis: why the filter has no diagnosis, or None.
+        data_warning: how the data differ from the checkpoint's training data, or None.
+        scene: layers of its 3D scene. live: present while the trace is of a live run.
+    """
+
+    steps: int
+    dt: float
+    kind: str
+    filter: str
+    episode: int
+    components: list[Component]
+    modalities: list[str]
+    groups: list[str]
+    weight_width: int
+    checkpoint_hash: str
+    data_hash: str
+    seed: int
+    faults: str
+    settings: dict[str, Any]
+    nees_bounds: tuple[float, float] | None
+    no_maps: str | None
+    missing_quantities: dict[Quantity, str]
+    sensors: list[DisplayedSensor]
+    columns: list[Column]
+    data_warning: str | None = None
+    no_diagnosis: str | None = None
+    scene: list[SceneLayer]
+    live: LiveRun | None = None
 
 
 def _selection(task: str, filter: str, episode: int, faults: str = "", data: str = "") -> Selection:

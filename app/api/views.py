@@ -6,14 +6,21 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Request, WebSocket
 from fastapi.responses import Response
 
-from beliefscope.app.api.models.catalog import RequestBody
-from beliefscope.app.api.models.traces import ViewAddresses
+from beliefscope.app.api.models import Reply, RequestBody
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.etag import tagged
 from beliefscope.app.protocol.messages import close_reason
 from beliefscope.app.views.embedded_viser import client_page
 from beliefscope.app.views.registry import Views
 from beliefscope.app.views.view import View
+
+
+class ViewAddresses(Reply):
+    """Addresses of an open view."""
+
+    view: str
+    scene: str
+    socket: str
 
 
 class ViewRequest(RequestBody):

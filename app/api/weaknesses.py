@@ -5,7 +5,7 @@ from typing import Any
 
 from beliefscope.app.api.diagnosis import available_diagnosis
 from beliefscope.app.api.failures import found_failures
-from beliefscope.app.api.models.catalog import Reply, fields_of
+from beliefscope.app.api.models import Reply, fields_of
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore

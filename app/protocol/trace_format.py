@@ -76,7 +76,7 @@ def header(
     no_maps: str | None,
     missing: Mapping[Quantity, str],
 ) -> dict[str, Any]:
-    """Metadata of a trace, as in ``api.models.traces.TraceHeader``.
+    """Metadata of a trace, as in ``api.traces.TraceHeader``.
 
     no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
     """

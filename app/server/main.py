@@ -35,7 +35,7 @@ from beliefscope.app.api import (
     traces,
     views as api_views,
 )
-from beliefscope.app.api.models.catalog import Error
+from beliefscope.app.api.models import Error
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import InProgress, NameTaken, NotFound, QueueFull
 from beliefscope.app.protocol.messages import MAP_SIZES, describe_error

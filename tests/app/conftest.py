@@ -15,7 +15,7 @@ from fastapi.routing import APIRoute
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient, WebSocketTestSession
 
-from beliefscope.app.api.models.catalog import Error
+from beliefscope.app.api.models import Error
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.datasets.simulation.door import DOOR

@@ -1,8 +1,8 @@
-"""Base of the models of JSON responses, and models shared by several routes.
+"""Base of the models of JSON responses, and models shared by several routes; others stand beside their routes.
 
-The page's TypeScript types are generated from all models in this package. Large responses are sent without validation;
-the tests validate them (``tests/app/conftest.py``). Dataclasses of other folders are used as they are if they have only
-plain fields; models of those with arrays are derived by ``fields_of``.
+The page's TypeScript types are generated from all of them. Large responses are sent without validation; the tests
+validate them (``tests/app/conftest.py``). Dataclasses of other folders are used as they are if they have only plain
+fields; models of those with arrays are derived by ``fields_of``.
 """
 
 import dataclasses
@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, create_model
 
 from beliefscope.app.jobs.queue import Job
-from beliefscope.app.runs.examples import Example
 from beliefscope.datasets.dataset import EpisodeSummary
-from beliefscope.datasets.faults.injection import FaultInfo
+from beliefscope.inspect.diagnostics import views
 
 Number = float | None
 """None if not finite or not available."""
@@ -79,14 +78,6 @@ class JobReply(Reply):
     job: Job | None
 
 
-class Health(Reply):
-    """Health check. late: s that maps and scenes are overdue."""
-
-    status: Literal["ok"]
-    version: str
-    late: float
-
-
 class MapArea(Reply):
     """Components on the axes of the likelihood maps, one or two, and half the extent (in the unit of the first)."""
 
@@ -134,13 +125,6 @@ class DataInfo(Reply):
     episodes: list[EpisodeSummary]
 
 
-class EpisodeList(Reply):
-    """A part of the episodes of a data set that match a query. count: of all that match."""
-
-    count: int
-    episodes: list[EpisodeSummary]
-
-
 class Component(Reply):
     """A state component. Values times ``scale`` are in the unit ``shown``."""
 
@@ -168,15 +152,89 @@ class TaskInfo(Reply):
     data: list[DataInfo]
 
 
-class Catalog(Reply):
-    """Everything the server can show.
+class LiveState(Reply):
+    """State of a live run. message: explanation of an abnormal state, or empty."""
 
-    examples: none on a server with the user's filters, data sets or tasks. problems: one line per unusable file.
-    """
+    name: str
+    state: Literal["running", "ended", "died", "damaged"]
+    message: str
 
-    version: str
-    read_only: bool
-    examples: list[Example]
-    faults: list[FaultInfo]
+
+class LiveRun(LiveState):
+    """A live run. expected: number of steps, if announced. started: ISO 8601."""
+
+    data: str
+    task: str
+    episode: int
+    faults: str
+    steps: int
+    expected: int | None
+    started: str
+
+
+class ListedLiveRun(LiveRun):
+    """A live run in the list. filter: its name in the catalog. available: whether its checkpoint is available."""
+
+    filter: str
+    available: bool
+    kind: str
+
+
+class LiveList(Reply):
+    """Live runs, newest first, and their tasks; an unreadable file has only its state."""
+
+    runs: list[ListedLiveRun | LiveState]
     tasks: list[TaskInfo]
-    problems: list[str]
+
+
+class FilterName(Reply):
+    """Name of a filter in the catalog."""
+
+    filter: str
+
+
+@fields_of(views.Curve)
+class Curve(Reply):
+    """A quantity over the steps of a trace."""
+
+
+@fields_of(views.Line)
+class Line(Reply):
+    """A line of a plot."""
+
+
+@fields_of(views.Plot)
+class Plot(Reply):
+    """A plot whose x axis is not time. diagonal: draw y = x. names: labels of x = 0, 1, ..."""
+
+    lines: list[Line]
+
+
+@fields_of(views.ImagePanel)
+class PixelMap(Reply):
+    """A value per pixel of a camera image."""
+
+    values: list[list[Number]]
+
+
+class ResultViews(Reply):
+    """Tables, curves and figures of a result, in cm and degrees."""
+
+    verdict: str
+    tables: list[views.Table]
+    curves: list[Curve]
+    bands: dict[str, list[bool]]
+    plots: list[Plot]
+    images: list[PixelMap]
+
+
+class DeletedId(Reply):
+    """Id that restores a deleted file."""
+
+    deleted: str
+
+
+class Freed(Reply):
+    """Size of permanently deleted files."""
+
+    freed: int
