@@ -4,7 +4,6 @@ A run is the only episode of the data set ``live:NAME``. The filter and its view
 """
 
 import threading
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -33,7 +32,7 @@ from beliefscope.inspect.traces.live_run import LiveRun
 
 LIVE_PREFIX = "live:"
 LISTED_RUNS = 30  # most recent ones
-COMPLETE_IN_MEMORY = 4  # runs
+RUNS_IN_MEMORY = 4  # most recent ones
 
 
 class GrowingRun(TracedRun):
@@ -91,8 +90,7 @@ class LiveRuns:
         """tasks: user-defined tasks, as for ``stored_task``."""
         self.folder, self._tasks = folder, tasks
         self._runs: dict[str, LiveRun] = {}
-        self._growing: dict[str, GrowingRun] = {}  # the newest state of each running run
-        self._complete: OrderedDict[str, TracedRun] = OrderedDict()
+        self._traced: dict[str, TracedRun] = {}  # the newest state of each requested run, most recent last
         self._lock = threading.Lock()
 
     def __getitem__(self, name: str) -> LiveRun:
@@ -140,21 +138,17 @@ class LiveRuns:
             )
         if (selection.filter, selection.faults, selection.edit, selection.only) != (name, NO_FAULTS, None, ""):
             return None
+        running = run.state == "running"
         with self._lock:
-            if run.state == "running":
-                newest = self._growing.get(run.name)
-                if newest is None or newest.key != run.key:
-                    newest = self._growing[run.name] = GrowingRun(run, checkpoint)
-                return newest
-            self._growing.pop(run.name, None)
-            key = run.key
-            if key not in self._complete:
-                self._complete[key] = TracedRun(key, checkpoint)
-                self._complete[key].future.set_result(run.reader.part(0))
-            self._complete.move_to_end(key)
-            while len(self._complete) > COMPLETE_IN_MEMORY:
-                self._complete.popitem(last=False)
-            return self._complete[key]
+            traced = self._traced.pop(run.name, None)
+            if traced is None or (traced.key, traced.growing) != (run.key, running):
+                traced = GrowingRun(run, checkpoint) if running else TracedRun(run.key, checkpoint)
+                if not running:
+                    traced.future.set_result(run.reader.part(0))
+            self._traced[run.name] = traced
+            while len(self._traced) > RUNS_IN_MEMORY:
+                del self._traced[next(iter(self._traced))]
+            return traced
 
     def ended_run(self, data: str) -> LiveRun:
         """The run of a data set's name. Raises BadInput while it is running."""
