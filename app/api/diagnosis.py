@@ -6,14 +6,13 @@ Another job measures the healthy record of a filter that has none.
 
 import json
 import threading
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
-from beliefscope.app.api.jobs import arguments_over_episodes, key_over_episodes, result_or_job
+from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
 from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
@@ -132,7 +131,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         responses={202: {"model": DiagnosisJob | Progress}},
     )
     def get_diagnosis(selection: RequestedRun, over: Over = "episode") -> Response:
-        job = jobs.find("diagnosis", _key(store, _arguments(store, selection, over)))
+        job = jobs.find("diagnosis", _arguments(store, selection, over))
         if path := jobs.finished_result(job):
             return FileResponse(path, media_type="application/json")
         first = preliminary_diagnosis(store, selection)
@@ -145,27 +144,26 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         arguments = _arguments(store, selection, over)
         scope = "" if over == "episode" else f"{len(arguments['episodes'])} held-out episodes"
         title, link = f"Diagnosis of {selection.describe(scope)}", _link(selection, arguments["data"], over)
-        return JobReply(job=jobs.submit("diagnosis", title, arguments, _key(store, arguments), link))
+        return JobReply(job=jobs.submit("diagnosis", title, arguments, link=link))
 
     @router.get(
         "/api/repair/{task}/{filter}/{episode}", response_model=SmallestRepair, responses={202: {"model": JobReply}}
     )
     def get_repair(selection: RequestedRun) -> Response:
-        return result_or_job(jobs, "repair", _repair_key(store, selection))
+        return result_or_job(jobs, "repair", _repair_arguments(store, selection))
 
     @router.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
     def search_repair(selection: RequestedRun) -> JobReply:
-        arguments = {"settings": store.settings.to_json(), "selection": selection.to_json()}
         link = _link(selection, store.dataset(selection.task, selection.data)[0], "episode")
         title = f"Smallest repair of {selection.describe()}"
-        return JobReply(job=jobs.submit("repair", title, arguments, _repair_key(store, selection), link))
+        return JobReply(job=jobs.submit("repair", title, _repair_arguments(store, selection), link=link))
 
     @router.get(
         "/api/healthy-record/{task}/{filter}", response_model=HealthyRecord, responses={202: {"model": JobReply}}
     )
     def get_record(task: str, filter: str, data: str = "") -> Response:
         """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
-        job = jobs.find("healthy", key_over_episodes(store, _record_arguments(store, task, filter, data)))
+        job = jobs.find("healthy", _record_arguments(store, task, filter, data))
         measured = store.measured_record(task, filter)
         if measured and not (job and job.active):
             return JSONResponse({"data": measured})
@@ -180,8 +178,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             raise BadInput(f"{name!r} has {count} held-out episodes; a healthy record needs at least {MIN_HEALTHY}")
         title = f"Healthy record of {filter}, {task}, {count} held-out episodes of {name}"
         link = page_link(task=task, filter=filter, data=name, tab="diagnosis")
-        key = key_over_episodes(store, arguments)
-        job = jobs.submit("healthy", title, arguments, key, link, output_exists=False)  # a new job replaces the record
+        job = jobs.submit("healthy", title, arguments, link=link, output_exists=False)  # a new job replaces the record
         return JobReply(job=job)
 
     return router
@@ -198,7 +195,7 @@ def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> 
 
     Raises BadInput without a healthy profile, and InProgress.
     """
-    path = jobs.finished_result(jobs.find("diagnosis", _key(store, _arguments(store, selection, "episode"))))
+    path = jobs.finished_result(jobs.find("diagnosis", _arguments(store, selection, "episode")))
     return preliminary_diagnosis(store, selection) if path is None else json.loads(path.read_bytes())
 
 
@@ -218,18 +215,14 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
     selection.faults.check(store.checkpoint(selection.task, selection.filter).task)
     held_out = [index for index in data.held_out() if index != selection.episode][: MAX_EPISODES - 1]
     episodes = [selection.episode, *(held_out if over == "held-out" else ())]
-    faults = str(selection.faults)
-    return arguments_over_episodes(store, selection.task, selection.filter, name, episodes, faults=faults)
+    others = {"faults": str(selection.faults), "record": store.record_version(selection.task, selection.filter)}
+    return arguments_over_episodes(store, selection.task, selection.filter, name, episodes, **others)
 
 
-def _key(store: TraceStore, arguments: Mapping[str, Any]) -> object:
-    """Everything that a diagnosis depends on, given the arguments of its job."""
-    return key_over_episodes(store, arguments), store.record_version(arguments["task"], arguments["filter"])
-
-
-def _repair_key(store: TraceStore, selection: Selection) -> object:
-    """Everything that a repair depends on: the bound of its error is that of the healthy record."""
-    return store.key(selection), store.record_version(selection.task, selection.filter)
+def _repair_arguments(store: TraceStore, selection: Selection) -> dict[str, Any]:
+    """Arguments of the job: the bound of its error is that of the healthy record."""
+    record = store.record_version(selection.task, selection.filter)
+    return {"selection": selection.to_json(), "key": store.key(selection), "record": record}
 
 
 def _record_arguments(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:

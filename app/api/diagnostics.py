@@ -102,23 +102,17 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         if not (entry.slow or episodes):
             with computing:
                 return Response(_result(entry, run, options), media_type="application/json")
-        return result_or_job(jobs, "diagnostic", _key(store, entry, _selections(store, selection, episodes), options))
+        return result_or_job(jobs, "diagnostic", _arguments(store, entry, selection, options, episodes))
 
     @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
     def compute(
         entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
     ) -> JobReply:
         _check(entry, store.request(selection))
-        selections = _selections(store, selection, episodes)
-        arguments = {
-            "settings": store.settings.to_json(),
-            "diagnostic": entry.name,
-            "options": options,
-            "selections": [item.to_json() for item in selections],
-        }
-        title = f"{entry.title} of {selection.describe(f'all {len(selections)} held-out episodes' if episodes else '')}"
-        key, link = _key(store, entry, selections, options), _link(entry, selection, options, episodes)
-        return JobReply(job=jobs.submit("diagnostic", title, arguments, key, link))
+        arguments = _arguments(store, entry, selection, options, episodes)
+        scope = f"all {len(arguments['selections'])} held-out episodes" if episodes else ""
+        title, link = f"{entry.title} of {selection.describe(scope)}", _link(entry, selection, options, episodes)
+        return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
 
     return router
 
@@ -137,15 +131,18 @@ def _check(entry: Entry, run: TracedRun) -> None:
         raise HTTPException(409, reason)
 
 
-def _selections(store: TraceStore, selection: Selection, episodes: Episodes) -> list[Selection]:
-    return store.held_out(selection) if episodes else [selection]
-
-
-def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> object:
-    """Everything the result depends on, including the indices of the episodes."""
-    traces = [(selection.episode, store.key(selection)) for selection in selections]
-    version = store.record_version(selections[0].task, selections[0].filter)
-    return entry.name, traces, sorted(options.items()), *((version,) if version else ())
+def _arguments(
+    store: TraceStore, entry: Entry, selection: Selection, options: Mapping[str, Any], episodes: Episodes
+) -> dict[str, Any]:
+    """Arguments of the job, with everything that its result depends on."""
+    selections = store.held_out(selection) if episodes else [selection]
+    return {
+        "diagnostic": entry.name,
+        "options": dict(sorted(options.items())),
+        "selections": [item.to_json() for item in selections],
+        "keys": [store.key(item) for item in selections],
+        "record": store.record_version(selection.task, selection.filter),
+    }
 
 
 def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:

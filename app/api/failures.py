@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends
 from fastapi.responses import JSONResponse, Response
 
-from beliefscope.app.api.jobs import arguments_over_episodes, key_over_episodes, result_or_job
+from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
 from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
 from beliefscope.app.api.traces import finished_run
 from beliefscope.app.jobs.failures import failure_document
@@ -129,7 +129,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def get_failures(request: RequestedSurvey) -> Response:
         if request.data.startswith(LIVE_PREFIX):
             return _live_failures(store, request)
-        return result_or_job(jobs, "failures", key_over_episodes(store, _arguments(store, request)))
+        return result_or_job(jobs, "failures", _arguments(store, request))
 
     @router.post("/api/failures/{task}/{filter}", status_code=202)
     def find_failures(request: RequestedSurvey) -> JobReply:
@@ -139,7 +139,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         title = ", ".join(filter(None, [f"Failures of {request.filter}", request.task, scope, faults]))
         state = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults")}
         link = page_link(**state, tab="failures")
-        return JobReply(job=jobs.submit("failures", title, arguments, key_over_episodes(store, arguments), link))
+        return JobReply(job=jobs.submit("failures", title, arguments, link=link))
 
     return router
 
@@ -147,7 +147,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 def found_failures(store: TraceStore, jobs: Jobs, selection: Selection) -> Path | None:
     """The result of the search over the held-out episodes with the filter, data and faults of a run, if done."""
     request = SurveyRequest(selection.task, selection.filter, selection.data, faults=str(selection.faults))
-    return jobs.finished_result(jobs.find("failures", key_over_episodes(store, _arguments(store, request))))
+    return jobs.finished_result(jobs.find("failures", _arguments(store, request)))
 
 
 def _live_failures(store: TraceStore, request: SurveyRequest) -> Response:

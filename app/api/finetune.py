@@ -159,11 +159,11 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         key = [filter, data, checkpoint.hash, episodes.hash, tuning.to_json(), store.settings.particles]
         id = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         run = runs.add(id, task, filter, data, tuning)
-        arguments = {name: getattr(run, name) for name in ("run", "task", "filter", "data", "settings")}
+        arguments = {name: getattr(run, name) for name in ("run", "task", "filter", "data")}
         link = page_link(task=task, filter=filter, data=data, tab="finetune", run=id)
         slices = " and ".join(slice_.name for slice_, _ in tuning.mix) or "clean data"
         title = f"Fine-tuning of {filter}, {task}: {slices}"
-        jobs.submit("finetune", title, arguments | {"server": store.settings.to_json()}, id, link)
+        jobs.submit("finetune", title, arguments | {"tuning": run.settings}, id, link)
         return info(run)
 
     @router.get("/api/tuned/{run}", response_model=FineTuneDetails)

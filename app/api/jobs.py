@@ -46,26 +46,20 @@ def routes(jobs: Jobs) -> APIRouter:
 
 
 def arguments_over_episodes(
-    store: TraceStore, task: str, filter_: str, data: str, episodes: list[int], **others: str
+    store: TraceStore, task: str, filter_: str, data: str, episodes: list[int], **others: Any
 ) -> dict[str, Any]:
-    """Arguments of a job that runs a filter over episodes of a data set."""
-    names = {"settings": store.settings.to_json(), "task": task, "filter": filter_, "data": data}
-    return {**names, **others, "episodes": episodes}
+    """Arguments of a job that runs a filter over episodes of a data set, with everything that its result depends on.
 
-
-def key_over_episodes(store: TraceStore, arguments: Mapping[str, Any]) -> object:
-    """Everything that the result of a job over episodes of a data set depends on, given its arguments, except for a
-    healthy record of the workspace.
+    others: further arguments, such as the version of the healthy record where the result depends on it.
     """
-    task, filter_, data = (arguments[name] for name in ("task", "filter", "data"))
     hashes = store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash
-    others = [value for name, value in arguments.items() if name != "settings"]  # names occur in links
-    return others, hashes, store.settings.seed, store.settings.particles
+    settings = {"hashes": hashes, "seed": store.settings.seed, "particles": store.settings.particles}
+    return {"task": task, "filter": filter_, "data": data, **others, "episodes": episodes, **settings}
 
 
-def result_or_job(jobs: Jobs, kind: str, key: object) -> Response:
+def result_or_job(jobs: Jobs, kind: str, arguments: Mapping[str, Any]) -> Response:
     """The result of a finished job; else the response 202 with the job, or without one if it was not requested."""
-    job = jobs.find(kind, key)
+    job = jobs.find(kind, arguments)
     if path := jobs.finished_result(job):
         return FileResponse(path, media_type="application/json")
     return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)

@@ -148,14 +148,13 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
             if stride:
                 response.status_code = 202
                 arguments = {
-                    "settings": store.settings.to_json(),
                     "selection": selection.to_json(),
                     "path": str(path),
                     "maps": stride,
                     "quantity": body.quantity,
                 }
                 title, link = f"Recording of {selection.describe()}", _url(path.name).lstrip("/")
-                job = jobs.submit("recording", title, arguments, path.name, link, output_exists=False)
+                job = jobs.submit("recording", title, arguments, link=link, output_exists=False)
                 return JobReply(job=job)
             writer.submit(write, files, run, path).result()
         else:
@@ -178,7 +177,7 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         filter_, output = display_name(info.filter, info.checkpoint_hash, filters), store.live.folder / f"{run}{SUFFIX}"
         link = page_link(task=info.task, filter=filter_, data=LIVE_PREFIX + run, episode=info.episode or 0, tab="scene")
         arguments, title = {"recording": str(files.path(name)), "run": str(output)}, f"The run in {recording.name}"
-        return JobReply(job=jobs.submit("reading", title, arguments, key, link, output.is_file()))
+        return JobReply(job=jobs.submit("reading", title, arguments, link=link, output_exists=output.is_file()))
 
     _add_file_routes(router, files, matcher)
     return router

@@ -76,14 +76,13 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         name = f"{selection.file_stem}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
         folder = reports.folder / name
         arguments = {
-            "settings": store.settings.to_json(),
             "selection": selection.to_json(),
             "options": options.model_dump(),
             "url": url,
             "folder": str(folder),
         }
         title, link = f"Report of {selection.describe()}", f"api/reports/{name}.html"
-        return JobReply(job=jobs.submit("report", title, arguments, key, link, folder.is_dir()))
+        return JobReply(job=jobs.submit("report", title, arguments, link=link, output_exists=folder.is_dir()))
 
     @router.get("/api/reports/{name}.html", response_class=Response)
     def page(name: str, inline: bool = False) -> FileResponse:

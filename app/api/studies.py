@@ -110,8 +110,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         if not results.unfinished:
             raise BadInput(f"all cells of study {name!r} are finished")
         arguments, key = _job_arguments(study, results, store), _key(study, results)
-        link = f"?tab=study&study={quote(name)}"
-        return JobReply(job=jobs.submit("study", f"Cells of study {name}", arguments, key, link, output_exists=False))
+        title, link = f"Cells of study {name}", f"?tab=study&study={quote(name)}"
+        return JobReply(job=jobs.submit("study", title, arguments, key, link, output_exists=False))
 
     @router.post("/api/studies/{name}/{task}/{filter}/{seed}")
     def open_checkpoint(name: str, task: str, filter: str, seed: int) -> FilterName:

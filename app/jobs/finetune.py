@@ -30,8 +30,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Fine-tune, resuming if interrupted; write checkpoint and result into the run's folder."""
     from beliefscope.recordings.rerun_log.training_curves import log_curves  # imports Rerun
 
-    settings = Settings.from_json(arguments["server"])
-    tuning = FineTune.from_json(arguments["settings"])
+    settings = Settings.from_json(arguments["settings"])
+    tuning = FineTune.from_json(arguments["tuning"])
     folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
     path = folder / "finetuned.safetensors"
     # Threads of torch that wait for a core which the page uses cost more time than they save.

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -97,7 +97,8 @@ RECORD = TypeAdapter(Job)
 class Jobs:
     """The jobs of one server, including ended ones of earlier servers. Thread-safe.
 
-    folder: of the job folders; created on first use. kinds: see ``KINDS``. max_running, max_waiting: limits.
+    folder: of the job folders; created on first use. kinds: see ``KINDS``. max_running, max_waiting: limits. settings:
+    of the server, as JSON; added to the arguments of each job.
     """
 
     def __init__(
@@ -106,9 +107,10 @@ class Jobs:
         kinds: Mapping[str, str] = KINDS,
         max_running: int = MAX_RUNNING,
         max_waiting: int = MAX_WAITING,
+        settings: Callable[[], Mapping[str, Any]] = dict,
     ) -> None:
-        self._folder, self._kinds, self._max_active = folder, kinds, max_running + max_waiting
-        self._max_running = max_running
+        self._folder, self._settings, self._kinds = folder, settings, kinds
+        self._max_running, self._max_active = max_running, max_running + max_waiting
         self._lock = threading.RLock()
         self._executor = ThreadPoolExecutor(max_running, "job")
         self._processes: dict[str, WorkerProcess] = {}
@@ -135,7 +137,7 @@ class Jobs:
             return self._jobs[id]
 
     def find(self, kind: str, key: object) -> Job | None:
-        """The job submitted with this kind and key, if any."""
+        """The job submitted with this kind and key (or arguments), if any."""
         with self._lock:
             return self._jobs.get(_id(kind, key))
 
@@ -159,19 +161,20 @@ class Jobs:
         kind: str,
         title: str,
         arguments: Mapping[str, Any],
-        key: object,
+        key: object = None,
         link: str = "",
         output_exists: bool = True,
     ) -> Job:
         """Queue a job, or return the existing one with the same kind and key if it is active or done.
 
-        arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
-        link: page address of the result. output_exists: False if files that the job wrote have been deleted.
+        arguments: JSON, passed to the kind's function. key: everything the result depends on, compared by ``repr``; by
+        default the arguments, which then have hashes of the files that the job reads. link: page address of the
+        result. output_exists: False if files that the job wrote have been deleted.
 
         Raises BadInput for an unknown kind or a full disk, and QueueFull.
         """
         check_name("kind of job", kind, self._kinds)
-        id = _id(kind, key)
+        id = _id(kind, arguments if key is None else key)
         with self._lock:
             existing = self._jobs.get(id)
             if existing is not None and (existing.active or (output_exists and self.finished_result(existing))):
@@ -194,7 +197,7 @@ class Jobs:
             self._save(job)
             self._jobs[id] = job
             begun = threading.Event()
-            self._executor.submit(self._run, id, arguments, begun)
+            self._executor.submit(self._run, id, {**arguments, "settings": self._settings()}, begun)
             for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
                 self._delete(job.id)
         if active < self._max_running:

@@ -77,7 +77,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     delete_abandoned_parts(settings.workspace)
     store = TraceStore(with_saved_filters(settings), TraceWorker() if subprocess else None)
     views = Views(store, settings.views)
-    jobs = Jobs(settings.workspace / "jobs")
+    jobs = Jobs(settings.workspace / "jobs", settings=lambda: store.settings.to_json())
     viewer = WebViewer(settings.workspace / "cache")
     files = RecordingFolder(settings.workspace / "recordings")
 
