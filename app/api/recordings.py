@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -42,6 +43,7 @@ MAX_UPLOAD = 2 * 10**9  # bytes
 RESERVED_SPACE = 2 * 10**8  # bytes that uploads leave free on the disk
 CHECK_INTERVAL = 1 << 24  # uploaded bytes between checks of the free space
 MAGIC = b"RRF"  # first bytes of all versions of Rerun's files
+MAX_MATCHES = 4096  # recordings whose data set is remembered
 FREE_ROUNDING = 10**7  # bytes; keeps the ETag of the list stable
 
 
@@ -229,7 +231,7 @@ class RunMatcher:
 
     def __init__(self, store: TraceStore) -> None:
         self._store = store
-        self._data_names: dict[tuple[str, int, str], str | None] = {}
+        self._find_data = lru_cache(MAX_MATCHES)(self._search_data)  # data sets do not change
 
     def entry(self, recording: Recording) -> RecordingEntry:
         """The list entry of a recording."""
@@ -269,17 +271,13 @@ class RunMatcher:
             return RunNames(filter=filter_, data=data), ""
         return None, reason
 
-    def _find_data(self, task: str, index: int, digest: str) -> str | None:
-        """Name of the data set with this episode; cached, since data sets do not change."""
-        key = task, index, digest
-        if key not in self._data_names:
-            self._data_names[key] = None
-            for name, episodes in self._store.datasets(task).items():
-                with suppress(BadInput):  # unreadable episodes do not match
-                    if 0 <= index < len(episodes) and episodes[index].digest() == digest:
-                        self._data_names[key] = name
-                        break
-        return self._data_names[key]
+    def _search_data(self, task: str, index: int, digest: str) -> str | None:
+        """Name of the data set with this episode."""
+        for name, episodes in self._store.datasets(task).items():
+            with suppress(BadInput):  # unreadable episodes do not match
+                if 0 <= index < len(episodes) and episodes[index].digest() == digest:
+                    return name
+        return None
 
 
 def _url(name: str) -> str:

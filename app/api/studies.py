@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 from beliefscope.app.api.models import FilterName, JobReply, Reply
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.runs.catalog import short_names
+from beliefscope.app.runs.catalog import result_folders
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
 from beliefscope.datasets.errors import BadInput, check_name
@@ -78,9 +78,7 @@ class StudyList(Reply):
 
 def all_studies(folders: Mapping[str, Path], workspace: Path) -> list[Study]:
     """The studies given to the server by name, those in the workspace, and the built-in one."""
-    paths = {folder.resolve() for folder in folders.values()}
-    others = [path.parent for path in sorted(workspace.glob(f"*/{FILE}")) if path.parent.resolve() not in paths]
-    named = {**folders, **short_names(others, {*folders, SHIPPED})}
+    named = result_folders(folders, workspace, FILE, SHIPPED)
     return [*(Study(name, folder, True) for name, folder in named.items()), Study(SHIPPED, PRETRAINED, False)]
 
 

@@ -225,6 +225,13 @@ def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[s
     return {name(path): path for path in parts}
 
 
+def result_folders(given: Mapping[str, Path], workspace: Path, file: str, reserved: str = "") -> dict[str, Path]:
+    """Folders by name: those given to the server, and others in the workspace that contain ``file``."""
+    known = {folder.resolve() for folder in given.values()}
+    others = [path.parent for path in sorted(workspace.glob(f"*/{file}")) if path.parent.resolve() not in known]
+    return {**given, **short_names(others, {*given, reserved})}
+
+
 def served_names(filters: Sequence[str], data: Path | None) -> tuple[list[str], str]:
     """Names, as on the page, of filters (files or built-in ones) and of the data; None: the sample set."""
     files = short_names(map(Path, filter(is_path, filters)), PRETRAINED)

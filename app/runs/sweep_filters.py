@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beliefscope.app.runs.catalog import short_names
+from beliefscope.app.runs.catalog import result_folders
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
@@ -23,11 +23,7 @@ NAME = re.compile(rf"(.+)-([0-9a-f]{{{HASH_DIGITS}}})", re.DOTALL)
 
 def sweep_folders(settings: Settings) -> dict[str, Path]:
     """Folders of sweeps by name: those given to the server, and those in the workspace."""
-    given = settings.sweeps
-    paths = {folder.resolve() for folder in given.values()}
-    tables = sorted(settings.workspace.glob("*/results.parquet"))
-    others = [path.parent for path in tables if path.parent.resolve() not in paths]
-    return {**given, **short_names(others, given)}
+    return result_folders(settings.sweeps, settings.workspace, "results.parquet")
 
 
 def load_sweep_filter(sweep: Experiments, checkpoint: str, settings: Settings) -> tuple[str, Checkpoint, Path]:
