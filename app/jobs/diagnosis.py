@@ -69,5 +69,5 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
             lambda share: report(0.5 + 0.5 * share, "running the filter over the healthy episodes"),
             arguments["episodes"],
         )
-        store.healthy_records.put(checkpoint.hash, profile.to_json())
+        store.write_record(checkpoint, profile.to_json())
     return {"data": profile.data}

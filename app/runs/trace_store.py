@@ -1,5 +1,6 @@
 """The traces of a server, each computed once on first request; and the catalog of filters and data sets."""
 
+import copy
 import hashlib
 import json
 import threading
@@ -8,10 +9,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
+
+from pydantic import TypeAdapter
 
 from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
@@ -22,7 +25,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.sweep_filters import find_sweep_filter
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
-from beliefscope.app.workspace.healthy_records import HealthyRecords
+from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
@@ -41,6 +44,9 @@ BYTES_IN_MEMORY = 256 << 20  # of the most recent traces; one is kept whatever i
 MAX_WAITING = 64  # runs in the queue
 MAX_KEYS = 4096  # selections with a cached key, a few hundred bytes each
 
+RECORD = TypeAdapter(dict[str, Any])
+"""JSON of ``beliefscope.inspect.diagnostics.healthy_profile``, measured by a job for a filter that has none."""
+
 
 class TraceStore:
     """Traces, filters and data sets of a server. Methods may be called from any thread, and may block."""
@@ -49,7 +55,7 @@ class TraceStore:
         """worker: process that runs the filters; without one, they run in a thread."""
         self.settings = settings
         self.live = LiveRuns(settings.workspace / "live", settings.definitions)
-        self.healthy_records = HealthyRecords(settings.workspace / "healthy")
+        self._records = RecordCache(partial(read_record, RECORD))
         self._worker = worker
         self._lock = threading.RLock()
         self._key = lru_cache(MAX_KEYS)(self._compute_key)
@@ -156,8 +162,11 @@ class TraceStore:
         """Whether the run failed, or the healthy record of its filter was measured after its start."""
         if run.future.done() and run.future.exception() is not None:
             return True
-        record = self.healthy_records.get(run.checkpoint.hash)
+        record = self._records.get(self._record_path(run.checkpoint))
         return record is not None and record is not run.checkpoint.healthy_profile
+
+    def _record_path(self, checkpoint: Checkpoint) -> Path:
+        return self.settings.workspace / "healthy" / f"{checkpoint.hash}.json"
 
     def cached(self, selection: Selection) -> TracedRun | None:
         """The selected run if its trace is complete and in memory."""
@@ -196,18 +205,28 @@ class TraceStore:
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
         """With the healthy record of the workspace, if it was measured. Raises BadInput for an unknown name."""
         with self._lock:
-            return self.healthy_records.complete(self._filter(task, filter_))
+            checkpoint = self._filter(task, filter_)
+            record = self._records.get(self._record_path(checkpoint))
+            if record is not None:
+                checkpoint = copy.copy(checkpoint)
+                object.__setattr__(checkpoint, "healthy_profile", record)  # a checkpoint is frozen
+            return checkpoint
 
     def measured_record(self, task: str, filter_: str) -> str | None:
         """Which data the healthy record of the workspace is from; None if there is none. Raises as ``checkpoint``."""
         with self._lock:
-            record = self.healthy_records.get(self._filter(task, filter_).hash)
+            record = self._records.get(self._record_path(self._filter(task, filter_)))
             return None if record is None else str(record.get("data"))
 
     def record_version(self, task: str, filter_: str) -> int | None:
-        """Version of the healthy record of the workspace; None if there is none. Raises as ``checkpoint``."""
+        """Differs between measurements of the record in the workspace; None without. Raises as ``checkpoint``."""
         with self._lock:
-            return self.healthy_records.version(self._filter(task, filter_).hash)
+            return self._records.modified(self._record_path(self._filter(task, filter_)))
+
+    def write_record(self, checkpoint: Checkpoint, record: dict[str, Any]) -> None:
+        """Keep a healthy record of a filter in the workspace; replaces an earlier one."""
+        with self._lock:
+            self._records.put(self._record_path(checkpoint), record)
 
     def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
         """Name and data set; the task's first for an empty name. Raises BadInput for an unknown name."""
