@@ -232,7 +232,6 @@ def _add_files(app: FastAPI, viewer: WebViewer) -> None:
     def viewer_script() -> Response:
         return Response(viewer.script(), media_type="text/javascript")
 
-    @app.get("/vendor/rerun/viewer.wasm")
     @app.get("/vendor/rerun/re_viewer_bg.wasm")  # the name that viewer.js requests
     def viewer_module(request: Request) -> Response:
         return viewer_wasm(viewer, request)
