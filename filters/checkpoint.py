@@ -47,6 +47,7 @@ class Checkpoint:
             file.
         record: JSON: training command, seed, data hash, metrics, versions; keys of earlier versions are renamed.
         healthy_profile: JSON of ``beliefscope.inspect.diagnostics.healthy_profile``, or None.
+        path: of the file; None for an external filter and one in memory.
     """
 
     filter: Filter
@@ -54,6 +55,7 @@ class Checkpoint:
     hash: str
     record: Mapping[str, Any]
     healthy_profile: Mapping[str, Any] | None = None
+    path: Path | None = None
 
     @property
     def task(self) -> Task:
@@ -108,21 +110,21 @@ class DeferredCheckpoint(Checkpoint):
         """Raises BadInput like ``load_checkpoint``, except for damaged tensors."""
         header, _ = _read(path, prefix=None)
         architecture = _architecture(header)
-        values = _description(path, header) | {"_path": path, "_architecture": architecture}
+        values = _description(path, header) | {"_architecture": architecture}
         for key, value in values.items():
             object.__setattr__(self, key, value)  # a checkpoint is frozen
 
-    _path: Path
+    path: Path
     _architecture: Architecture
 
     @cached_property
     def filter(self) -> Filter:
-        return _filter(self._path, _read(self._path)[1], self._architecture)
+        return _filter(self.path, _read(self.path)[1], self._architecture)
 
     @cached_property
     def statistics(self) -> Statistics:
         statistics, prefix = Statistics(self.task), "statistics."
-        tensors = _read(self._path, prefix)[1]
+        tensors = _read(self.path, prefix)[1]
         statistics.load_state_dict({key.removeprefix(prefix): value.clone() for key, value in tensors.items()})
         return statistics
 
@@ -194,6 +196,7 @@ def _description(path: Path, header: Mapping[str, Any]) -> dict[str, Any]:
         "hash": hashlib.sha256(path.read_bytes()).hexdigest(),
         "record": training_record(header["record"]),
         "healthy_profile": header.get("healthy_profile"),
+        "path": path,
     }
 
 

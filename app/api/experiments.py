@@ -151,10 +151,10 @@ def routes(store: TraceStore) -> APIRouter:
 
     @router.post("/api/experiments/{sweep}/{checkpoint}")
     def open_checkpoint(sweep: str, checkpoint: str) -> FilterName:
-        name, loaded, path = load_sweep_filter(tables(sweep), checkpoint, store.settings)
+        name, loaded = load_sweep_filter(tables(sweep), checkpoint, store.settings)
         listed = catalog_names(store).get((loaded.task.name, checkpoint))
         if listed is None:
-            store.add_filter(loaded.task.name, name, loaded, path, first=False)
+            store.add_filter(loaded.task.name, name, loaded, first=False)
         return FilterName(filter=listed or name)
 
     return router

@@ -125,7 +125,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             if checkpoint.hash != hash_:
                 raise BadInput(f"{str(path)!r} is not the checkpoint that study {name!r} evaluated")
             catalog_name = f"{name}-{filter}-seed{seed}"
-            store.add_filter(task, catalog_name, checkpoint, path, first=False)
+            store.add_filter(task, catalog_name, checkpoint, first=False)
         return FilterName(filter=catalog_name)
 
     return router

@@ -40,14 +40,13 @@ DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 class TaskCatalog:
     """Filters and data sets of one task by name. The included ones are loaded on first use.
 
-    paths: filter -> checkpoint file; external filters have none. secondary: filters of the user that do not replace the
-    default filter: they are listed after it, and after the user's other filters.
+    secondary: filters of the user that do not replace the default filter: listed after it, and after the user's
+    other filters.
     """
 
     task: Task
     user_filters: dict[str, Checkpoint] = field(default_factory=dict)
     user_data: dict[str, Dataset] = field(default_factory=dict)
-    paths: dict[str, Path] = field(default_factory=dict)
     secondary: set[str] = field(default_factory=set)
 
     @cached_property
@@ -57,8 +56,7 @@ class TaskCatalog:
         for name in dict.fromkeys((*DEFAULT_FILTERS, *filters_of(self.task))):
             if name not in self.user_filters:
                 with suppress(BadInput):  # no pretrained checkpoint ships
-                    self.paths[name] = shipped(self.task, name)
-                    filters[name] = _included(self.paths[name])
+                    filters[name] = _included(shipped(self.task, name))
         for name, source in EXTERNAL.get(self.task.name, {}).items():
             filters.setdefault(name, _external(source, self.task))
         listed = list(filters.items())
@@ -73,9 +71,8 @@ class TaskCatalog:
                 data[SAMPLE] = _sample(sample_path(self.task), self.task)
         return data
 
-    def add_filter(self, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
+    def add_filter(self, name: str, checkpoint: Checkpoint, first: bool) -> None:
         """Add a filter as the default, or after the default and the user's other filters."""
-        self.paths[name] = path
         (self.secondary.discard if first else self.secondary.add)(name)
         others = {key: value for key, value in self.user_filters.items() if key != name}
         self.user_filters = {name: checkpoint, **others} if first else {**others, name: checkpoint}
@@ -170,8 +167,6 @@ def task_catalogs(
             catalog.user_filters[name] = checkpoint
             if name in secondary:
                 catalog.secondary.add(name)
-            if isinstance(source, Path):
-                catalog.paths[name] = source
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
     for name, path in data.items():
         with _collect_error(problems):

@@ -53,8 +53,7 @@ def save_filter(store: TraceStore, new: SavedFilter) -> None:
     others = [saved for saved in _read(store.settings.workspace) if (saved.task, saved.name) != (new.task, new.name)]
     if new.default:
         others = [replace(saved, default=saved.default and saved.task != new.task) for saved in others]
-    path = Path(new.path)
-    store.add_filter(new.task, new.name, load_checkpoint(path), path, first=new.default)
+    store.add_filter(new.task, new.name, load_checkpoint(Path(new.path)), first=new.default)
     write_record([new, *others], store.settings.workspace / FILE)
 
 

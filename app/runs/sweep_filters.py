@@ -26,8 +26,8 @@ def sweep_folders(settings: Settings) -> dict[str, Path]:
     return result_folders(settings.sweeps, settings.workspace, "results.parquet")
 
 
-def load_sweep_filter(sweep: Experiments, checkpoint: str, settings: Settings) -> tuple[str, Checkpoint, Path]:
-    """Name, filter and file of the checkpoint with this hash.
+def load_sweep_filter(sweep: Experiments, checkpoint: str, settings: Settings) -> tuple[str, Checkpoint]:
+    """Name and filter of the checkpoint with this hash.
 
     Raises BadInput for an unknown hash, and for a file that is missing or was changed.
     """
@@ -35,11 +35,11 @@ def load_sweep_filter(sweep: Experiments, checkpoint: str, settings: Settings) -
     loaded = load_checkpoint(path, settings.definitions)
     if loaded.hash != checkpoint:
         raise BadInput(f"checkpoint {str(path)!r} was changed after the sweep, from {checkpoint[:12]}")
-    return f"{path.stem}-{checkpoint[:HASH_DIGITS]}", loaded, path
+    return f"{path.stem}-{checkpoint[:HASH_DIGITS]}", loaded
 
 
-def find_sweep_filter(task: str, name: str, settings: Settings) -> tuple[Checkpoint, Path] | None:
-    """Filter and file of a name from ``load_sweep_filter``; None if no sweep of the server has it.
+def find_sweep_filter(task: str, name: str, settings: Settings) -> Checkpoint | None:
+    """Filter of a name from ``load_sweep_filter``; None if no sweep of the server has it.
 
     Raises BadInput if the file is missing or was changed.
     """
@@ -56,7 +56,7 @@ def find_sweep_filter(task: str, name: str, settings: Settings) -> tuple[Checkpo
             query = "SELECT checkpoint FROM checkpoints WHERE task = ? AND name = ? AND starts_with(checkpoint, ?)"
             for row in tables.query(query, [task, *match.groups()]).to_pylist():
                 try:
-                    return load_sweep_filter(tables, row["checkpoint"], settings)[1:]
+                    return load_sweep_filter(tables, row["checkpoint"], settings)[1]
                 except BadInput as error:
                     problem = problem or BadInput(f"filter {name!r} of sweep {sweep!r}: {error}")
     if problem is not None:

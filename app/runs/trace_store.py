@@ -236,11 +236,12 @@ class TraceStore:
             catalog = self._catalog(task)
             return name or next(iter(catalog.data)), catalog.dataset(name)
 
-    def add_filter(self, task: str, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
+    def add_filter(self, task: str, name: str, checkpoint: Checkpoint, first: bool) -> None:
         """Add a filter to the catalog and the settings, so that jobs find it by its name."""
         with self._lock:
-            self._catalog(task).add_filter(name, checkpoint, path, first)
-            self.settings = replace(self.settings, checkpoints={**self.settings.checkpoints, name: path})
+            self._catalog(task).add_filter(name, checkpoint, first)
+            source = checkpoint.path or checkpoint
+            self.settings = replace(self.settings, checkpoints={**self.settings.checkpoints, name: source})
 
     def remove_filter(self, task: str, name: str) -> None:
         """Remove a filter from the catalog and the settings."""
@@ -272,8 +273,8 @@ class TraceStore:
 
     def _add_sweep_filter(self, task: str, name: str) -> None:
         """Add the filter to the catalog if only a sweep has it. Raises BadInput if its file is missing or changed."""
-        if name not in self._catalog(task).filters and (item := find_sweep_filter(task, name, self.settings)):
-            self.add_filter(task, name, *item, first=False)
+        if name not in self._catalog(task).filters and (filter_ := find_sweep_filter(task, name, self.settings)):
+            self.add_filter(task, name, filter_, first=False)
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
         """The recorded live run, if the selection is exactly that run."""
@@ -335,19 +336,15 @@ class TraceStore:
 
     def _run_request(self, selection: Selection, checkpoint: Checkpoint) -> RunRequest:
         with self._lock:
-            catalog = self._catalog(selection.task)
             live = selection.data.startswith(LIVE_PREFIX)
-            data = self.live.path(selection.data) if live else catalog.dataset(selection.data).path
-            if external := isinstance(checkpoint, ExternalFilter):
-                source = checkpoint.source
-            else:
-                source = str(catalog.paths[selection.filter])
+            data = self.live.path(selection.data) if live else self.dataset(selection.task, selection.data)[1].path
+            source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else str(checkpoint.path)
             original = str(self._trace_file(replace(selection, edit=None, only="")))
             return RunRequest(
                 **vars(selection),
                 definition=json.dumps(task_to_json(checkpoint.task), sort_keys=True),
                 checkpoint=source,
-                external=external,
+                external=checkpoint.path is None,
                 path=str(data),
                 original=original,
                 output=str(self._trace_file(selection)),
