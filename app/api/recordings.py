@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import time
-from collections.abc import AsyncIterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request, Response
@@ -110,14 +108,7 @@ class NewName(RequestBody):
 
 
 def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
-    writer = ThreadPoolExecutor(1, "writing recordings")  # one thread: matplotlib keeps fonts open per thread
-
-    @asynccontextmanager
-    async def lifespan(_: Any) -> AsyncIterator[None]:
-        yield
-        await asyncio.to_thread(writer.shutdown, cancel_futures=True)
-
-    router = APIRouter(lifespan=lifespan)
+    router = APIRouter()
     matcher = RunMatcher(store)
 
     @router.get("/api/recordings", response_model=RecordingList)
@@ -158,7 +149,7 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
                 title, link = f"Recording of {selection.describe()}", _url(path.name).lstrip("/")
                 job = jobs.submit("recording", title, arguments, link=link, output_exists=False)
                 return JobReply(job=job)
-            writer.submit(write, files, run, path).result()
+            files.writer.submit(write, files, run, path).result()
         else:
             response.status_code = 200
         seconds = None if existed else time.perf_counter() - start

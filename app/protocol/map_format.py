@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import measure_maps, particle_cloud
@@ -72,8 +71,8 @@ def encode_maps(trace: Trace, index: int, maps: LikelihoodMap) -> EncodedMaps:
     cells, log_max, log_range = quantise(maps.log_likelihood)
     cloud = particle_cloud(trace, index, maps.components)
     axes = [
-        _axis_json(task.components[k], offsets) | {"index": k}
-        for k, offsets in zip(maps.components, (maps.offsets_x, maps.offsets_y), strict=False)
+        task.components[k].to_json() | {"half_width": float(-x[0] + 0.5 * (x[1] - x[0])), "index": k}  # SI
+        for k, x in zip(maps.components, (maps.offsets_x, maps.offsets_y), strict=False)
     ]
     on_floor, same_unit = maps.components == task.floor, len(axes) == 2 and axes[0]["unit"] == axes[1]["unit"]
     statistics = measure_maps([replace(maps, step=index)], trace)
@@ -106,11 +105,6 @@ def encode_maps(trace: Trace, index: int, maps: LikelihoodMap) -> EncodedMaps:
     }
     floats = [] if cloud is None else [np.ascontiguousarray(part, dtype="<f4").tobytes() for part in cloud]
     return EncodedMaps(maps, on_floor, json.dumps(description), b"".join([*floats, cells.astype("<u2").tobytes()]))
-
-
-def _axis_json(component: Component, offsets: NDArray[np.float32]) -> dict[str, Any]:
-    """A component that a map shows. half_width: SI."""
-    return component.to_json() | {"half_width": float(-offsets[0] + 0.5 * (offsets[1] - offsets[0]))}
 
 
 def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:

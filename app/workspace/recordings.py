@@ -54,7 +54,10 @@ class Recording:
 
 
 class RecordingFolder:
-    """The recordings of one folder. Methods may be called from any thread, and may block."""
+    """The recordings of one folder. Methods may be called from any thread, and may block.
+
+    writer: writes recordings in one thread, as matplotlib keeps fonts open per thread.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -63,6 +66,7 @@ class RecordingFolder:
         self._records = RecordCache(partial(read_record, TypeAdapter(Record)))
         self._probe = RecordingProbe()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reading recordings")
+        self.writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writing recordings")
         self._queued: dict[str, os.stat_result] = {}
 
     def list_recordings(self) -> list[Recording]:
@@ -152,9 +156,10 @@ class RecordingFolder:
         return self.get(self.trash.restore(id).name)
 
     def close(self) -> None:
-        """Stop reading files."""
+        """Stop reading and writing files."""
         self._probe.close()
-        self._reader.shutdown(wait=True, cancel_futures=True)
+        for executor in (self._reader, self.writer):
+            executor.shutdown(wait=True, cancel_futures=True)
 
     def _files(self) -> Iterator[tuple[str, os.stat_result]]:
         """Names and states of all regular files."""
