@@ -5,7 +5,6 @@ Another job measures the healthy record of a filter that has none.
 """
 
 import json
-import threading
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
@@ -27,8 +26,6 @@ from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import MAX_EPISODES as MAX_RECORDED
 
 Over = Annotated[Literal["episode", "held-out"], Query(description="the run's episode, or held-out ones")]
-
-_computing = threading.Lock()  # one preliminary diagnosis at a time
 
 MAX_EPISODES = 10
 """Held-out episodes of a diagnosis: more take longer and change little."""
@@ -202,11 +199,11 @@ def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> 
 def preliminary_diagnosis(store: TraceStore, selection: Selection) -> Any:
     """The preliminary diagnosis as JSON values, kept with the run. Raises BadInput without a healthy profile."""
     run = finished_run(store, selection)
-    with _computing:
-        if "diagnosis" not in run.diagnostics:
-            result = preliminary(run.checkpoint, run.trace, store.settings.particles)
-            run.diagnostics["diagnosis"] = json.dumps(as_json(result.to_json()), allow_nan=False).encode()
-        return json.loads(run.diagnostics["diagnosis"])
+
+    def compute() -> Any:
+        return as_json(preliminary(run.checkpoint, run.trace, store.settings.particles).to_json())
+
+    return json.loads(run.result("diagnosis", compute))
 
 
 def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Routes under ``/api/diagnostics``: diagnostics of one episode or of all held-out episodes; slow ones as jobs."""
 
-import json
-import threading
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
@@ -71,7 +69,6 @@ Episodes = Literal["held-out"] | None
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
-    computing = threading.Lock()  # one fast diagnostic at a time
 
     @router.get("/api/diagnostics", response_model=list[DiagnosticInfo])
     def list_diagnostics() -> list[dict[str, Any]]:
@@ -100,8 +97,11 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         run = finished_run(store, selection)
         _check(entry, run)
         if not (entry.slow or episodes):
-            with computing:
-                return Response(_result(entry, run, options), media_type="application/json")
+            key = repr((entry.name, sorted(options.items())))
+            result = run.result(
+                key, lambda: {"trajectories": 1, **entry([run.trace], run.checkpoint, **options).views()}
+            )
+            return Response(result, media_type="application/json")
         return result_or_job(jobs, "diagnostic", _arguments(store, entry, selection, options, episodes))
 
     @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
@@ -115,15 +115,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
 
     return router
-
-
-def _result(entry: Entry, run: TracedRun, options: Mapping[str, Any]) -> bytes:
-    """Result of a fast diagnostic as JSON, kept with the run."""
-    key = repr((entry.name, sorted(options.items())))
-    if key not in run.diagnostics:
-        views = entry([run.trace], run.checkpoint, **options).views()
-        run.diagnostics[key] = json.dumps({"trajectories": 1, **views}, allow_nan=False).encode()
-    return run.diagnostics[key]
 
 
 def _check(entry: Entry, run: TracedRun) -> None:

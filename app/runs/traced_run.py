@@ -1,7 +1,9 @@
 """A filter run that is being computed or complete, and the values derived from its trace."""
 
+import json
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future, TimeoutError as FutureTimeout
 from functools import cached_property
 from typing import Any
@@ -18,6 +20,8 @@ from beliefscope.inspect.trace import Trace, arrays_of
 MAP_CACHE_BYTES = 12 << 20  # per trace: about 300 coarse maps
 DEFAULT_MAP = MapOptions()
 
+_computing = threading.Lock()
+
 
 class TracedRun:
     """A run and its trace. Methods may be called from any thread.
@@ -27,7 +31,6 @@ class TracedRun:
         future: the trace, or the error that ended its computation.
         progress: completed fraction, 0..1.
         scene_key: identifies what a 3D scene draws; equal for all states of a live run.
-        diagnostics: results of fast diagnostics and the preliminary diagnosis, as JSON; kept by their routes.
         growing: whether the run is live and may get more steps (``app/runs/live_runs.py``).
     """
 
@@ -39,7 +42,7 @@ class TracedRun:
         self.future: Future[Trace] = Future()
         self.future.set_running_or_notify_cancel()  # a client that stops waiting must not cancel it
         self.progress = 0.0
-        self.diagnostics: dict[str, bytes] = {}
+        self._results: dict[str, bytes] = {}
         self._engine_lock = threading.Lock()
         self._cache_lock = threading.Lock()
         self._cache: OrderedDict[tuple[int, int, MapOptions], EncodedMaps] = OrderedDict()
@@ -105,6 +108,13 @@ class TracedRun:
             while self._cache_bytes > MAP_CACHE_BYTES:
                 self._cache_bytes -= self._cache.popitem(last=False)[1].nbytes
         return maps
+
+    def result(self, name: str, compute: Callable[[], Any]) -> bytes:
+        """JSON of a fast diagnostic or another result with this name, kept with the run. One is computed at a time."""
+        with _computing:
+            if name not in self._results:
+                self._results[name] = json.dumps(compute(), allow_nan=False).encode()
+            return self._results[name]
 
     def missing_maps(self, step: int, count: int, options: MapOptions) -> list[int]:
         """Of the ``count`` steps nearest to ``step``, those whose coarse map is not cached; the nearest first."""
