@@ -55,7 +55,7 @@ class Settings:
             "checkpoints": {
                 name: {"source": filter_.source, "task": task_to_json(filter_.task)}
                 if isinstance(filter_, ExternalFilter)
-                else str(filter_)
+                else str(filter_.path if isinstance(filter_, Checkpoint) else filter_)
                 for name, filter_ in self.checkpoints.items()
             },
             "tasks": list(self.tasks),
