@@ -1,7 +1,6 @@
 """Routes under ``/api/studies``: results of studies, and training of their unfinished cells."""
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -11,12 +10,11 @@ from pydantic import ConfigDict
 from beliefscope.app.api.models import FilterName, JobReply, Reply
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.runs.catalog import result_folders
+from beliefscope.app.runs.study_filters import all_studies, load_study_filter, study_filter_name
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
+from beliefscope.app.workspace.studies import Results, Study
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.store import sample_path
-from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.names import is_code
 from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.study_table import Row
@@ -76,12 +74,6 @@ class StudyList(Reply):
     problems: list[str]
 
 
-def all_studies(folders: Mapping[str, Path], workspace: Path) -> list[Study]:
-    """The studies given to the server by name, those in the workspace, and the built-in one."""
-    named = result_folders(folders, workspace, FILE, SHIPPED)
-    return [*(Study(name, folder, True) for name, folder in named.items()), Study(SHIPPED, PRETRAINED, False)]
-
-
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
 
@@ -120,12 +112,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             raise NotFound(f"Study {name!r} has no checkpoint {cell!r}.")
         catalog_name = catalog_names(store).get((task, hash_))
         if catalog_name is None:
-            path = study.checkpoint(cell)
-            checkpoint = load_checkpoint(path)
-            if checkpoint.hash != hash_:
-                raise BadInput(f"{str(path)!r} is not the checkpoint that study {name!r} evaluated")
-            catalog_name = f"{name}-{filter}-seed{seed}"
-            store.add_filter(task, catalog_name, checkpoint, first=False)
+            catalog_name = study_filter_name(cell, hash_)
+            store.add_filter(task, catalog_name, load_study_filter(study, cell, hash_, store.settings), first=False)
         return FilterName(filter=catalog_name)
 
     return router

@@ -22,6 +22,7 @@ from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.study_filters import find_study_filter
 from beliefscope.app.runs.sweep_filters import find_sweep_filter
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
@@ -79,14 +80,14 @@ class TraceStore:
     def catalog(self, task: str = "", filters: Sequence[str] = ()) -> dict[str, Any]:
         """``tasks`` that can be displayed, the ``problems``, and ``examples``.
 
-        task, filters: filters to include if a sweep has them.
+        task, filters: filters to include if a sweep or a study has them.
         """
         with self._lock:
             catalogs, problems = self._catalogs
             problems = list(problems)
             for name in filters if task in catalogs else ():
                 try:
-                    self._add_sweep_filter(task, name)
+                    self._add_stored_filter(task, name)
                 except BadInput as error:
                     problems.append(str(error))
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
@@ -268,13 +269,16 @@ class TraceStore:
         return catalogs[task]
 
     def _filter(self, task: str, name: str) -> Checkpoint:
-        self._add_sweep_filter(task, name)
+        self._add_stored_filter(task, name)
         return self._catalog(task).filter(name)
 
-    def _add_sweep_filter(self, task: str, name: str) -> None:
-        """Add the filter to the catalog if only a sweep has it. Raises BadInput if its file is missing or changed."""
-        if name not in self._catalog(task).filters and (filter_ := find_sweep_filter(task, name, self.settings)):
-            self.add_filter(task, name, filter_, first=False)
+    def _add_stored_filter(self, task: str, name: str) -> None:
+        """Add a filter that only a sweep or a study has. Raises BadInput if its file is missing or changed."""
+        if name not in self._catalog(task).filters:
+            settings = self.settings
+            filter_ = find_sweep_filter(task, name, settings) or find_study_filter(task, name, settings)
+            if filter_ is not None:
+                self.add_filter(task, name, filter_, first=False)
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
         """The recorded live run, if the selection is exactly that run."""

@@ -43,7 +43,7 @@ class Results(BaseModel):
     tasks: Mapping[str, Mapping[str, str]]
     seeds: Annotated[int, Field(ge=1)]
     rows: list[Annotated[Row, BeforeValidator(_rename)]]
-    checkpoints: Mapping[str, str] = {}
+    checkpoints: Mapping[CellName, str] = {}
     cells: Mapping[CellName, str] = {}
     given: Mapping[str, str] = {}
 

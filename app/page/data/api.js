@@ -116,7 +116,7 @@ function path(parts, query) {
 /**
  * Gets the catalog.
  * @param {string} [task]
- * @param {string[]} [filters] of the task to include, although only a sweep has them
+ * @param {string[]} [filters] of the task to include, although only a sweep or a study has them
  * @returns {Promise<Catalog>}
  */
 export const catalog = (task, filters = []) =>

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.api.studies import all_studies
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.study_filters import all_studies
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
@@ -54,6 +54,11 @@ def folder(settings: Settings, tmp_path: Path) -> Path:
     return tmp_path / "mine"
 
 
+def name_in_catalog(folder: Path) -> str:
+    (hash_,) = json.loads((folder / FILE).read_text())["checkpoints"].values()
+    return f"{FILTER}-seed0-{hash_[:8]}"
+
+
 def find_study(client: TestClient, name: str) -> dict[str, Any]:
     (study,) = (s for s in client.get("/api/studies").json()["studies"] if s["name"] == name)
     return study
@@ -85,13 +90,46 @@ def test_checkpoint_is_added_to_the_catalog_once(
         assert task["filters"] == [{"name": FILTER, "trained": [{"seed": 0, "catalog_name": None, "file": True}]}]
         url = f"/api/studies/mine/door/{FILTER}/0"
         opened = client.post(url).json()
-        assert opened == {"filter": f"mine-{FILTER}-seed0"} == client.post(url).json()
+        assert opened == {"filter": name_in_catalog(folder)} == client.post(url).json()
         (door,) = (t for t in client.get("/api/catalog").json()["tasks"] if t["name"] == "door")
         assert [f["name"] for f in door["filters"]].count(opened["filter"]) == 1
         (task,) = find_study(client, "mine")["tasks"]
         assert task["filters"][0]["trained"][0]["catalog_name"] == opened["filter"]
         assert client.post(f"/api/studies/mine/door/{FILTER}/1").status_code == 404
         assert client.post(f"/api/studies/none/door/{FILTER}/0").status_code == 404
+
+
+def test_name_of_a_checkpoint_is_valid_in_another_server(
+    settings: Settings, folder: Path, open_client: Callable[..., TestClient]
+) -> None:
+    name, file = name_in_catalog(folder), folder / "cells" / "door" / FILTER / "seed0.safetensors"
+    new_server = replace(settings, studies={"renamed": folder}, data={}, checkpoints={})
+    damaged = settings.workspace / "damaged" / FILE
+    damaged.parent.mkdir(parents=True)
+    damaged.write_text(json.dumps(results("") | {"checkpoints": {"door": "0"}}))
+
+    def catalog(client: TestClient) -> tuple[list[str], list[str]]:
+        """Names of the filters of door, and problems."""
+        reply = client.get("/api/catalog", params={"task": "door", "filter": ["lstm-seed0-00000000", name]}).json()
+        (door,) = (task for task in reply["tasks"] if task["name"] == "door")
+        return [filter_["name"] for filter_ in door["filters"]], reply["problems"]
+
+    with open_client(new_server) as client:
+        filters, problems = catalog(client)
+        assert (filters[1:].count(name), problems) == (1, []), "listed after the default"
+        assert client.get(f"/api/trace/door/{name}/0").status_code in (200, 202)
+        assert client.get(f"/api/trace/door/{FILTER}-seed0-00000000/0").status_code == 400
+        assert client.get(f"/api/trace/push/{name}/0").status_code == 400, "of another task"
+    shutil.copy(PRETRAINED / "door-image-ekf.safetensors", file)
+    with open_client(new_server) as client:
+        filters, (problem,) = catalog(client)
+        assert name not in filters
+        assert problem.startswith(f"filter '{name}' of study 'renamed': ")
+        assert problem.endswith("is not the checkpoint that study 'renamed' evaluated")
+        assert problem in client.get(f"/api/trace/door/{name}/0").json()["error"]
+    file.unlink()
+    with open_client(new_server) as client:
+        assert catalog(client)[1][0].endswith("seed0.safetensors' does not exist")
 
 
 def test_checkpoint_with_another_hash_is_refused(
