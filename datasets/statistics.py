@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -14,7 +15,15 @@ from beliefscope.datasets.task import Task
 Statistics = Mapping[str, float | list[float]]
 """Name with unit -> number, or one number for each of the axes x, y, z. For the names see ``statistics``."""
 
-UNITS = ("cm", "mm", "deg", "N", "Nm")
+NAME = re.compile(r"(.+)_(std|range)_(.*)")
+"""Quantity, measure and unit of a name."""
+
+QUANTITIES = {
+    "contact_fraction": "steps in contact",
+    "effector": "effector position",
+    "effector_step": "effector displacement per step",
+}
+MEASURES = {"std": "standard deviation"}
 
 
 @dataclass(frozen=True)
@@ -67,23 +76,22 @@ def default_size(task_name: str) -> tuple[int, int]:
     return (100, 200) if reference is None else (reference.episodes, reference.steps)
 
 
-def comparison_rows(ours: Statistics, reference: Statistics) -> list[list[str]]:
-    """Name, values of two datasets and their ratio, one text each with a number for each axis."""
-
-    def axes(value: float | list[float]) -> list[float]:
-        return value if isinstance(value, list) else [value]
-
-    def label(name: str) -> str:
-        words, _, unit = name.replace("_", " ").rpartition(" ")
-        return f"{words}, {unit}" if unit in UNITS else f"{words} {unit}"
-
-    rows = []
+def comparison_table(ours: Statistics, reference: Statistics) -> tuple[list[str], list[list[str | float | None]]]:
+    """Headings and rows of a table: a row for each number, with that of the reference if it has any."""
+    rows: list[list[str | float | None]] = []
     for name, value in ours.items():
-        left, right = axes(value), axes(reference.get(name, []))
-        ratios = [a / b for a, b in zip(left, right, strict=False)]
-        texts = [" ".join(f"{number:.3g}" for number in numbers) for numbers in (left, right)]
-        rows.append([label(name), *texts, " ".join(f"{ratio:.2f}" for ratio in ratios)])
-    return rows
+        match = NAME.fullmatch(name)
+        subject, measure, unit = match.groups() if match else (name, "share", "")
+        other = reference.get(name)
+        for i, axis in enumerate("xyz" if isinstance(value, list) else [""]):
+            number = value[i] if isinstance(value, list) else value
+            paper = other[i] if isinstance(other, list) else other
+            ratio = None if paper is None else number / paper
+            label = f"{QUANTITIES.get(subject, subject.replace('_', ' '))} {axis}".rstrip()
+            rows.append([label, MEASURES.get(measure, measure), unit, number, paper, ratio])
+    columns = ["quantity", "measure", "unit", "this dataset", "paper", "this / paper"]
+    count = len(columns) if reference else columns.index("paper")
+    return columns[:count], [row[:count] for row in rows]
 
 
 def statistics(task: Task, episodes: Iterable[Episode]) -> Statistics:

@@ -10,7 +10,7 @@ import pytest
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.door import DOOR
-from beliefscope.datasets.statistics import PAPER_DATA, default_size, statistics
+from beliefscope.datasets.statistics import PAPER_DATA, comparison_table, default_size, statistics
 from beliefscope.datasets.store import open_dataset, sample_path
 
 
@@ -50,6 +50,25 @@ def test_statistics_of_two_episodes() -> None:
 def test_statistics_without_haptics() -> None:
     plain = dataclasses.replace(episode([[0.0] * 3] * 2, [[0.0] * 3] * 2, [True, True]), observations={})
     assert list(statistics(DOOR, [plain])) == ["contact_fraction", "hinge_x_std_cm", "hinge_y_std_cm", "angle_std_deg"]
+
+
+def test_comparison_table_has_one_number_in_each_cell() -> None:
+    ours = {"contact_fraction": 0.5, "range_std_m/s": 3.0, "effector_step_std_mm": [2.0, 1.0, 3.0]}
+    columns, rows = comparison_table(ours, {"contact_fraction": 0.25, "effector_step_std_mm": [4.0, 1.0, 1.0]})
+    assert columns == ["quantity", "measure", "unit", "this dataset", "paper", "this / paper"]
+    assert rows == [
+        ["steps in contact", "share", "", 0.5, 0.25, 2.0],
+        ["range", "standard deviation", "m/s", 3.0, None, None],
+        ["effector displacement per step x", "standard deviation", "mm", 2.0, 4.0, 0.5],
+        ["effector displacement per step y", "standard deviation", "mm", 1.0, 1.0, 1.0],
+        ["effector displacement per step z", "standard deviation", "mm", 3.0, 1.0, 3.0],
+    ]
+
+
+def test_comparison_table_without_published_data_has_no_columns_for_them() -> None:
+    columns, rows = comparison_table({"contact_fraction": 0.5}, {})
+    assert columns == ["quantity", "measure", "unit", "this dataset"]
+    assert rows == [["steps in contact", "share", "", 0.5]]
 
 
 @pytest.mark.parametrize("name", PAPER_DATA)

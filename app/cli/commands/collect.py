@@ -36,7 +36,7 @@ def collect(
     """
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.simulation.collect import collect as simulate
-    from beliefscope.datasets.statistics import PAPER_DATA, comparison_rows, default_size, statistics
+    from beliefscope.datasets.statistics import PAPER_DATA, comparison_table, default_size, statistics
     from beliefscope.datasets.store import open_dataset
 
     name = load_task(task).name
@@ -59,5 +59,5 @@ def collect(
             "data_hash": data.hash,
         }
     summary = f"{count} episodes of {length} steps, {ours['contact_fraction']:.0%} in contact"
-    table = console.grid("Statistics", ["", "this dataset", "paper", "ratio"], comparison_rows(ours, paper))
+    table = console.grid("Statistics over all steps", *comparison_table(ours, paper))
     return console.Result(document, f"{summary}\n\n{table}", output)
