@@ -158,10 +158,10 @@ def html_result(headline: str, tables: Sequence[Table]) -> str:
 
 
 def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Value]], note: str = "") -> str:
-    """A table with a title and a note as text; numbers are right-aligned with three digits, None is ``-``."""
+    """A table with a title and a note as text; numbers are right-aligned with three digits, None and NaN are ``-``."""
 
     def text(value: Value) -> str:
-        return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+        return "-" if value is None or value != value else f"{value:.3g}" if isinstance(value, float) else str(value)
 
     cells = [list(columns), *([text(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]

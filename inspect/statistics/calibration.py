@@ -77,10 +77,13 @@ def particle_crps(deviation: Array, weights: Array) -> Array:
 def ljung_box(series: Array, lags: int = LAGS) -> tuple[Array, Array]:
     """Ljung-Box statistic and autocorrelation at lag 1 of series (T, C); both (C,).
 
-    ``Q = T (T + 2) sum_h r_h^2 / (T - h)``, chi-square with ``lags`` degrees of freedom for white series.
+    ``Q = T (T + 2) sum_h r_h^2 / (T - h)``, chi-square with ``lags`` degrees of freedom for white series. Both are NaN
+    for a constant series, which has no autocorrelation.
     """
     steps = len(series)
     x = series - series.mean(0)
-    r = np.stack([(x[lag:] * x[:-lag]).sum(0) for lag in range(1, lags + 1)]) / np.square(x).sum(0)
+    # A constant such as 0.1 differs from its mean by rounding.
+    power = np.where(np.ptp(series, axis=0) > 0.0, np.square(x).sum(0), np.nan)
+    r = np.stack([(x[lag:] * x[:-lag]).sum(0) for lag in range(1, lags + 1)]) / power
     pairs = steps - np.arange(1, lags + 1)[:, None]
     return steps * (steps + 2) * (r**2 / pairs).sum(0), r[0]

@@ -16,7 +16,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.plotting import write_figure
-from beliefscope.inspect.diagnostics.views import as_json
+from beliefscope.inspect.diagnostics.views import as_json, format_table
 from beliefscope.inspect.statistics.measures import blackout
 from beliefscope.inspect.trace import Trace
 
@@ -145,3 +145,8 @@ def test_diagnostics_that_do_not_apply_to_an_lstm(name: str, why: str) -> None:
 def test_missing_checkpoint_is_refused() -> None:
     why = DIAGNOSTICS["maps"].refusal(plant.real("crossmodal-pf"), None)
     assert why == "maps needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
+
+
+def test_unknown_numbers_of_a_table_are_dashes() -> None:
+    rows = [(1.0, 2), (None, None), (float("nan"), 12)]
+    assert format_table("Title", ("a", "b"), rows).splitlines() == ["Title", "  a   b", "  1   2", "  -   -", "  -  12"]

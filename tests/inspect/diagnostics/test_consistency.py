@@ -226,6 +226,16 @@ def test_ljung_box_is_that_of_statsmodels() -> None:
     assert abs(correlation[0]) < 0.3 < 0.8 < correlation[1]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("constant", [0.0, 0.1, 1e9])
+def test_a_constant_series_has_no_autocorrelation(constant: float) -> None:
+    white = np.random.default_rng(5).normal(size=80)
+    statistic, correlation = ljung_box(np.stack([np.full(80, constant), white], axis=1))
+    assert np.isnan([statistic[0], correlation[0]]).all()
+    alone = [part[0] for part in ljung_box(white[:, None])]
+    assert [statistic[1], correlation[1]] == pytest.approx(alone)
+
+
 def test_phases_of_few_steps_get_no_verdict(exact: Consistency) -> None:
     entry = replace(exact.entry("fused"), steps=9, nees=50.0, interval=(40.0, 60.0), adjusted=(40.0, 60.0))
     assert entry.assessment == "too few steps (9; at least 10 needed)"
