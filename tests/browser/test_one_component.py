@@ -41,6 +41,13 @@ def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: A
     assert "has no healthy record" in text("#diagnosis .headline").text_content()
     assert text("#diagnosis > .doing button").text_content() == "Measure a healthy record"
     assert not text("#diagnosis .repair").is_visible()
+    text("#diagnosis > .doing button").click()
+    page.until("() => document.querySelector('#diagnosis').dataset.state === 'error'")
+    status = text("#diagnosis > .status").text_content()
+    assert "a healthy record needs at least" in status
+    assert not text("#diagnosis > .doing button").count(), "trying again cannot help"
+    page.screenshot("refused-record")
+    page.errors[:] = [line for line in page.errors if "status of 400" not in line]
     page.page.evaluate("document.querySelector('#tab-failures').click()")
     text("#failures").get_by_role("button", name="Search for failures", exact=True).click()
     page.until("() => document.querySelector('#failures').dataset.state === 'ready'")

@@ -2,6 +2,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
+import { ServerError } from '../../app/page/data/server_error.js';
 import { isTrainable, recoveredText } from '../../app/page/tabs/diagnosis.js';
 import { JobResults } from '../../app/page/widgets/job_results.js';
 
@@ -59,11 +60,32 @@ test('an error is kept, an aborted request is not, and the oldest result is drop
   const { results } = setUp();
   const fail = () => Promise.reject(new Error('no such filter'));
   await results.load('one', fail, signal);
-  assert.deepEqual(results.get('one'), { state: 'error', error: 'no such filter' });
+  assert.deepEqual(results.get('one'), {
+    state: 'error',
+    error: 'no such filter',
+    isRefusal: false,
+  });
   await results.load('two', fail, AbortSignal.abort());
   assert.equal(results.get('two').state, 'loading');
   await results.load('three', async () => ({}), signal);
   assert.equal(results.get('one').state, 'loading');
+});
+
+test('a request that the server refused cannot be tried again, unlike one that failed', async () => {
+  const { results } = setUp();
+  for (const [status, isRefusal] of [
+    [400, true],
+    [429, false],
+    [0, false],
+  ]) {
+    const error = new ServerError('5 held-out episodes', Number(status));
+    await results.startOrCancel('run', () => Promise.reject(error));
+    assert.deepEqual(results.get('run'), {
+      state: 'error',
+      error: '5 held-out episodes.',
+      isRefusal,
+    });
+  }
 });
 
 test('the effect of undoing a cause has a direction and no sign', () => {

@@ -66,6 +66,7 @@ async function request(url, options) {
   const body = await response.json().catch(() => ({}));
   throw new ServerError(
     body.error ?? `The server responded with ${response.status} ${response.statusText}.`,
+    response.status,
   );
 }
 

@@ -257,7 +257,7 @@ export class Diagnosis {
     const entry = this.#records.get(this.#recordKey);
     const isInUse = entry.state === 'ready' && entry.result.data === source;
     const trace = this.#trace;
-    const isShown = isInUse || ['active', 'ended'].includes(entry.state);
+    const isShown = isInUse || ['active', 'ended', 'error'].includes(entry.state);
     host.hidden = !this.#starts || !isShown;
     if (host.hidden || !trace) return;
     const { data } = trace.selection;

@@ -4,16 +4,17 @@
 /** @import { Jobs } from './jobs.js' */
 
 import { create, html, messageOf } from '../core/dom.js';
+import { ServerError } from '../data/server_error.js';
 import { isActive } from './jobs.js';
 
 /**
  * A result, or why there is none yet. absent: not requested; active: its job waits or runs; ended: without a result.
- * preliminary: the server's estimate of the result until then.
+ * preliminary: the server's estimate of the result until then. isRefusal: trying again cannot help.
  * @template T
  * @typedef {({state: 'ready', result: T, job?: undefined}
  *   | {state: 'absent' | 'loading', job?: undefined}
  *   | {state: 'active' | 'ended', job: Job}
- *   | {state: 'error', error: string, job?: undefined}) & {preliminary?: T}} JobResult
+ *   | {state: 'error', error: string, isRefusal?: boolean, job?: undefined}) & {preliminary?: T}} JobResult
  */
 
 /**
@@ -72,7 +73,7 @@ export class JobResults {
       else this.#set(key, { state: 'ready', result: reply });
     } catch (error) {
       if (signal.aborted) return;
-      this.#wait(key, { state: 'error', error: messageOf(error) });
+      this.#wait(key, failure(error));
     }
     this.#changed([]);
   }
@@ -88,7 +89,7 @@ export class JobResults {
     try {
       this.#wait(key, jobState((await request()).job));
     } catch (error) {
-      this.#wait(key, { state: 'error', error: messageOf(error) });
+      this.#wait(key, failure(error));
     }
     this.#changed([]);
     this.#jobs.refresh();
@@ -130,6 +131,16 @@ export class JobResults {
 }
 
 /**
+ * Returns the state of a result whose request failed.
+ * @param {unknown} error
+ * @returns {{state: 'error', error: string, isRefusal: boolean, job?: undefined}}
+ */
+function failure(error) {
+  const isRefusal = error instanceof ServerError && error.isRefusal;
+  return { state: 'error', error: messageOf(error), isRefusal };
+}
+
+/**
  * Returns the state of a result whose job is not done; null if there is no job.
  * @param {Job | null} job
  * @returns {{state: 'absent', job?: undefined} | {state: 'active' | 'ended', job: Job}}
@@ -140,9 +151,9 @@ function jobState(job) {
 }
 
 /**
- * Shows the button that starts or cancels a job, and the progress of an active one.
+ * Shows the button that starts or cancels a job, and the progress of an active one; no button for a refused request.
  * @param {HTMLElement} host
- * @param {{state: string, job?: Job}} result
+ * @param {{state: string, job?: Job, isRefusal?: boolean}} result
  * @param {object} button
  * @param {string} button.action text; empty: no button
  * @param {string} [button.label] accessible name, if it is not the text
@@ -150,18 +161,20 @@ function jobState(job) {
  * @param {() => void} button.press
  * @param {HTMLElement} [button.next] gets the focus when the button disappears
  */
-export function showJobButton(host, { state, job }, { action, label, progress, press, next }) {
-  const key = `${state} ${label || action}`;
+export function showJobButton(host, { state, job, isRefusal }, button) {
+  const { label, progress, press, next } = button;
+  const action = isRefusal ? '' : button.action;
+  const key = `${state} ${action && (label || action)}`;
   if (host.dataset.key !== key) {
     const hadFocus = host.contains(document.activeElement);
     host.dataset.key = key;
     host.replaceChildren();
     if (state === 'active') host.append(create('progress', { ariaLabel: progress }));
     if (action) {
-      const button = create('button', { type: 'button', className: 'text', textContent: action });
-      if (label) button.ariaLabel = label;
-      button.addEventListener('click', press);
-      host.append(button);
+      const start = create('button', { type: 'button', className: 'text', textContent: action });
+      if (label) start.ariaLabel = label;
+      start.addEventListener('click', press);
+      host.append(start);
     }
     if (hadFocus) (action ? html('button', host) : next)?.focus();
   }
