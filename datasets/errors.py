@@ -37,6 +37,12 @@ def unknown_name(kind: str, name: str, available: object) -> BadInput:
     return BadInput(f"{kind} {name!r} does not exist.{hint} Available: {', '.join(names) or 'none'}.")
 
 
+def type_name(value: object) -> str:
+    """The type of a value with its article: ``a Tensor`` or ``an int``."""
+    name = type(value).__name__
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
 def reason_unreadable(path: Path, error: Exception) -> str:
     """Why a file is no readable safetensors file: it is an HDF5 file, or the message of the library's error."""
     with suppress(OSError), path.open("rb") as file:

@@ -20,7 +20,7 @@ from beliefscope.datasets.episode_index import read_index, write_index
 from beliefscope.datasets.episode_parts import STEPS_PER_PART
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
-from beliefscope.datasets.readers.episode_file import FORMAT, VERSION, EpisodeFile, combined
+from beliefscope.datasets.readers.episode_file import FORMAT, VERSION, EpisodeFile, combined, is_episode_file
 from beliefscope.datasets.readers.hdf5_guard import (
     SAMPLES,
     DeferredErrorFile,
@@ -32,6 +32,12 @@ from beliefscope.datasets.readers.paper_authors import PaperDataset, is_paper_fi
 from beliefscope.datasets.readers.push_real_task import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference, task_to_json
+
+EXAMINED = 100
+"""Files of a folder that are searched for data files; data sets of other formats have thousands."""
+
+LISTED = 5
+"""Data files of a folder that are named in a message."""
 
 
 def sample_path(task: str | Task) -> Path:
@@ -76,12 +82,14 @@ def open_dataset(
     if read_index(path) is not None:
         mark_readable(path)  # it was read completely when the index was written
     probe(files)
+    if path.is_dir() and (own := list(filter(is_episode_file, files[:EXAMINED]))):
+        raise BadInput(f"{path} is a folder: give one of its data files, {_listed(own, path)}.")
     if is_mit_push(files[0]):
         return MitPushDataset(path, files, task if task in PUSH_REAL_TASKS else PUSH_REAL, skip_bad)
     if is_paper_file(files[0]):
         return PaperDataset(path, files, skip_bad)
     if path.is_dir():
-        raise BadInput(f"{path} contains datasets, such as {files[0].name}: give one of the files.")
+        raise BadInput(f"{path} is a folder without a data file of Beliefscope: expected FILE.h5 (docs/data.md).")
     return EpisodeFile(path, skip_bad, given if task is None else (task, *given))
 
 
@@ -93,8 +101,16 @@ def data_files(path: Path) -> list[Path]:
         return [path]
     files = sorted(file for file in path.rglob("*") if file.suffix in (".json", ".h5", ".hdf5") and file.is_file())
     if not files:
-        raise BadInput(f"Folder {path} has no data: expected files that end in .json, .h5 or .hdf5.")
+        raise BadInput(
+            f"folder {path} has no data: expected a data file, or a folder of files that end in .json, .h5 or .hdf5."
+        )
     return files
+
+
+def _listed(files: Sequence[Path], folder: Path) -> str:
+    names = [str(file.relative_to(folder)) for file in files]
+    more = len(names) - LISTED
+    return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _reduce(data: Dataset) -> tuple[Any, ...]:

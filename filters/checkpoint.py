@@ -33,7 +33,7 @@ from beliefscope.filters.batch import Statistics
 from beliefscope.filters.catalog import build
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
-from beliefscope.filters.names import PRETRAINED as PRETRAINED, shipped as shipped
+from beliefscope.filters.names import PRETRAINED as PRETRAINED, check_not_source, shipped as shipped
 
 FORMAT = 1
 
@@ -172,6 +172,7 @@ def _filter(path: Path, tensors: Mapping[str, torch.Tensor], architecture: Archi
 
 def _read(path: Path, prefix: str | None = "") -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Header of a file, and the tensors whose names start with the prefix; None: no tensors."""
+    check_not_source(str(path))
     if not path.is_file():
         raise BadInput(f"checkpoint {str(path)!r} does not exist")
     try:

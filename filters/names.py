@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -45,6 +47,7 @@ def filter_names(task: Task) -> dict[str, tuple[str, tuple[str, ...]]]:
 
 def shipped(task: str | Task, name: str) -> Path:
     """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
+    check_not_source(name)
     definition = find_task(task)
     filters, task = filter_names(definition), definition.name
     paths = {known: PRETRAINED / f"{task}-{known}.safetensors" for known in filters}
@@ -58,6 +61,28 @@ def shipped(task: str | Task, name: str) -> Path:
             f"Available: {', '.join(available) or 'none'}."
         )
     return paths[name]
+
+
+def check_not_source(text: str) -> None:
+    """Raise BadInput for the path of a Python file without the name of a function. The file is read, not run."""
+    if not text.endswith(".py"):
+        return
+    functions: list[str] = []
+    with suppress(OSError, ValueError, SyntaxError):
+        body = ast.parse(Path(text).read_bytes()).body
+        public = (node for node in body if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"))
+        functions = [node.name for node in public if _is_callable(node.args)]
+    listed = f" Functions without arguments: {', '.join(functions)}." if functions else ""
+    function = "build" if "build" in functions or not functions else functions[0]
+    raise BadInput(
+        f"filter {text!r} is a Python file: add the function that returns the filter, {text}:{function}.{listed}"
+    )
+
+
+def _is_callable(arguments: ast.arguments) -> bool:
+    """Whether a function can be called without arguments."""
+    positional = len(arguments.posonlyargs) + len(arguments.args)
+    return positional == len(arguments.defaults) and None not in arguments.kw_defaults
 
 
 def is_path(text: str) -> bool:

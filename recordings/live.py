@@ -123,12 +123,15 @@ class LiveRecorder:
             fields: fields of the trace that describe its origin: filter, seed, faults, data_hash, settings, ...
 
         Raises:
-            BadInput: neither a checkpoint nor a task is given, the task is unknown, or the name contains a folder.
+            BadInput: neither a checkpoint nor a task is given, the task is unknown, or the name is invalid.
         """
         if checkpoint is None and not task:
             raise BadInput("a live run needs the filter's checkpoint or the name of its task")
         if Path(name).name != name or name.startswith("."):
-            raise BadInput(f"live run {name!r}: the name must not contain a folder; use folder=")
+            raise BadInput(
+                f"{name!r} is not the name of a live run: give a file name, without a folder and not starting with a "
+                "dot. --workspace chooses the folder (in Python, folder=)."
+            )
         self._task = load_task(task) if checkpoint is None else checkpoint.task
         self._checkpoint, self._modalities, self._start, self._expected = checkpoint, modalities, start, expected
         self._fields = {"settings": {"torch": torch.__version__}} | fields

@@ -31,6 +31,17 @@ VERSION = 1
 T = TypeVar("T")
 
 
+def is_episode_file(path: Path) -> bool:
+    """Whether a file has the layout of this module, of any version."""
+    if path.suffix == ".json":
+        return False
+    try:
+        with open_hdf5(path) as file:
+            return bool(file.attrs.get("format", "") == FORMAT)
+    except (BadInput, *HDF5_ERRORS):
+        return False
+
+
 class EpisodeFile(Dataset):
     """A file written by ``write_dataset``. Opening reads only attributes; ``[i]`` reads and validates an episode.
 

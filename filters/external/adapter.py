@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets import rotations
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, type_name, unknown_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.belief import Gaussian, moments
 
@@ -178,7 +178,7 @@ def named_values(output: Any, source: str, task: Task) -> Values:
         output = dict(zip(("estimate_mean", "estimate_covariance"), output, strict=True))
     if not isinstance(output, Mapping):
         raise BadInput(
-            f"{source} returns a {type(output).__name__}, expected a mean, a pair of mean and covariance, or a dict"
+            f"{source} returns {type_name(output)}, expected a mean, a pair of mean and covariance, or a dict"
         )
     named = {name: value for name, value in output.items() if name != "extra"}
     named |= {f"{EXTRA}{name}": value for name, value in output.get("extra", {}).items()}
@@ -212,7 +212,7 @@ def _tensor(value: Any, name: str, source: str) -> Tensor:
         array = np.array(value)  # torch refuses some layouts of arrays, such as read-only ones and negative strides
         if array.dtype.kind in "biuf":
             return torch.from_numpy(array)
-    raise BadInput(f"{source} returns {name} as a {type(value).__name__}, expected an array or a Tensor")
+    raise BadInput(f"{source} returns {name} as {type_name(value)}, expected an array or a Tensor")
 
 
 def copied(values: Values) -> Values:

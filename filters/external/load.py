@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, type_name
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
@@ -383,7 +383,7 @@ def as_external(
     adapter = filter_ if isinstance(filter_, Adapter) else Adapter(filter_)
     if not callable(adapter.module) and not hasattr(adapter.module, "forward"):
         raise BadInput(
-            f"{source} returns a {type(adapter.module).__name__}, expected a filter, which can be called or has "
+            f"{source} returns {type_name(adapter.module)}, expected a filter, which can be called or has "
             "forward, or an Adapter of one"
         )
     loaded = load_task(task) if task else None

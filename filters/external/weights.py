@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from beliefscope.datasets.errors import BadInput, reason_unreadable
+from beliefscope.datasets.errors import BadInput, reason_unreadable, type_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
@@ -30,7 +30,7 @@ def load_weights(module: object, path: Path, place: str) -> None:
     Raises BadInput for a file that cannot be read or whose tensors are not those of the module.
     """
     if not isinstance(module, nn.Module):
-        raise BadInput(f"{place} builds a {type(module).__name__}, weights need a torch module")
+        raise BadInput(f"{place} builds {type_name(module)}, weights need a torch module")
     try:
         module.load_state_dict(load_file(path))
     except (OSError, SafetensorError) as error:

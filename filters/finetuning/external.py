@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, type_name
 from beliefscope.datasets.io import user_code
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.calls import inputs_of, seeded
@@ -79,7 +79,7 @@ def finetune_external(
     episode, and a loss that fails or is not a finite scalar with gradients.
     """
     if not isinstance(base.adapter.module, nn.Module):
-        raise BadInput(f"{base.source} is a {type(base.adapter.module).__name__}, fine-tuning needs a torch module")
+        raise BadInput(f"{base.source} is {type_name(base.adapter.module)}, fine-tuning needs a torch module")
     for slice_, _ in settings.mix:
         if slice_.contact is not None or slice_.only:
             raise BadInput(f"slice {slice_.name!r}: external filters are fine-tuned on slices of sensor faults only")

@@ -120,7 +120,19 @@ def test_missing_file(tmp_path: Path) -> None:
 
 
 def test_empty_folder(tmp_path: Path) -> None:
-    check_rejected(tmp_path, r"has no data: expected files that end in \.json, \.h5 or \.hdf5")
+    check_rejected(
+        tmp_path, r"has no data: expected a data file, or a folder of files that end in \.json, \.h5 or \.hdf5"
+    )
+
+
+def test_the_data_files_of_a_folder_are_named(path: Path) -> None:
+    folder = path.parent
+    (folder / "study.json").write_text("{}")
+    check_rejected(folder, rf"is a folder: give one of its data files, {path.name}\.")
+    (folder / "more").mkdir()
+    for i in range(6):
+        (folder / "more" / f"{i}.h5").write_bytes(path.read_bytes())
+    check_rejected(folder, r"data files, .*more/4\.h5 and 2 more\.")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root can read all files")

@@ -91,17 +91,11 @@ def _profile(checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate:
     Raises BadInput, before the runs, if these are too few for the diagnosis of ``count`` episodes.
     """
     from beliefscope.datasets.store import open_dataset
-    from beliefscope.inspect.diagnosis.diagnose import check_size
-    from beliefscope.inspect.diagnostics.healthy_profile import find_profile
+    from beliefscope.inspect.diagnosis.diagnose import check_size, required_profile
     from beliefscope.inspect.healthy import profile_of
 
     if clean is None:
-        profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
-        if profile is None:
-            raise BadInput(
-                f"filter {checkpoint.name!r} has no healthy record; give clean episodes, --profile-from DATA"
-            )
-        return profile
+        return required_profile(checkpoint)
     with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
         check_size(len(indices), count, alarm_rate)

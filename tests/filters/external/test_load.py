@@ -11,11 +11,12 @@ import pytest
 from torch import nn
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, type_name
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
+from beliefscope.filters.open_filter import open_filter
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def other():
         ("no.such.module:build", "", r"^module 'no\.such\.module' cannot be imported: ModuleNotFoundError"),
         ("own.py:biuld", "", r"^own\.py has no 'biuld'\. Available: Filter, build, number, fails, other\.$"),
         ("own.py:NUMBER", "", r"^own\.py has 'NUMBER', which is not callable\. Available"),
-        ("own.py:number", "", r"^own\.py:number returns a int, expected a filter, which can be called or has forward"),
+        ("own.py:number", "", r"^own\.py:number returns an int, expected a filter, which can be called or has forward"),
         ("own.py:fails", "", r"^own\.py:fails fails when called: KeyError: 'weights\.pt'$"),
         ("own.py:other", "", r"^filter 'own\.py:other' is for task 'push', not for 'door'$"),
         ("own.py:build", "1 / 0", r"^own\.py cannot be run: ZeroDivisionError"),
@@ -131,3 +132,25 @@ def test_hash_covers_code_without_a_file() -> None:
 def test_adapters_that_do_not_fit_the_task_are_rejected(adapter: dict[str, Any], message: str) -> None:
     with pytest.raises(BadInput, match=message):
         ExternalFilter(Adapter(nn.Linear(2, 2), **adapter), DOOR, "mine")
+
+
+@pytest.mark.parametrize("given", ["own.py", "./own.py"])
+def test_a_python_file_without_a_function_is_refused_with_its_functions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = "def _own(): ...\ndef make(a=1, *, b=2): ...\ndef needs(a): ...\ndef needs_too(*, a): ...\nraise OSError\n"
+    (tmp_path / "own.py").write_text(source)
+    expected = "Python file: add the function that returns the filter, own.py:make. "
+    with pytest.raises(BadInput) as error:
+        open_filter("door", given)
+    assert str(error.value).endswith(f"{expected}Functions without arguments: make.")
+    for content in ("def (", None):
+        (tmp_path / "own.py").unlink() if content is None else (tmp_path / "own.py").write_text(content)
+        with pytest.raises(BadInput, match=r"own\.py:build\.$"):
+            open_filter("door", given)
+
+
+@pytest.mark.parametrize(("value", "name"), [(3, "an int"), (None, "a NoneType"), (nn.ReLU(), "a ReLU")])
+def test_type_name_has_its_article(value: object, name: str) -> None:
+    assert type_name(value) == name
