@@ -366,6 +366,17 @@ CUT = """(selects) => selects.filter((select) => {
 """Returns the names of the select elements that are narrower than their selected names."""
 
 
+SMALLEST_GAP = """(tabs) => {
+  const names = [...tabs.children].map((tab) => {
+    const range = document.createRange();
+    range.selectNodeContents(tab);
+    return range.getBoundingClientRect();
+  });
+  return Math.min(...names.slice(1).map(({ left }, i) => left - names[i].right));
+}"""
+"""Returns the smallest distance between the names of two tabs, px."""
+
+
 def test_a_failed_run_is_reported_and_tried_again_and_names_are_whole(open_page: Any) -> None:
     page = open_page(size=(1280, 720))
     names = page.page.locator(".pickers select:visible")
@@ -375,6 +386,7 @@ def test_a_failed_run_is_reported_and_tried_again_and_names_are_whole(open_page:
     assert names.evaluate_all(CUT) == ["episode"], "the episode's properties are cut first"
     tabs = page.page.locator("#views .tabs")
     assert tabs.evaluate("(tabs) => tabs.scrollWidth <= tabs.clientWidth")
+    assert tabs.evaluate(SMALLEST_GAP) >= 4.0, "names run together"
     answer = {"status": 500, "json": {"error": "The filter failed"}}
     page.page.route("**/api/trace/**", lambda route: route.fulfill(**answer))
     page.page.locator("#filter").select_option("crossmodal-ekf")
