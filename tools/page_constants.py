@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 from beliefscope.app.protocol import map_format, messages
+from beliefscope.app.runs.sweep_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.inspect.diagnosis.cause import SHOWN
+from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
 
 PATH = Path(__file__).parents[1] / "app" / "page" / "core" / "constants.js"
@@ -37,6 +38,8 @@ def constants() -> dict[str, tuple[str, object]]:
         "LOG_RANGE": ("Nats below its peak that a map distinguishes.", map_format.LOG_RANGE),
         "CELL_STEPS": ("Largest value of a map's cell.", map_format.LEVELS),
         "SHOWN": ("Smallest probability of a cause of a fault that is listed.", SHOWN),
+        "LARGEST": ("Largest probability that is displayed as a number.", LARGEST),
+        "HASH_DIGITS": ("Digits of its hash at the end of the name of a checkpoint of a sweep.", HASH_DIGITS),
         "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),
         "VIEWPOINTS": ("Viewpoints of the 3D scene.", get_args(messages.Viewpoint)),

@@ -78,9 +78,13 @@ SHOWN = 0.05
 """Smallest probability of a cause in headlines, in tables and on the page."""
 
 
+LARGEST = 0.99
+"""Largest probability that is displayed as a number."""
+
+
 def probability_text(probability: float) -> str:
     """A probability with two digits; none is certain."""
-    return f"{probability:.2f}" if probability < 0.995 else "above 0.99"
+    return f"{probability:.2f}" if round(probability, 2) <= LARGEST else f"above {LARGEST}"
 
 
 @dataclass(frozen=True)

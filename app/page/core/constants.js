@@ -17,6 +17,12 @@ export const CELL_STEPS = /** @type {const} */ (65535);
 /** Smallest probability of a cause of a fault that is listed. */
 export const SHOWN = /** @type {const} */ (0.05);
 
+/** Largest probability that is displayed as a number. */
+export const LARGEST = /** @type {const} */ (0.99);
+
+/** Digits of its hash at the end of the name of a checkpoint of a sweep. */
+export const HASH_DIGITS = /** @type {const} */ (8);
+
 /** Weight of clean data in the loss of a fine-tuning. */
 export const CLEAN_WEIGHT = /** @type {const} */ (0.5);
 

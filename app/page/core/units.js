@@ -2,6 +2,8 @@
 
 /** @import { Task } from '../types/server.js' */
 
+import { LARGEST } from './constants.js';
+
 /** @typedef {{unit: string, scale: number}} DisplayUnit scale: factor from the server's unit */
 
 /**
@@ -118,7 +120,7 @@ export const stepLabel = (step, time) =>
  * @param {number} probability
  */
 export const probabilityText = (probability) =>
-  probability < 0.995 ? probability.toFixed(2) : 'above 0.99';
+  Number(probability.toFixed(2)) <= LARGEST ? probability.toFixed(2) : `above ${LARGEST}`;
 
 /**
  * Formats a share from 0 to 1 in percent.

@@ -32,7 +32,7 @@ const OVER = [
   ['episode', 'this episode'],
   ['held-out', 'held-out episodes'],
 ];
-const UNLIKELY = 'Every cause of the catalog has a probability below 0.05.';
+const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN}.`;
 const WITHIN =
   'The largest of all statistics; healthy episodes, too, have some outside of these ranges.';
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */

@@ -4,6 +4,7 @@
 /** @import { Catalog, EpisodeResult, ExperimentRow } from '../types/server.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
+import { HASH_DIGITS } from '../core/constants.js';
 import { create, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { fixed, significant, stepLabel } from '../core/units.js';
@@ -215,4 +216,4 @@ export class EpisodePanel {
  * @param {ExperimentRow} row
  */
 const filterName = ({ catalog_name, name, checkpoint }) =>
-  catalog_name ?? `${name}-${checkpoint.slice(0, 8)}`;
+  catalog_name ?? `${name}-${checkpoint.slice(0, HASH_DIGITS)}`;
