@@ -102,7 +102,7 @@ def letters_of(name: str) -> str:
     """Letters of the axes of a value after N. Raises BadInput for an unknown name."""
     if name.startswith(EXTRA):
         if not re.fullmatch(r"[\w-]{1,80}", name.removeprefix(EXTRA)):
-            raise BadInput(f"extra value {name.removeprefix(EXTRA)!r}: a name has letters, digits, - and _ only")
+            raise BadInput(f"extra value {name.removeprefix(EXTRA)!r}: a name has up to 80 letters, digits, - and _")
         return ""
     if name not in SHAPES:
         raise unknown_name("value of a filter", name, [*SHAPES, "extra"])

@@ -206,7 +206,8 @@ def test_hash_of_an_object_covers_its_arrays() -> None:
     [
         ({"accepted": np.ones((2, 2))}, r"accepted of shape \(1, 2, 2\), expected \(1, K\)"),
         ({"innovation": [np.ones(2)]}, "returns only innovation, expected both innovation and innovation_covariance"),
-        ({"extra": {"a b": 1.0}}, "extra value 'a b': a name has letters, digits"),
+        ({"extra": {"a b": 1.0}}, r"extra value 'a b': a name has up to 80 letters, digits, - and _$"),
+        ({"extra": {"a" * 81: 1.0}}, r"extra value 'a{81}': a name has up to 80 letters"),
         ({"extra": {"a": np.inf}}, "extra/a with a number that is not finite"),
         ({"extra": {"a": [1.0]}}, "returns extra/a as a list, expected an array or a Tensor"),
     ],
