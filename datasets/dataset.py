@@ -29,6 +29,17 @@ class EpisodeSummary:
     contact_fraction: float | None
 
 
+def no_training_episodes(task: Task, splits: Iterable[str], data: str = "the data set") -> BadInput:
+    """The error for data without training episodes, with the next step. splits: those of the episodes."""
+    present = " and ".join(repr(split) for split in sorted(set(splits)))
+    name = task.name
+    collect = f"collect some, beliefscope collect {name} -o {name}.h5, or " if task.simulate is not None else ""
+    return BadInput(
+        f"{data} has no episode of split 'train', only of {present or 'none'}: {collect}store some of the episodes "
+        "with dataclasses.replace(episode, split='train') and bs.save_dataset"
+    )
+
+
 class Dataset(ABC):
     """Sequence of episodes and context manager.
 

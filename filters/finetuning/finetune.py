@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from beliefscope.datasets.dataset import SPLITS
+from beliefscope.datasets.dataset import SPLITS, no_training_episodes
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
@@ -197,7 +197,7 @@ def split_episodes(
     split = {name: [i for i, e in enumerate(episodes) if e.split == name and i not in by_episode] for name in SPLITS}
     train = sorted([*split["train"], *by_episode])
     if not train:
-        raise BadInput("the data set has no episode of split 'train'")
+        raise no_training_episodes(episodes[0].task, (e.split for e in episodes))
     val = split["val"]
     if not val:
         val = [i for i in train if i not in by_episode][::8] or train

@@ -8,9 +8,8 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.dataset import Dataset, no_training_episodes
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 
 EPISODES, SEED = 60, 1000
@@ -25,7 +24,7 @@ def simulated_episodes(name: str, data: Dataset, is_sample: bool) -> int:
     if any(summary.split == "train" for summary in data.summaries):
         return 0
     if not is_sample or data.task.simulate is None:
-        raise BadInput(f"Data set {name!r} has no training episodes (split 'train').")
+        raise no_training_episodes(data.task, (summary.split for summary in data.summaries), f"data set {name!r}")
     return EPISODES
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from beliefscope import __version__
+from beliefscope.datasets.dataset import no_training_episodes
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
@@ -71,7 +71,7 @@ def train(
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     splits = {s: [e for e in episodes if e.split == s] for s in ("train", "val", "test")}
     if not splits["train"]:
-        raise BadInput("the data set has no episode of split 'train'")
+        raise no_training_episodes(architecture.task, (e.split for e in episodes))
     began = time.monotonic()
     by_particles = architecture.fusion == "information" and architecture.kind == "pf"
     # The same model as a Kalman filter has a likelihood without sampling noise.
