@@ -39,6 +39,7 @@ from beliefscope.recordings.probe import RecordingInfo
 
 MAX_UPLOAD = 2 * 10**9  # bytes
 RESERVED_SPACE = 2 * 10**8  # bytes that uploads leave free on the disk
+POLL_INTERVAL = 0.2  # s between checks whether the client of an upload has cancelled it
 CHECK_INTERVAL = 1 << 24  # uploaded bytes between checks of the free space
 MAGIC = b"RRF"  # first bytes of all versions of Rerun's files
 MAX_MATCHES = 4096  # recordings whose data set is remembered
@@ -194,7 +195,7 @@ def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatc
         part = await asyncio.to_thread(files.partial_path)
         try:
             await _receive(request, part, limit)
-            info = await asyncio.wrap_future(files.examine(part))
+            info = await _unless_cancelled(request, asyncio.wrap_future(files.examine(part)))
             recording = await asyncio.to_thread(files.add, part, name, info)
             return await asyncio.to_thread(matcher.entry, recording)
         finally:
@@ -278,6 +279,17 @@ def _url(name: str) -> str:
 def _check_size(size: int, limit: int) -> None:
     if size > limit:
         raise HTTPException(413, f"The file is larger than {limit / 1e6:,.0f} MB, the limit for uploads.")
+
+
+async def _unless_cancelled(request: Request, examination: asyncio.Future[RecordingInfo]) -> RecordingInfo:
+    """Wait for the result. Raises HTTPException if the client closes the connection before."""
+    is_done = False
+    while not is_done:
+        is_done = bool((await asyncio.wait([examination], timeout=POLL_INTERVAL))[0])
+        if await request.is_disconnected():
+            examination.cancel()  # does not start if another file is being read
+            raise HTTPException(400, "The upload was cancelled.")
+    return examination.result()
 
 
 async def _receive(request: Request, part: Path, limit: int) -> None:

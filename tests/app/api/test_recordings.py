@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import http.client
+import json
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -221,6 +224,31 @@ def test_invalid_files_are_refused(
 
 
 @IN_PROCESS
+def test_an_upload_that_is_cancelled_while_it_is_examined_is_not_added(
+    address: str, run_recording: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    examined, cancelled = threading.Event(), threading.Event()
+
+    def probe(self: RecordingProbe, path: Path) -> RecordingInfo:
+        examined.set()
+        assert cancelled.wait(20.0)
+        return RecordingInfo(application="other")
+
+    monkeypatch.setattr(RecordingProbe, "__call__", probe)
+    connection = http.client.HTTPConnection(address)
+    connection.request("PUT", f"{URL}/x.rrd", run_recording, {"Origin": f"http://{address}"})
+    assert examined.wait(10.0)
+    assert [path.suffix for path in folder.iterdir()] == [".part"]
+    connection.close()
+    deadline = time.monotonic() + 10.0
+    while list(folder.iterdir()):  # before the file has been examined
+        assert time.monotonic() < deadline, "the upload was not stopped"
+        time.sleep(0.02)
+    cancelled.set()
+    with urlopen(f"http://{address}{URL}") as reply:
+        assert json.load(reply)["recordings"] == []
+
+
 def test_upload_size_is_limited(
     client: TestClient, run_recording: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
