@@ -45,6 +45,23 @@ def with_saved_filters(settings: Settings) -> Settings:
     return replace(settings, checkpoints=checkpoints, secondary=frozenset(secondary)) if filters else settings
 
 
+def refresh_saved_filters(store: TraceStore) -> None:
+    """Add filters that another server of the workspace has saved, and remove those whose checkpoint was deleted."""
+    settings = store.settings
+    runs = FineTuneRuns(settings.workspace)
+    for name, path in settings.checkpoints.items():
+        if not isinstance(path, Path) or path.is_file():
+            continue
+        if runs.folder(path.parent.name).resolve() == path.parent.resolve():  # not a file that was given to the server
+            for task in store.tasks():
+                if name in store.filters(task):
+                    store.remove_filter(task, name)
+    for saved in read_saved_filters(settings.workspace):
+        with suppress(BadInput):  # damaged, or of a task that this server does not have
+            if saved.name not in store.filters(saved.task):
+                store.add_filter(saved.task, saved.name, load_checkpoint(Path(saved.path)), first=saved.default)
+
+
 def save_filter(store: TraceStore, new: SavedFilter) -> None:
     """Add a filter to the catalog and to the list. A default replaces the previous default of its task.
 
@@ -61,8 +78,8 @@ def remove_filter(store: TraceStore, task: str, name: str) -> None:
     """Remove a filter from the catalog and the list. Its checkpoint file is kept."""
     workspace = store.settings.workspace
     others = [saved for saved in _read(workspace) if (saved.task, saved.name) != (task, name)]
+    write_record(others, workspace / FILE)  # first: a page that is loading adds the filters of the list
     store.remove_filter(task, name)
-    write_record(others, workspace / FILE)
 
 
 def _read(workspace: Path) -> list[SavedFilter]:

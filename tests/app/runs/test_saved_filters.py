@@ -7,7 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, save_filter, with_saved_filters
+from beliefscope.app.runs.saved_filters import (
+    SavedFilter,
+    read_saved_filters,
+    refresh_saved_filters,
+    save_filter,
+    with_saved_filters,
+)
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.simulation.push import PUSH
@@ -39,6 +45,32 @@ def test_a_saved_filter_is_listed_after_the_default_one(tmp_path: Path) -> None:
     assert [*store.filters("push")] == names(with_saved_filters(settings)) == ["tuned", *before]
     save_filter(store, saved(tmp_path, default=False))
     assert [*store.filters("push")] == names(with_saved_filters(settings)) == expected
+
+
+@pytest.mark.parametrize("default", [False, True])
+def test_another_server_of_the_workspace_follows_the_list(tmp_path: Path, default: bool) -> None:
+    store, other = TraceStore(Settings(tmp_path)), TraceStore(Settings(tmp_path))
+    before = [*other.filters("push")]
+    new = saved(tmp_path, default)
+    save_filter(store, new)
+    assert [*other.filters("push")] == before
+    for _ in range(2):
+        refresh_saved_filters(other)
+        assert [*other.filters("push")] == [*store.filters("push")]
+    Path(new.path).unlink()
+    for server in (store, other):
+        refresh_saved_filters(server)
+        assert [*server.filters("push")] == before
+        assert "tuned" not in server.settings.checkpoints
+
+
+def test_a_damaged_checkpoint_of_another_server_is_not_listed(tmp_path: Path) -> None:
+    store, other = TraceStore(Settings(tmp_path)), TraceStore(Settings(tmp_path))
+    new = saved(tmp_path, default=False)
+    save_filter(store, new)
+    Path(new.path).write_bytes(b"damaged")
+    refresh_saved_filters(other)
+    assert "tuned" not in other.filters("push")
 
 
 def test_a_workspace_may_be_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
