@@ -41,7 +41,7 @@ from beliefscope.filters.external.adapter import (
 from beliefscope.filters.external.step_values import stacked
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
-from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter
+from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter, check_run_name
 from beliefscope.inspect.traces.run import assemble_trace, step_arrays
 from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live_recording
 
@@ -127,11 +127,7 @@ class LiveRecorder:
         """
         if checkpoint is None and not task:
             raise BadInput("a live run needs the filter's checkpoint or the name of its task")
-        if Path(name).name != name or name.startswith("."):
-            raise BadInput(
-                f"{name!r} is not the name of a live run: give a file name, without a folder and not starting with a "
-                "dot. --workspace chooses the folder (in Python, folder=)."
-            )
+        check_run_name(name)
         self._task = load_task(task) if checkpoint is None else checkpoint.task
         self._checkpoint, self._modalities, self._start, self._expected = checkpoint, modalities, start, expected
         self._fields = {"settings": {"torch": torch.__version__}} | fields

@@ -51,6 +51,15 @@ Shapes = dict[str, tuple[tuple[int, ...], np.dtype[Any]]]
 """Array -> shape and dtype of one step, or of the whole array if it has no step axis."""
 
 
+def check_run_name(name: str) -> None:
+    """Raise BadInput for a name that is not the name of a file in the folder of live runs."""
+    if Path(name).name != name or name.startswith("."):
+        raise BadInput(
+            f"{name!r} is not the name of a live run: give a file name, without a folder and not starting with a dot. "
+            "--workspace chooses the folder (in Python, folder=)."
+        )
+
+
 class LiveFileWriter:
     """Writer of a live file. Use one writer per file, from one thread.
 
