@@ -222,8 +222,8 @@ def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[s
 
 def result_folders(given: Mapping[str, Path], workspace: Path, file: str, reserved: str = "") -> dict[str, Path]:
     """Folders by name: those given to the server, and others in the workspace that contain ``file``."""
-    known = {folder.resolve() for folder in given.values()}
-    others = [path.parent for path in sorted(workspace.glob(f"*/{file}")) if path.parent.resolve() not in known]
+    paths = {folder.resolve() for folder in given.values()}
+    others = [path.parent for path in sorted(workspace.glob(f"*/{file}")) if path.parent.resolve() not in paths]
     return {**given, **short_names(others, {*given, reserved})}
 
 
