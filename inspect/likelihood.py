@@ -243,8 +243,8 @@ class MapEngine:
     def _modalities(self, quantity: Quantity) -> tuple[str, ...]:
         """Modalities with a map: none for posteriors of a filter that reports only the fused one."""
         trace = self.trace
-        known = quantity == "likelihood" or has_layer_weights(trace) or bool(trace.modalities_with_posterior)
-        return trace.modalities if known else ()
+        has_maps = quantity == "likelihood" or has_layer_weights(trace) or bool(trace.modalities_with_posterior)
+        return trace.modalities if has_maps else ()
 
     def _densities(self, quantity: Quantity, others: Others) -> Callable[..., Array]:
         """The method that evaluates a quantity: networks, kernel densities of particles, or Gaussians."""

@@ -40,9 +40,9 @@ def with_adjusted(profile: HealthyProfile, rows: Rows, sensors: Rows) -> tuple[H
     A reading far from healthy ones predicts nothing, so a faulty sensor does not change the adjusted statistics of
     healthy modules.
     """
-    known = {name: np.isfinite(values) for name, values in profile.statistics.items()}
-    readings = [n for n, at in known.items() if at.sum() >= MIN_HEALTHY and any(n in row for row in sensors)]
-    names = [n for n, at in known.items() if at.all() and n.startswith(MODULES) and any(n in row for row in rows)]
+    finite = {name: np.isfinite(values) for name, values in profile.statistics.items()}
+    readings = [n for n, at in finite.items() if at.sum() >= MIN_HEALTHY and any(n in row for row in sensors)]
+    names = [n for n, at in finite.items() if at.all() and n.startswith(MODULES) and any(n in row for row in rows)]
     if not readings or not names:
         return profile, [dict(row) for row in rows]
     count = profile.episodes

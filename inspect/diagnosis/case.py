@@ -69,10 +69,10 @@ def observe(trace: Trace, checkpoint: Checkpoint, profile: HealthyProfile) -> tu
 
 def examine_again(case: Case, setting: Setting, traces: Sequence[Trace]) -> Case:
     """Another run of the episodes of a case; statistics of sensors remain where the readings are the same."""
-    known = {id(trace.episode): sensors for trace, sensors in zip(case.traces, case.sensors, strict=True)}
+    sensors_by_episode = {id(trace.episode): sensors for trace, sensors in zip(case.traces, case.sensors, strict=True)}
     rows, sensors = [], []
     for trace in traces:
-        same = known.get(id(trace.episode))
+        same = sensors_by_episode.get(id(trace.episode))
         sensors.append(sensor_statistics(trace.episode, case.profile.reference) if same is None else same)
         rows.append(episode_statistics(trace, setting.checkpoint, sensors[-1]))
     return compared(setting, traces, rows, sensors, case.profile, case.alarm_rate)
@@ -141,6 +141,6 @@ def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
     """First step that shows a deviation and the first step after it, over the affected episodes; None if unknown."""
     episodes = [trace.episode for trace, hit in zip(case.traces, affected, strict=True) if hit]
-    found = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]
-    known = [steps for steps in found if steps is not None]
-    return (min(first for first, _ in known), 1 + max(last for _, last in known)) if known else None
+    localisations = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]
+    intervals = [steps for steps in localisations if steps is not None]
+    return (min(first for first, _ in intervals), 1 + max(last for _, last in intervals)) if intervals else None

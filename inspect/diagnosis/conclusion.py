@@ -125,9 +125,9 @@ def conclude(
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    known = effects is not None or (sure and is_unused(candidates[0].cause, case.setting.checkpoint))
+    is_effect_known = effects is not None or (sure and is_unused(candidates[0].cause, case.setting.checkpoint))
     effect = (effects or {}).get(candidates[0].cause.name) if sure else None
-    masked = known and not is_visible(case.by_statistic, effect)
+    masked = is_effect_known and not is_visible(case.by_statistic, effect)
     headline = _headline(affected, candidates, masked, len(case.rows))
     deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
     return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case))
@@ -183,8 +183,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     if not candidates or not candidates[0].evidence or candidates[0].probability < SHOWN:
         sure = bool(candidates) and candidates[0].probability >= SURE
         of_sensors = [alarm for alarm in case.alarms if alarm.statistic in _of_sensors(case)]
-        shown = (of_sensors or case.alarms)[0].text  # a faulty sensor changes the belief as well
-        return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {shown}; try: {_search(case, count)}"
+        symptom = (of_sensors or case.alarms)[0].text  # a faulty sensor changes the belief as well
+        return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {_search(case, count)}"
     first = candidates[0]
     similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:

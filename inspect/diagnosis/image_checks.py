@@ -46,8 +46,10 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     lost = lost_images(images)
     usable, dark = present & ~lost, lost[present]
     middle = median_image(images[present])
-    known = reference is not None and (reference.key, reference.image.shape) == (key, middle.shape) and usable.any()
-    brightness = float(brightness_of(middle, reference)) if reference is not None and known else 1.0
+    is_comparable = (
+        reference is not None and (reference.key, reference.image.shape) == (key, middle.shape) and usable.any()
+    )
+    brightness = float(brightness_of(middle, reference)) if reference is not None and is_comparable else 1.0
     values = {
         f"black/{key}/all": float(dark.mean()),
         f"losses/{key}/all": float((np.diff(dark, prepend=False) & dark).mean()),
@@ -57,7 +59,7 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     }
     if HAND in episode.observations:
         values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND], present)
-    if reference is None or not known:
+    if reference is None or not is_comparable:
         return values
     values |= {
         f"brightness/{key}/all": brightness,
@@ -112,9 +114,9 @@ def image_lag(images: Gray, hand: Array, present: Mask) -> float:
     level = noise_level(images[~lost].astype(np.float64)) if (~lost).sum() >= MIN_STEPS else np.zeros(images.shape[1:])
     pixels = np.maximum(change - 3.0 * level, 0.0).mean((1, 2))
     speed = np.linalg.norm(np.diff(hand.astype(np.float64), axis=0), axis=1)
-    known = present[1:] & present[:-1] & ~(lost[1:] | lost[:-1] | frozen[1:])
+    valid = present[1:] & present[:-1] & ~(lost[1:] | lost[:-1] | frozen[1:])
     late, early = np.log(pixels + 10.0 * MOTION_FLOOR), np.log(speed + MOTION_FLOOR)
-    return lag(late[:, None], early[:, None], known)[0]
+    return lag(late[:, None], early[:, None], valid)[0]
 
 
 def registration(reference: Array, images: Array) -> tuple[float, float]:

@@ -56,14 +56,14 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
 
     Statistics that do not apply are absent.
     """
-    known, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
+    has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
     if external:
         values = reported_particle_statistics(trace)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
-    if known:
+    if has_truth:
         values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
-    if known and not external:
+    if has_truth and not external:
         values |= dynamics_statistics(trace.episode, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
 

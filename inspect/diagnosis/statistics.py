@@ -56,8 +56,8 @@ def with_scatter(
         for row, value in zip(result, np.abs(values - np.nanmean(values)).tolist(), strict=True):
             row[name] = value
     for name in (name for name in profile.statistics if name.partition("/")[0] in COMMON):
-        known = np.array([row[name] for row in rows if np.isfinite(row.get(name, np.nan))])
-        common = float(common_part(known[:, None])[0]) if len(known) >= MIN_COMMON else np.nan
+        finite = np.array([row[name] for row in rows if np.isfinite(row.get(name, np.nan))])
+        common = float(common_part(finite[:, None])[0]) if len(finite) >= MIN_COMMON else np.nan
         for row in result:
             row[name] = common
     return replace(profile, statistics=columns), result

@@ -242,8 +242,8 @@ def healthy_particles(setting: Setting, deviations: Deviations) -> Setting | Non
     """As many particles as in the healthy record; None if there are more already, or the filter has its own number."""
     if isinstance(setting.checkpoint, ExternalFilter):
         return None
-    known = deviations.get("particles//all")
-    healthy = 0 if known is None else round(known.healthy)
+    deviation = deviations.get("particles//all")
+    healthy = 0 if deviation is None else round(deviation.healthy)
     return replace(setting, particles=healthy) if healthy > setting.particles else None
 
 

@@ -98,11 +98,11 @@ def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:
 def _shift(deviations: Deviations, axis: str) -> float | None:
     """Pixels: mean of the shifts of the scene and of the hand, weighted by the precision of healthy episodes."""
     names = [f"{kind}/image {axis}/all" for kind in ("shift", "hand offset")]
-    known = [deviations[name] for name in names if name in deviations]
-    if not known:
+    shifts = [deviations[name] for name in names if name in deviations]
+    if not shifts:
         return None
-    weights = [max(d.high - d.low, 1e-6) ** -2 for d in known]
-    return float(np.average([d.value - d.healthy for d in known], weights=weights))
+    weights = [max(d.high - d.low, 1e-6) ** -2 for d in shifts]
+    return float(np.average([d.value - d.healthy for d in shifts], weights=weights))
 
 
 def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
@@ -214,15 +214,15 @@ def shift_labels(setting: Setting, deviations: Deviations) -> Setting | None:
     task = setting.checkpoint.task
     shift = np.zeros(len(task.components))
     for i, component in enumerate(task.components):
-        known = [
+        biases = [
             d
             for name, d in deviations.items()
             if name.startswith("module bias/") and name.endswith(f" {component.name}/all")
         ]
-        if not known:
+        if not biases:
             return None
-        weights = [max(d.high - d.low, 1e-6) ** -2 for d in known]
-        shift[i] = np.average([d.value - d.healthy for d in known], weights=weights)
+        weights = [max(d.high - d.low, 1e-6) ** -2 for d in biases]
+        shift[i] = np.average([d.value - d.healthy for d in biases], weights=weights)
     return _with_labels(setting, lambda states: states + shift)
 
 

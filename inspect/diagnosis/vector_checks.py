@@ -164,8 +164,8 @@ def control_statistics(episode: Episode) -> dict[str, float]:
     delay = lag(change, moved)[0]
     shift = 0 if np.isnan(delay) else int(delay)
     steps = np.arange(len(hand))
-    known = (steps - shift >= 1) & (steps - shift < len(hand))
-    a, b = change[known], moved[steps[known] - shift]
+    valid = (steps - shift >= 1) & (steps - shift < len(hand))
+    a, b = change[valid], moved[steps[valid] - shift]
     power = np.square(b).sum()
     return {
         "lag/control/all": delay,

@@ -83,10 +83,10 @@ def is_visible(deviations: Mapping[str, Deviation], effect: Effect | None) -> bo
             return True
         unused = bool(effect.ratios) and all(1.0 / UNUSED < ratio < UNUSED for ratio in effect.ratios.values())
         explained = effect.complete or unused
-    found = (deviations.get(name) for name in VISIBLE)
+    candidates = (deviations.get(name) for name in VISIBLE)
     return any(
         _large(d.statistic, d.value / d.healthy) and (d.alarm if explained else not d.low <= d.value <= d.high)
-        for d in found
+        for d in candidates
         if d is not None
     )
 

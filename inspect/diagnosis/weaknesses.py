@@ -87,8 +87,8 @@ def untrained(checkpoint: Checkpoint) -> Iterator[Weakness]:
     """The sensor fault that the training data of a filter lack, if its default fine-tuning addresses one."""
     settings = default_settings(checkpoint.filter)
     base = checkpoint.record.get("base")
-    known = [slice_.faults for slice_, _ in FineTune.from_json(base["settings"]).mix] if base else []
-    if (why := reason(checkpoint.filter)) and settings.mix[0][0].faults not in known:
+    trained_faults = [slice_.faults for slice_, _ in FineTune.from_json(base["settings"]).mix] if base else []
+    if (why := reason(checkpoint.filter)) and settings.mix[0][0].faults not in trained_faults:
         name = settings.mix[0][0].name
         title = f"Sensor fault \u201c{name}\u201d, which the training data lack"
         yield Weakness("default", title, why, None, None, replace(settings, success=Criterion(name)))

@@ -54,10 +54,10 @@ def window_statistics(episode: Episode, reference: Reference | None) -> dict[str
     result = {}
     for name, values in window_values(episode, reference).items():
         kind, subject, _ = name.split("/")
-        known = values[np.isfinite(values)]
-        if kind in SUMMARIES and len(known) >= MIN_WINDOWS:
+        finite = values[np.isfinite(values)]
+        if kind in SUMMARIES and len(finite) >= MIN_WINDOWS:
             phase, summary = SUMMARIES[kind]
-            result[f"{kind}/{subject}/{phase}"] = float(summary(known))
+            result[f"{kind}/{subject}/{phase}"] = float(summary(finite))
     return result
 
 

@@ -322,8 +322,8 @@ def _summarise(
 
 def _known_mean(values: Array) -> float:
     """Mean of the values that are not NaN; NaN without any."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else math.nan
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else math.nan
 
 
 def _sentence(text: str) -> str:

@@ -79,7 +79,7 @@ class Conventions(Diagnostic):
     omitted: Array
 
     @property
-    def found(self) -> list[tuple[int, int]]:
+    def relevant_removals(self) -> list[tuple[int, int]]:
         """Change and error, by their indices, of relevant removals, largest first.
 
         More than the omission of the input removes: a change that only makes a filter ignore a bad input is none.
@@ -94,17 +94,17 @@ class Conventions(Diagnostic):
     def alarms(self) -> tuple[str, ...]:
         if self.trajectories < MIN_TRAJECTORIES:
             return ()
-        return tuple(f"{self.changes[i].text}: {self._effect(i, j)}" for i, j in self.found)
+        return tuple(f"{self.changes[i].text}: {self._effect(i, j)}" for i, j in self.relevant_removals)
 
     @property
     def verdict(self) -> str:
         count = len(self.changes)
-        if not self.found:
+        if not self.relevant_removals:
             text = (
                 f"None of {count} changes of signs, scales, axes and delays lowers an error by {RELEVANT:.0%} or more."
             )
         else:
-            i, j = self.found[0]
+            i, j = self.relevant_removals[0]
             text = f"With {self.changes[i].text}, {self._effect(i, j)}: filter and data may disagree about it."
         if self.at_truth:
             text += " Runs start at the true state, where few readings can lower the error."
@@ -127,8 +127,8 @@ class Conventions(Diagnostic):
         rows = []
         for i in np.argsort(-self.share.max(1)):
             numbers = np.stack([self.share[i], self.low[i], self.high[i], self.omitted[i]], axis=1)
-            shown = (numbers if has_intervals else numbers[:, [0, 3]]).ravel()
-            values = (None if np.isnan(v) else 100.0 * float(v) for v in shown)
+            displayed = (numbers if has_intervals else numbers[:, [0, 3]]).ravel()
+            values = (None if np.isnan(v) else 100.0 * float(v) for v in displayed)
             rows.append((self.changes[i].text, *values, self.changes[i].faults))
         note = "Intervals of 95 % for all of them together. Inject the fault to see the run with the change."
         columns = ("with", *heads, "fault injection")

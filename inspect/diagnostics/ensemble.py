@@ -104,8 +104,8 @@ class Ensemble(Diagnostic):
         if worst.collapsed:
             text += f" It collapses in {worst.collapsed:.1%} of steps ({display_name(worst.component)})."
         best = max(self.components, key=lambda c: c.correlation)
-        known = best.correlation > 0.3
-        text += " Its spread " + ("predicts" if known else "does not predict") + " which steps have large errors"
+        predictive = best.correlation > 0.3
+        text += " Its spread " + ("predicts" if predictive else "does not predict") + " which steps have large errors"
         return f"{text} (correlation {best.correlation:.2f})."
 
     def tables(self) -> list[Table]:
@@ -190,8 +190,8 @@ def _steps(trace: Trace) -> tuple[Array, Array, Array]:
 
 
 def _component(name: str, error: Array, spread: Array, rank: Array, members: int) -> ComponentEnsemble:
-    known = np.isfinite(rank)
-    error, spread, rank = error[known], spread[known], rank[known]
+    finite = np.isfinite(rank)
+    error, spread, rank = error[finite], spread[finite], rank[finite]
     bins = min(BINS, members + 1)
     ranks, _ = np.histogram((rank + 0.5) / (members + 1), bins=bins, range=(0.0, 1.0))
     widths, _ = np.histogram((np.arange(members + 1) + 0.5) / (members + 1), bins=bins, range=(0.0, 1.0))

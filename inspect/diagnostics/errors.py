@@ -199,8 +199,8 @@ def errors_of(traces: Sequence[Trace]) -> Errors:
     error = [measures.errors(trace)[:, -1] for trace in traces]
     distance = [first.task.main_error.norm(e) for e in error]
     missing = [missing_steps(trace) for trace in traces]
-    known = [_known_steps(trace) for trace in traces]
-    outages = (outages_of(k, traces, distance, [m[k] for m in missing], known) for k in first.task.modalities)
+    counted = [_known_steps(trace) for trace in traces]
+    outages = (outages_of(k, traces, distance, [m[k] for m in missing], counted) for k in first.task.modalities)
     return Errors(
         task=first.task,
         filter=first.filter,
@@ -214,12 +214,12 @@ def errors_of(traces: Sequence[Trace]) -> Errors:
 
 
 def _groups(traces: Sequence[Trace], error: Sequence[Array], distance: Sequence[Array]) -> list[GroupErrors]:
-    known = np.concatenate([_known_steps(trace) for trace in traces])
+    counted = np.concatenate([_known_steps(trace) for trace in traces])
     every, norm = np.concatenate(error), np.concatenate(distance)
-    total = float(np.square(norm[known]).sum())
+    total = float(np.square(norm[counted]).sum())
     groups = []
     for name, mask in measures.pooled_phases(traces).items():
-        at = mask & known
+        at = mask & counted
         if at.any():
             squares = np.square(norm[at])
             rmse, bias = np.sqrt(np.square(every[at]).mean(0)), every[at].mean(0)

@@ -252,9 +252,9 @@ def _t_values(values: Array, divisions: np.ndarray, floor: Array, rising: np.nda
 
     Both are zero for a decrease of a ``rising`` statistic (S,).
     """
-    known = np.isfinite(values)
-    present = known.astype(np.float64)
-    centred = np.where(known, values - np.nanmean(values, axis=0), 0.0)
+    finite = np.isfinite(values)
+    present = finite.astype(np.float64)
+    centred = np.where(finite, values - np.nanmean(values, axis=0), 0.0)
     inside = divisions.astype(np.float64)
     count, total = inside @ present, inside @ centred
     others = present.sum(0) - count
@@ -277,9 +277,9 @@ def _draws(total: int, count: int, seed: int) -> Array:
 def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
     """(S,) 95 % range of the mean of ``count`` trajectories drawn from the healthy ones (E, S)."""
     drawn = _draws(len(healthy), count, seed)
-    known = np.isfinite(healthy)
-    size = drawn @ known.astype(np.float64)
-    means = np.where(size > 0, drawn @ np.where(known, healthy, 0.0) / np.maximum(size, 1.0), np.nan)
+    finite = np.isfinite(healthy)
+    size = drawn @ finite.astype(np.float64)
+    means = np.where(size > 0, drawn @ np.where(finite, healthy, 0.0) / np.maximum(size, 1.0), np.nan)
     low, high = np.nanpercentile(means, [2.5, 97.5], axis=0)
     return low, high
 

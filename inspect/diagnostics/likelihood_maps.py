@@ -119,10 +119,10 @@ class MapSurvey(Diagnostic):
         if shape != "ridge":
             return f"{text}."
         text += f", median elongation {np.median(n.elongation[of_shape, i]):.1f}"
-        known = mask & np.isfinite(n.expected)
-        if not known.any():
+        has_direction = mask & np.isfinite(n.expected)
+        if not has_direction.any():
             return f"{text}; the task expects no direction."
-        return f"{text}; its long axis is {self._deviation(i, known)} off the direction that the task expects."
+        return f"{text}; its long axis is {self._deviation(i, has_direction)} off the direction that the task expects."
 
     def _deviation(self, layer: int, mask: Mask) -> str:
         """Median deviation over steps, with a 95 % interval over trajectories if there are enough."""

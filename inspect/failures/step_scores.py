@@ -48,14 +48,14 @@ class Score:
 
     Attributes:
         title: display name.
-        unit: of the values. shown: unit for display, and its factor.
+        unit: of the values. display: unit for display, and its factor.
         values: trace -> (T,), higher is worse.
         why_not: trace -> reason why the score does not apply, or None.
     """
 
     title: str
     unit: str
-    shown: tuple[str, float]
+    display: tuple[str, float]
     values: Callable[[Trace], Array]
     why_not: Callable[[Trace], str | None] = lambda trace: None
 
@@ -185,15 +185,15 @@ class EpisodeScores:
 def scores_of(task: Task) -> dict[str, Score]:
     """Scores of a task by name, including one for each angle."""
     main = task.main_error
-    unit, shown = task.components[main.indices[0]].unit, main.shown
+    unit, display = task.components[main.indices[0]].unit, main.shown
     angles = {c.name: _angle(i, c) for i, c in enumerate(task.components) if c.unit == "rad" and (i,) != main.indices}
     return {
-        "error": Score(f"{main.name} error", unit, shown, lambda trace: measures.main_error(trace)[:, -1]),
+        "error": Score(f"{main.name} error", unit, display, lambda trace: measures.main_error(trace)[:, -1]),
         **angles,
         "nees": Score("NEES", "", ("", 1.0), lambda trace: measures.nees(trace)[:, -1], _no_covariance),
         "ess": Score("particles per effective particle", "x", ("x", 1.0), _degeneracy, _no_particles),
         "disagreement": Score("disagreement of modalities", "sigma", ("sigma", 1.0), disagreement, _no_fusion),
-        "regret": Score("regret of the weights", unit, shown, _regret, _no_fusion),
+        "regret": Score("regret of the weights", unit, display, _regret, _no_fusion),
     }
 
 
@@ -210,8 +210,8 @@ def disagreement(trace: Trace) -> Array:
 
 
 def _angle(index: int, component: Component) -> Score:
-    title, shown = f"{component.label} error", component.shown
-    return Score(title, "rad", shown, lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
+    title, display = f"{component.label} error", component.shown
+    return Score(title, "rad", display, lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
 
 
 def _degeneracy(trace: Trace) -> Array:

@@ -28,8 +28,8 @@ def survey_document(survey: Survey, link: Callable[[Event, str], str]) -> dict[s
             "name": name,
             "title": score.title,
             "unit": score.unit,
-            "shown": score.shown[0],
-            "scale": score.shown[1],
+            "shown": score.display[0],
+            "scale": score.display[1],
         }
         info |= {"why_not": survey.refused.get(name)}
         scores.append(info | ({} if info["why_not"] else _ranking(failures_of(survey, name), link)))

@@ -85,8 +85,8 @@ def _covariate(name: str, unit: str, values: NDArray[Any]) -> StepCovariate | No
         index = np.where(texts == "", np.nan, np.searchsorted(categories, texts)) if categories else np.zeros(0)
         return StepCovariate(name, unit, index, categories) if 1 < len(categories) <= MAX_CATEGORIES else None
     numbers = values.astype(np.float64)
-    known = numbers[np.isfinite(numbers)]
-    if not len(known) or (known.min() == known.max() and len(known) == len(numbers)):
+    finite = numbers[np.isfinite(numbers)]
+    if not len(finite) or (finite.min() == finite.max() and len(finite) == len(numbers)):
         return None
     return StepCovariate(name, unit, numbers, ("no", "yes") if values.dtype == bool else ())
 

@@ -234,7 +234,7 @@ def slices_of_survey(
         by=by,
         title=definition.title,
         unit=definition.unit,
-        shown=definition.shown,
+        shown=definition.display,
         alpha=alpha,
         episodes=len(ordered),
         steps=len(score),

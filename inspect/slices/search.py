@@ -85,8 +85,8 @@ class Condition:
 def _shown(unit: str) -> tuple[str, float]:
     """Unit for display, also of a rate, and the factor from the SI unit."""
     base, per, rest = unit.partition("/")
-    shown, factor = display_unit(base)
-    return shown + per + rest, factor
+    display, factor = display_unit(base)
+    return display + per + rest, factor
 
 
 @dataclass(frozen=True)
@@ -210,12 +210,12 @@ def _families(covariates: Sequence[StepCovariate], episode: Index) -> list[_Fami
 
 def _bins(covariate: StepCovariate) -> tuple[Index, Array]:
     """Bin of each step (S,), -1 for none; and edges between bins, which are values of the covariate."""
-    values, known = covariate.values, np.isfinite(covariate.values)
+    values, finite = covariate.values, np.isfinite(covariate.values)
     if covariate.categories:
-        return np.where(known, np.nan_to_num(values), -1).astype(np.int64), np.zeros(0)
-    edges = np.unique(np.quantile(values[known], np.arange(1, BINS) / BINS, method="lower"))
-    edges = edges[edges < values[known].max()]
-    return np.where(known, np.searchsorted(edges, values, side="left"), -1), edges
+        return np.where(finite, np.nan_to_num(values), -1).astype(np.int64), np.zeros(0)
+    edges = np.unique(np.quantile(values[finite], np.arange(1, BINS) / BINS, method="lower"))
+    edges = edges[edges < values[finite].max()]
+    return np.where(finite, np.searchsorted(edges, values, side="left"), -1), edges
 
 
 def _ranges(covariate: StepCovariate, edges: Array, coarse: bool = False) -> tuple[Array, list[tuple[Condition, ...]]]:

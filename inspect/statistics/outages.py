@@ -113,21 +113,21 @@ def without_reading(episode: Episode, key: str) -> Mask:
 
 
 def outages_of(
-    name: str, traces: Sequence[Trace], distance: Sequence[Array], missing: Sequence[Mask], known: Sequence[Mask]
+    name: str, traces: Sequence[Trace], distance: Sequence[Array], missing: Sequence[Mask], counted: Sequence[Mask]
 ) -> Outages | None:
     """Statistics of the outages of a modality; None if there are none.
 
     Args:
-        distance: (T,) m, error of each trace. missing: (T,) its outages. known: (T,) its steps that count.
+        distance: (T,) m, error of each trace. missing: (T,) its outages. counted: (T,) its steps that count.
     """
-    during = np.concatenate([d[m & k] for d, m, k in zip(distance, missing, known, strict=True)])
-    outside = np.concatenate([d[~m & k] for d, m, k in zip(distance, missing, known, strict=True)])
+    during = np.concatenate([d[m & k] for d, m, k in zip(distance, missing, counted, strict=True)])
+    outside = np.concatenate([d[~m & k] for d, m, k in zip(distance, missing, counted, strict=True)])
     if not len(during) or not len(outside):
         return None
     limit = RECOVERED * float(np.median(outside))
     before, end, recoveries, unrecovered = [], [], [], 0
     lengths, steps, squares = [], [], []
-    for trace, d, m, k in zip(traces, distance, missing, known, strict=True):
+    for trace, d, m, k in zip(traces, distance, missing, counted, strict=True):
         runs, durations = measures.intervals(m), trace.episode.durations
         for number, (a, b) in enumerate(runs):
             lengths.append(float(durations[a:b].sum()))
@@ -178,6 +178,6 @@ def _classes(
 
 def root_mean_square(values: Sequence[float] | Array) -> float:
     """Root of the mean square of the known values; NaN without any."""
-    known = np.asarray(values, dtype=np.float64)
-    known = known[np.isfinite(known)]
-    return float(np.sqrt(np.square(known).mean())) if len(known) else math.nan
+    array = np.asarray(values, dtype=np.float64)
+    finite = array[np.isfinite(array)]
+    return float(np.sqrt(np.square(finite).mean())) if len(finite) else math.nan

@@ -111,16 +111,16 @@ def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, fl
     """
     steps, lags = len(late), np.arange(-MAX_LAG, MAX_LAG + 1)
     source = np.arange(steps)[:, None] - lags  # (T, L): step of ``early`` that belongs to a step of ``late``
-    known = (source >= 0) & (source < steps)
+    paired = (source >= 0) & (source < steps)
     late_known, early_known = (np.asarray(np.isfinite(values).all(axis=1)) for values in (late, early))
-    known &= late_known[:, None] & early_known[source.clip(0, steps - 1)]
+    paired &= late_known[:, None] & early_known[source.clip(0, steps - 1)]
     if valid is not None:
-        known &= valid[:, None]
-    count = known.sum(0)
-    a = np.where(known[..., None], np.nan_to_num(late)[:, None], 0.0)  # (T, L, d)
-    b = np.where(known[..., None], np.nan_to_num(early)[source.clip(0, steps - 1)], 0.0)
+        paired &= valid[:, None]
+    count = paired.sum(0)
+    a = np.where(paired[..., None], np.nan_to_num(late)[:, None], 0.0)  # (T, L, d)
+    b = np.where(paired[..., None], np.nan_to_num(early)[source.clip(0, steps - 1)], 0.0)
     size = np.maximum(count, 1)[:, None]
-    a, b = (np.where(known[..., None], x - x.sum(0) / size, 0.0) for x in (a, b))
+    a, b = (np.where(paired[..., None], x - x.sum(0) / size, 0.0) for x in (a, b))
     power = (a * a).sum((0, 2)) * (b * b).sum((0, 2))
     enough = (count >= max(MIN_STEPS, steps // 3)) & (power > 1e-24)
     correlation = np.where(enough, (a * b).sum((0, 2)) / np.sqrt(np.maximum(power, 1e-24)), -1.0)

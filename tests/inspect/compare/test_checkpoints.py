@@ -226,8 +226,8 @@ def test_numbers_equal_evaluate(data: Dataset) -> None:
 def test_values_do_not_depend_on_the_number_of_processes(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beliefscope.filters.evaluate.BLOCK", 2)
     members = {index: episode_of(data, index, 40) for index in EPISODES[:5]}
-    one, two = (compare_checkpoints(pf(), ekf(), members, particles=20, workers=n).to_dict() for n in (1, 2))
-    assert one == two
+    serial, parallel = (compare_checkpoints(pf(), ekf(), members, particles=20, workers=n).to_dict() for n in (1, 2))
+    assert serial == parallel
 
 
 def test_interval_coverage() -> None:

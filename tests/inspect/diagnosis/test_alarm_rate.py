@@ -40,25 +40,25 @@ def test_healthy_samples_rarely_raise_an_alarm(count: int) -> None:
 
 def test_heavy_tails_of_other_statistics_do_not_hide_a_fault() -> None:
     rng = np.random.default_rng(0)
-    found = 0
+    detections = 0
     for _ in range(20):
         tested = rows(6, rng)
         tested[:, 3] += 2.5
-        found += NAMES[3] in alarms(rows(60, rng), tested)
-    assert found >= 17
+        detections += NAMES[3] in alarms(rows(60, rng), tested)
+    assert detections >= 17
 
 
 def test_a_single_episode_does_not_hide_its_own_deviation() -> None:
     rng = np.random.default_rng(1)
-    names, found = NAMES[:10], 0
+    names, detections = NAMES[:10], 0
     for _ in range(20):
         healthy, tested = rng.normal(size=(60, 10)), rng.normal(size=(1, 10))
         tested[0, 3] += 10.0
         profile = HealthyProfile("simulated", 60, None, dict(zip(names, healthy.T, strict=True)))
         comparison = compare(profile, [dict(zip(names, tested[0].tolist(), strict=True))])
         named = [d.statistic for d in with_critical_values(profile, comparison, RATE) if d.alarm]
-        found += comparison.p_value <= RATE and named == [names[3]]
-    assert found >= 19
+        detections += comparison.p_value <= RATE and named == [names[3]]
+    assert detections >= 19
 
 
 def test_a_smaller_alarm_rate_keeps_the_scale_of_deviations() -> None:

@@ -122,14 +122,14 @@ def test_the_wrong_direction_counts_against_a_cause() -> None:
 def test_mirrored_and_shifted_statistics_are_told_apart_by_their_values() -> None:
     mirrored, shifted = (Symptom("beta logit/*", target=target) for target in ("mirrored", "shifted"))
 
-    def found(values: tuple[float, float]) -> list[Deviation]:
+    def deviations(values: tuple[float, float]) -> list[Deviation]:
         healthy = (11.0, 5.0)
         return [
             deviation(f"beta logit/image {c}/all", -10.0, v, h) for c, v, h in zip("xy", values, healthy, strict=True)
         ]
 
-    assert support(mirrored, found((-11.0, -5.0))) > 0.9 > 0.0 > support(shifted, found((-11.0, -5.0)))
-    assert support(shifted, found((3.0, -3.0))) > 0.9 > 0.0 > support(mirrored, found((3.0, -3.0)))
+    assert support(mirrored, deviations((-11.0, -5.0))) > 0.9 > 0.0 > support(shifted, deviations((-11.0, -5.0)))
+    assert support(shifted, deviations((3.0, -3.0))) > 0.9 > 0.0 > support(mirrored, deviations((3.0, -3.0)))
 
 
 def test_strength_grows_from_insignificance_to_one() -> None:
@@ -156,9 +156,9 @@ def test_two_causes_are_probable_if_each_explains_what_the_other_does_not() -> N
     result = probabilities({"first": first, "second": second, "other": other})
     assert min(result["first"], result["second"]) > 0.9
     assert result["other"] < 0.1
-    one = probabilities({"first": Explanation("b", 1.0, {}), "second": second, "other": other})
-    assert one["first"] > 0.99
-    assert max(one["second"], one["other"]) < 0.2
+    single = probabilities({"first": Explanation("b", 1.0, {}), "second": second, "other": other})
+    assert single["first"] > 0.99
+    assert max(single["second"], single["other"]) < 0.2
 
 
 def test_causes_that_cannot_be_observed_are_left_out() -> None:
@@ -180,20 +180,20 @@ def test_an_optional_symptom_counts_only_where_it_is_observed() -> None:
 def test_the_distance_in_contact_separates_the_object_from_the_image_model() -> None:
     """A larger puck biases the image model, too, but only the puck changes where the hand touches it."""
     data, model = (next(c for c in CAUSES if c.name == name) for name in ("data.shift", "model.image.bias"))
-    found = [deviation(f"module {kind}/image x/all", 10.0) for kind in ("bias", "error")]
+    deviations = [deviation(f"module {kind}/image x/all", 10.0) for kind in ("bias", "error")]
     same, larger = (deviation("contact distance/labels/contact", t) for t in (0.0, 10.0))
-    assert explain(model, [*found, same]).score > explain(data, [*found, same]).score
-    assert explain(data, [*found, larger]).score > explain(model, [*found, larger]).score
+    assert explain(model, [*deviations, same]).score > explain(data, [*deviations, same]).score
+    assert explain(data, [*deviations, larger]).score > explain(model, [*deviations, larger]).score
 
 
 def test_an_offset_of_the_labels_has_no_common_distance_in_contact() -> None:
     """A larger object is farther away from every side, shifted labels by their own amount in each direction."""
     data, labels = (next(c for c in CAUSES if c.name == name) for name in ("data.shift", "labels.offset"))
-    found = [deviation(f"module {kind}/image x/all", 10.0) for kind in ("bias", "error")]
-    found.append(deviation("contact distance error/labels/contact", 10.0))
+    deviations = [deviation(f"module {kind}/image x/all", 10.0) for kind in ("bias", "error")]
+    deviations.append(deviation("contact distance error/labels/contact", 10.0))
     common, scattered = (deviation(f"contact distance{kind}/labels/contact", 10.0) for kind in ("", " scatter"))
-    assert explain(data, [*found, common]).score > explain(labels, [*found, common]).score
-    assert explain(labels, [*found, scattered]).score > explain(data, [*found, scattered]).score
+    assert explain(data, [*deviations, common]).score > explain(labels, [*deviations, common]).score
+    assert explain(labels, [*deviations, scattered]).score > explain(data, [*deviations, scattered]).score
 
 
 @pytest.mark.parametrize(
@@ -219,11 +219,11 @@ def test_the_burden_counts_phases_once_and_the_filter_less() -> None:
 @pytest.mark.parametrize(("haptics", "shared"), [(0.02, True), (0.0, False)])
 def test_a_shift_of_all_modalities_is_common(haptics: float, shared: bool) -> None:
     """The haptics model has a standard error of 5 mm; the image model has moved by 2 cm."""
-    found = [
+    deviations = [
         Deviation(f"module bias/{name} x/all", value, 0.0, -2 * sigma, 2 * sigma, 0.0, True, value / sigma)
         for name, value, sigma in (("image", 0.02, 0.001), ("haptics", haptics, 0.005))
     ]
-    common, alone = (support(Symptom("module bias/*", target=target), found) for target in ("common", "alone"))
+    common, alone = (support(Symptom("module bias/*", target=target), deviations) for target in ("common", "alone"))
     assert (common > 0.9 and alone < -0.9) if shared else (alone > 0.9 and common < -0.9)
 
 

@@ -202,9 +202,9 @@ def deviations_in(values: Callable[[float, float], list[float]]) -> Case:
 def test_the_number_of_processes_does_not_matter() -> None:
     """Two blocks of episodes and up to three interventions, in one process and in two."""
     episodes = {i: Faults.parse("image_shift=3").apply(e) for i, e in simulated(0, 20).items()}
-    one, two = (diagnose(checkpoint(), episodes, profile=profile(), workers=workers) for workers in (1, 2))
-    assert json.dumps(one.to_json()) == json.dumps(two.to_json())
-    assert one.causes[0].recovered is not None
+    serial, parallel = (diagnose(checkpoint(), episodes, profile=profile(), workers=workers) for workers in (1, 2))
+    assert json.dumps(serial.to_json()) == json.dumps(parallel.to_json())
+    assert serial.causes[0].recovered is not None
 
 
 def test_a_fault_in_some_episodes_is_examined_in_these() -> None:

@@ -283,10 +283,10 @@ def test_image_shift_is_registered() -> None:
 )
 def test_faults_are_localised(faults: str, statistic: str, steps: tuple[int, int]) -> None:
     faulty = Faults.parse(faults).apply(episodes("push")[0])
-    found = localise(statistic, faulty, reference("push"))
-    assert found is not None
+    interval = localise(statistic, faulty, reference("push"))
+    assert interval is not None
     tolerance = STRIDE if statistic.endswith("extreme") else 2
-    assert np.abs(np.subtract(found, steps)).max() <= tolerance
+    assert np.abs(np.subtract(interval, steps)).max() <= tolerance
     assert localise("lag/image/all", faulty, reference("push")) is None
 
 

@@ -140,7 +140,7 @@ DRIFT = values(drift__force_x__free_motion=1.0, drift__force_y__free_motion=0.0,
 
 
 @pytest.mark.parametrize(
-    ("faults", "action", "found", "key"),
+    ("faults", "action", "symptoms", "key"),
     [
         ("delay=image:steps=3", "advance image", values(lag__image__all=3.0), "image"),
         ("image_shift=2:y=-3", "realign image", values(shift__image_x__all=2.0, shift__image_y__all=-3.0), "image"),
@@ -153,10 +153,10 @@ DRIFT = values(drift__force_x__free_motion=1.0, drift__force_y__free_motion=0.0,
     ],
 )
 def test_readings_without_a_fault_are_the_original_ones(
-    faults: str, action: str, found: dict[str, Deviation], key: str
+    faults: str, action: str, symptoms: dict[str, Deviation], key: str
 ) -> None:
     faulty = {index: Faults.parse(faults).apply(episode) for index, episode in episodes().items()}
-    changed = undo(action, setting(checkpoint("crossmodal-ekf"), faulty), found)
+    changed = undo(action, setting(checkpoint("crossmodal-ekf"), faulty), symptoms)
     assert changed is not None
     for index, episode in episodes().items():
         inner = (slice(0, -3), slice(3, -3), slice(3, -3))[: episode.observations[key].ndim]
@@ -212,8 +212,8 @@ def test_an_offset_of_the_hand_is_measured_by_commanded_positions() -> None:
     with open_dataset(sample_path("push-field")) as data:
         clean = data[data.held_out()[0]]
     faulty = Faults.parse("effector_offset=0.02:y=-0.01").apply(clean)
-    found = values(offset__control_x__all=-0.02, offset__control_y__all=0.01, offset__control_z__all=0.0)
-    changed = undo("shift hand", setting(filter_, {0: faulty}), found)
+    symptoms = values(offset__control_x__all=-0.02, offset__control_y__all=0.01, offset__control_z__all=0.0)
+    changed = undo("shift hand", setting(filter_, {0: faulty}), symptoms)
     assert changed is not None
     distance = changed.episodes[0].observations["effector_position"] - clean.observations["effector_position"]
     assert np.abs(distance).max() < 1e-6
@@ -228,9 +228,9 @@ def test_an_offset_of_the_hand_is_measured_in_the_image() -> None:
     faulty = {i: Faults.parse("effector_offset=0.02:y=-0.01").apply(e) for i, e in episodes().items()}
     centre = reference.hand.scale[:1]
     pixels = (reference.hand.pixels(centre) - reference.hand.pixels(centre + np.array([[0.02, -0.01, 0.0]])))[0]
-    found = values(hand_offset__image_x__all=pixels[0], hand_offset__image_y__all=pixels[1])
+    symptoms = values(hand_offset__image_x__all=pixels[0], hand_offset__image_y__all=pixels[1])
     run = replace(setting(checkpoint("crossmodal-ekf"), faulty), healthy=profile)
-    changed = undo("shift hand", run, found)
+    changed = undo("shift hand", run, symptoms)
     assert changed is not None
     for index, episode in episodes().items():
         distance = changed.episodes[index].observations["effector_position"] - episode.observations["effector_position"]
@@ -263,8 +263,8 @@ def test_only_affected_episodes_change() -> None:
 @pytest.mark.parametrize(("own", "expected"), [(20, 300), (300, None), (1000, None)])
 def test_few_particles_become_as_many_as_in_the_record(own: int, expected: int | None) -> None:
     run = replace(setting(checkpoint("unimodal-pf")), particles=own)
-    known = Deviation("particles//all", float(own), 300.0, 300.0, 300.0, 0.0, True, -10.0)
-    changed = undo("healthy particles", run, {known.statistic: known})
+    deviation = Deviation("particles//all", float(own), 300.0, 300.0, 300.0, 0.0, True, -10.0)
+    changed = undo("healthy particles", run, {deviation.statistic: deviation})
     assert (None if changed is None else changed.particles) == expected
 
 

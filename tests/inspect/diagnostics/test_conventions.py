@@ -55,7 +55,7 @@ def of_mirrored_positions() -> Conventions:
 
 def test_a_planted_sign_is_the_first_finding_and_its_share_that_of_the_clean_runs() -> None:
     result = of_mirrored_positions()
-    change, error = result.found[0]
+    change, error = result.relevant_removals[0]
     assert result.changes[change].text == "the opposite sign of effector position"
     assert result.verdict.startswith("With the opposite sign of effector position, the ")
     clean, faulty = (np.sum([squared_errors(trace) for trace in runs], axis=0) for runs in (traces(), traces(MIRRORED)))
@@ -75,7 +75,7 @@ def test_sensors_without_influence_change_nothing() -> None:
 
 def test_clean_episodes_have_no_finding() -> None:
     result = conventions(traces(), filter_())
-    assert (result.found, result.alarms) == ([], ())
+    assert (result.relevant_removals, result.alarms) == ([], ())
     assert result.verdict.startswith(f"None of {len(result.changes)} changes of signs")
 
 

@@ -140,9 +140,9 @@ def test_consistent_fusion_has_no_reason() -> None:
 
 def test_overconfident_sensor() -> None:
     first = np.array([0.25, 1.0])[:, None, None]
-    found = contributing(simulated(observation_covariance=lambda r: r * first), "information-ekf")
-    assert set(found) == {(CALIBRATION, "image")}
-    reason = found[CALIBRATION, "image"]
+    reasons = contributing(simulated(observation_covariance=lambda r: r * first), "information-ekf")
+    assert set(reasons) == {(CALIBRATION, "image")}
+    reason = reasons[CALIBRATION, "image"]
     assert reason.value == pytest.approx(4.0, rel=0.15)
     assert reason.low < 4.0 < reason.high
     assert "deviations of the image sensor are too small" in reason.headline
@@ -156,10 +156,10 @@ def test_readings_without_information_are_no_reason() -> None:
 
 def test_biased_sensor_is_drifted_not_uncalibrated() -> None:
     shift = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0]])
-    found = contributing(simulated(observation_mean=lambda z: z + shift), "information-ekf")
-    assert set(found) == {(DRIFT, "haptics"), (WEIGHTS, "")}  # a biased sensor deserves less than half of the weight
-    assert found[DRIFT, "haptics"].value == pytest.approx(0.03 / np.hypot(0.03, 0.02), rel=0.05)
-    assert "hinge y of the haptics sensor has a bias of +2.99 cm" in found[DRIFT, "haptics"].headline
+    reasons = contributing(simulated(observation_mean=lambda z: z + shift), "information-ekf")
+    assert set(reasons) == {(DRIFT, "haptics"), (WEIGHTS, "")}  # a biased sensor deserves less than half of the weight
+    assert reasons[DRIFT, "haptics"].value == pytest.approx(0.03 / np.hypot(0.03, 0.02), rel=0.05)
+    assert "hinge y of the haptics sensor has a bias of +2.99 cm" in reasons[DRIFT, "haptics"].headline
 
 
 @pytest.mark.parametrize("product", [False, True])
@@ -168,19 +168,19 @@ def test_prior_in_two_posteriors_counts_twice(product: bool) -> None:
     traces = simulated(estimate_covariance=lambda c: c * 3.0 / 4.0)
     if product:
         traces = [replace(trace, weights=None) for trace in traces]
-    found = contributing(traces, "crossmodal-ekf")
-    assert set(found) == {(PRIOR, "")}
-    assert found[PRIOR, ""].value == pytest.approx(2.0, rel=1e-4)
+    reasons = contributing(traces, "crossmodal-ekf")
+    assert set(reasons) == {(PRIOR, "")}
+    assert reasons[PRIOR, ""].value == pytest.approx(2.0, rel=1e-4)
     assert not contributing(traces, "information-ekf")  # its trace has updates, but the rule fuses one prior
     assert not contributing(traces, "unimodal-ekf")  # every modality continues from its own belief
 
 
 def test_weights_far_from_the_best_split() -> None:
     wrong = np.broadcast_to(np.array([0.9, 0.1])[:, None], (90, 2, 3))
-    found = contributing(simulated(effective_weights=lambda w: wrong), "information-ekf")
-    assert set(found) == {(WEIGHTS, "")}
-    assert found[WEIGHTS, ""].value == pytest.approx(np.sqrt((0.9**2 + 0.1**2) / 0.5), rel=0.05)
-    assert "mean weight of image 0.90, best 0.5" in found[WEIGHTS, ""].headline
+    reasons = contributing(simulated(effective_weights=lambda w: wrong), "information-ekf")
+    assert set(reasons) == {(WEIGHTS, "")}
+    assert reasons[WEIGHTS, ""].value == pytest.approx(np.sqrt((0.9**2 + 0.1**2) / 0.5), rel=0.05)
+    assert "mean weight of image 0.90, best 0.5" in reasons[WEIGHTS, ""].headline
 
 
 @pytest.fixture(scope="module")

@@ -88,11 +88,11 @@ def test_p_value_of_one_trajectory_is_its_rank() -> None:
 def test_one_deviating_trajectory_is_unusual_but_no_alarm_in_words() -> None:
     healthy = np.random.default_rng(7).normal(0.0, 0.05, 99)
     reference = HealthyProfile("", 99, None, {"autocorrelation/haptics hinge_y/all": healthy})
-    one, five = (compare(reference, count * [{"autocorrelation/haptics hinge_y/all": 0.9}]) for count in (1, 5))
+    single, repeated = (compare(reference, count * [{"autocorrelation/haptics hinge_y/all": 0.9}]) for count in (1, 5))
     subject = "autocorrelation at lag 1 of the innovations of haptics (hinge y) is 0.9"
     compared = f"compared with the healthy record of 99 trajectories: {subject}"
-    assert one.sentence.startswith(f"Unusual episode (as up to 1 in 50 healthy ones), {compared}")
-    assert five.sentence.startswith(f"Alarm, {compared}")
+    assert single.sentence.startswith(f"Unusual episode (as up to 1 in 50 healthy ones), {compared}")
+    assert repeated.sentence.startswith(f"Alarm, {compared}")
 
 
 def test_order_of_trajectories_is_irrelevant() -> None:
@@ -173,18 +173,18 @@ def test_shipped_profiles_belong_to_their_checkpoints() -> None:
         checkpoint = load_checkpoint(path.with_name(path.name.removesuffix(SUFFIX) + ".safetensors"))
         document = json.loads(path.read_text())
         assert document["checkpoint"] == checkpoint.hash
-        found = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, None)
-        assert found is not None
-        assert found.episodes >= 50
-        assert math.isfinite(np.nanmean(found.statistics["nees/fused/all"]))
+        stored_profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, None)
+        assert stored_profile is not None
+        assert stored_profile.episodes >= 50
+        assert math.isfinite(np.nanmean(stored_profile.statistics["nees/fused/all"]))
         assert find_profile(checkpoint.task.name, checkpoint.name, "other", None) is None
         used = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
         assert used is not None  # that of the file, not an earlier one in the header
-        assert used.statistics.keys() == found.statistics.keys()
+        assert used.statistics.keys() == stored_profile.statistics.keys()
         assert used.reference is not None
         assert used.reference.hand is not None or used.reference.object is not None
         if checkpoint.kind == "pf":
-            assert "ess//all" in found.statistics
+            assert "ess//all" in stored_profile.statistics
 
 
 def test_the_profile_of_a_new_checkpoint_is_in_its_header(tmp_path: Any) -> None:
@@ -194,9 +194,9 @@ def test_the_profile_of_a_new_checkpoint_is_in_its_header(tmp_path: Any) -> None
     save_checkpoint(base.filter, base.name, base.record, path, document)
     checkpoint = load_checkpoint(path)
     assert checkpoint.record == base.record
-    found = find_profile("door", base.name, checkpoint.hash, checkpoint)
-    assert found is not None
-    assert found.to_json() == document
+    stored_profile = find_profile("door", base.name, checkpoint.hash, checkpoint)
+    assert stored_profile is not None
+    assert stored_profile.to_json() == document
 
 
 def test_single_trace_alarms_need_a_large_profile() -> None:

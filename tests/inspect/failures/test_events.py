@@ -314,11 +314,11 @@ def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[i
 def test_values_do_not_depend_on_the_number_of_processes() -> None:
     filter_ = load_checkpoint(shipped("push", "crossmodal-ekf"))
     with open_dataset(sample_path("push")) as data:
-        one, two = (survey_of(filter_, data, range(BLOCK + 1), workers=workers) for workers in (1, 2))
-    assert one.phases.keys() == two.phases.keys()
-    for name, values in one.scores.items():
-        np.testing.assert_array_equal(values, two.scores[name])
-    np.testing.assert_array_equal(one.phase_index, two.phase_index)
+        serial, parallel = (survey_of(filter_, data, range(BLOCK + 1), workers=workers) for workers in (1, 2))
+    assert serial.phases.keys() == parallel.phases.keys()
+    for name, values in serial.scores.items():
+        np.testing.assert_array_equal(values, parallel.scores[name])
+    np.testing.assert_array_equal(serial.phase_index, parallel.phase_index)
 
 
 def test_failures_match_the_traces(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> None:

@@ -53,8 +53,8 @@ def test_angles_wrap_and_collapsed_particles_have_a_density() -> None:
     density = ParticleDensity(DOOR, states, log_weights)
     turned = density.log_density(middle - [0.0, 0.0, 2.0 * np.pi], (0, 1), offsets, offsets)
     np.testing.assert_allclose(turned, density.log_density(middle, (0, 1), offsets, offsets), atol=1e-3)
-    one = ParticleDensity(DOOR, states[:1], np.zeros(1))
-    values = one.log_density(states[0], (0, 1), offsets, offsets)
+    single = ParticleDensity(DOOR, states[:1], np.zeros(1))
+    values = single.log_density(states[0], (0, 1), offsets, offsets)
     assert np.isfinite(values).all()
     assert values.argmax() == 12
 

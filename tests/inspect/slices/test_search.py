@@ -124,10 +124,10 @@ def test_pairings_are_rotations_of_whole_episodes() -> None:
 def test_unknown_values_belong_to_no_slice() -> None:
     rng = np.random.default_rng(5)
     columns = covariates(rng)
-    known = columns[1].values == 1
-    columns[0] = replace(columns[0], values=np.where(known, columns[0].values, np.nan))
+    recorded = columns[1].values == 1
+    columns[0] = replace(columns[0], values=np.where(recorded, columns[0].values, np.nan))
     (result,) = search(np.where(columns[0].values > 2.0, 4.0, 1.0) * errors(rng), columns)
-    assert known[result.steps].all()
+    assert recorded[result.steps].all()
 
 
 def test_nothing_to_search() -> None:
