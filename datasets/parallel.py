@@ -12,7 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import islice
 from multiprocessing.context import BaseContext
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -35,14 +35,14 @@ def run_in_processes(
     remaining, losses = iter(items), 0
     queue: list[Item] = []
     while True:
-        pool = ProcessPoolExecutor(workers, _context(_modules(function)), _exit_with_parent)
+        pool = ProcessPoolExecutor(workers, _context(_modules(function)), _start_worker, (function,))
         running: dict[Future[Result], Item] = {}
         try:
             while True:
                 # A short queue, because a lost process loses everything in it; items may be many.
                 queue += islice(remaining, max(0, 2 * workers - len(running) - len(queue)))
                 while queue and len(running) < 2 * workers:
-                    running[pool.submit(function, queue[0])] = queue[0]
+                    running[pool.submit(_call, queue[0])] = queue[0]
                     del queue[0]
                 if not running:
                     return
@@ -95,8 +95,18 @@ def _modules(function: Callable[..., object]) -> set[str]:
     return {getattr(owner, "__module__", __name__)} - {"__main__"}
 
 
-def _exit_with_parent() -> None:
-    """Initialize a worker: ignore Ctrl-C and exit when the parent process ends for any reason."""
+_function: Callable[[Any], Any]
+"""In a worker: the function to call. It is sent once, because it may contain a filter."""
+
+
+def _call(item: Any) -> Any:
+    return _function(item)
+
+
+def _start_worker(function: Callable[[Any], Any]) -> None:
+    """Initialize a worker: keep the function, ignore Ctrl-C, and exit when the parent process ends for any reason."""
+    global _function
+    _function = function
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
