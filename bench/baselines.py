@@ -49,7 +49,9 @@ def main(names: list[str]) -> None:
         for blackout in EVALUATED_BLACKOUTS:
             faults = Faults.parse(f"blackout={blackout}")
             first = blackout == EVALUATED_BLACKOUTS[0]  # a blackout does not change the baselines
-            result = evaluate(filter_, episodes, faults=faults, start_offset=STUDY_OFFSET.of(task), baselines=first)
+            result = evaluate(
+                filter_, episodes, faults=faults, start_offset=STUDY_OFFSET.for_task(task), baselines=first
+            )
             baselines = result.baselines or baselines
             for key in headline_keys(result.rmse):
                 values = [interval(result, key), f"{result.rmse_from_step_0[key]:.2f}"]

@@ -153,8 +153,8 @@ def main() -> None:
             print(f"| {path.stem} | {100 * rate_without_new_episodes(profile):.1f} % | | |", flush=True)
             continue
         rate, by_diagnostic = alarm_rate(profile, rows["healthy"], SAMPLES)
-        found = [f"{100 * alarm_rate(profile, rows[f], PLANTED_SAMPLES)[0]:.0f} %" if f in rows else "" for f in FAULTS]
-        print(f"| {path.stem} | {100 * rate:.1f} % | {found[0]} | {found[1]} |", flush=True)
+        rates = [f"{100 * alarm_rate(profile, rows[f], PLANTED_SAMPLES)[0]:.0f} %" if f in rows else "" for f in FAULTS]
+        print(f"| {path.stem} | {100 * rate:.1f} % | {rates[0]} | {rates[1]} |", flush=True)
         print(f"{path.stem}: {by_diagnostic}", file=sys.stderr, flush=True)
 
 

@@ -152,33 +152,33 @@ def executed(run: Callable[[], object]) -> Flops:
 @torch.no_grad()
 def networks_flops(filter_: Any, batch: Batch) -> Flops:
     """Each network once: of one trajectory and step, with one state."""
-    one = Batch(
+    step = Batch(
         {key: value[:1, :1] for key, value in batch.observations.items()},
         batch.controls[:1, :1],
         batch.states[:1, :1],
         batch.contact[:1, :1],
         batch.previous[:1],
     )
-    return count(lambda: _ours_once(filter_, one) if isinstance(filter_, Filter) else _published_once(filter_, one))
+    return count(lambda: _ours_once(filter_, step) if isinstance(filter_, Filter) else _published_once(filter_, step))
 
 
-def _ours_once(filter_: Filter, one: Batch) -> None:
-    evidence = filter_.encode(one)[0]
-    filter_.dynamics(one.previous, evidence.control)
+def _ours_once(filter_: Filter, step: Batch) -> None:
+    evidence = filter_.encode(step)[0]
+    filter_.dynamics(step.previous, evidence.control)
     if isinstance(filter_, MixtureParticleFilter):
-        filter_.log_likelihood(evidence, one.previous.unsqueeze(1))
+        filter_.log_likelihood(evidence, step.previous.unsqueeze(1))
 
 
-def _published_once(filter_: Any, one: Batch) -> None:
-    observed = {key: value[0] for key, value in observations(one).items()}
+def _published_once(filter_: Any, step: Batch) -> None:
+    observed = {key: value[0] for key, value in observations(step).items()}
     filters = getattr(filter_, "filter_models", [filter_])
-    filters[0].dynamics_model(initial_states=one.previous, controls=one.controls[0])
+    filters[0].dynamics_model(initial_states=step.previous, controls=step.controls[0])
     if hasattr(filter_, "filter_models"):
         for part in filters:
             part.virtual_sensor_model(observations=observed)
         filter_.crossmodal_weight_model(observations=observed)
     else:
-        filter_.measurement_model(states=one.previous.unsqueeze(1), observations=observed)
+        filter_.measurement_model(states=step.previous.unsqueeze(1), observations=observed)
 
 
 def published_filters(folder: Path) -> dict[str, nn.Module]:

@@ -65,8 +65,8 @@ def survey(folder: Path) -> None:
             seconds.append(time.perf_counter() - start)
             if workers == 1:
                 print(f"{name}, {episodes} episodes: {1e3 * (cpu() - before) / episodes:.1f} CPU-ms each")
-        one, two = seconds
-        print(f"{name}: {one:.1f} s in one process, {two:.1f} s in two, {one / two:.2f} x")
+        single, two = seconds
+        print(f"{name}: {single:.1f} s in one process, {two:.1f} s in two, {single / two:.2f} x")
 
 
 def checkpoints(folder: Path, count: int) -> list[Path]:

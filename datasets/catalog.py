@@ -48,11 +48,11 @@ def stored_task(stored: Any, given: Iterable[Task] = ()) -> Task:
     Raises:
         BadInput: for an invalid definition, and for the name of a task that is neither given nor shipped.
     """
-    known = [*given, *TASKS.values()]
+    tasks = [*given, *TASKS.values()]
     if isinstance(stored, str):
-        return next((task for task in known if task.name == stored), None) or find_task(stored)
+        return next((task for task in tasks if task.name == stored), None) or find_task(stored)
     task = task_from_json(stored)
-    source = next((other for other in known if not difference(task, other)), None)
+    source = next((other for other in tasks if not difference(task, other)), None)
     return task if source is None else with_functions(task, source)
 
 

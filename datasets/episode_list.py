@@ -24,11 +24,11 @@ def find(data: Dataset, query: str, first: int, limit: int) -> tuple[int, list[d
     word comes first.
     """
     words = query.lower().split()
-    found: Sequence[EpisodeSummary] = data.summaries
+    matches: Sequence[EpisodeSummary] = data.summaries
     if words:
-        found = [s for s in found if all(word in _text(s) for word in words)]
-        found.sort(key=lambda s: str(s.index) not in words)
-    return len(found), to_json(data, found[first : first + limit])
+        matches = [s for s in matches if all(word in _text(s) for word in words)]
+        matches.sort(key=lambda s: str(s.index) not in words)
+    return len(matches), to_json(data, matches[first : first + limit])
 
 
 def to_json(data: Dataset, summaries: Sequence[EpisodeSummary]) -> list[dict[str, Any]]:

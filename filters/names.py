@@ -50,9 +50,9 @@ def shipped(task: str | Task, name: str) -> Path:
     check_not_source(name)
     definition = find_task(task)
     filters, task = filter_names(definition), definition.name
-    paths = {known: PRETRAINED / f"{task}-{known}.safetensors" for known in filters}
+    paths = {filter_: PRETRAINED / f"{task}-{filter_}.safetensors" for filter_ in filters}
     is_shipped = task in TASKS and not difference(TASKS[task], definition)
-    available = [known for known, path in paths.items() if is_shipped and path.is_file()]
+    available = [filter_ for filter_, path in paths.items() if is_shipped and path.is_file()]
     if name not in filters:
         raise unknown_name("filter", name, available)
     if name not in available:

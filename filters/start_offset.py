@@ -43,23 +43,23 @@ class StartOffset:
         lengths: dict[str, float] = {}
         for part in filter(None, (part.strip() for part in text.split(","))):
             number = NUMBER.match(part)[0]  # type: ignore[index]  # matches any text
-            shown = part[len(number) :].strip()
-            if shown not in units:
+            suffix = part[len(number) :].strip()
+            if suffix not in units:
                 raise BadInput(f"start offset {part!r} is not in a unit of task {task.name!r}: {', '.join(units)}")
             try:
                 value = float(number)
             except ValueError:
                 value = math.nan
-            unit, factor = units[shown]
+            unit, factor = units[suffix]
             if not 0.0 < value < 1e6 or unit in lengths:
-                raise BadInput(f"start offset {part!r} of {text!r} is not one positive length, such as 3{shown}")
+                raise BadInput(f"start offset {part!r} of {text!r} is not one positive length, such as 3{suffix}")
             if task.rotations and unit == "rad":
                 name = task.components[task.rotations[0].start].rotation
                 raise BadInput(f"start offset {part!r}: {name!r} is a rotation, which starts at the truth")
             lengths[unit] = value / factor
         return cls(lengths)
 
-    def of(self, task: Task) -> StartOffset:
+    def for_task(self, task: Task) -> StartOffset:
         """The same offset without the units that the task does not have."""
         return StartOffset(
             {unit: self.lengths[unit] for unit in self.lengths if unit in {c.unit for c in task.components}}
@@ -69,8 +69,8 @@ class StartOffset:
         return bool(self.lengths)
 
     def __str__(self) -> str:
-        shown = {unit: display_unit(unit) for unit in self.lengths}
-        return ",".join(f"{factor * self.lengths[unit]:g}{name}" for unit, (name, factor) in shown.items())
+        displayed = {unit: display_unit(unit) for unit in self.lengths}
+        return ",".join(f"{factor * self.lengths[unit]:g}{name}" for unit, (name, factor) in displayed.items())
 
     def vectors(self, task: Task, episodes: Sequence[Episode], seed: int) -> FloatArray:
         """(N, n) offsets in SI units. Directions depend only on the seed and on each episode's digest."""

@@ -304,7 +304,7 @@ class Experiments:
 
     def path(self, table: str, column: str, value: str) -> Path:
         """File of a checkpoint or data set with this hash. Raises BadInput for an unknown hash."""
-        found = self._database.execute(f"SELECT path FROM {table} WHERE {column} = ?", [value]).fetchone()
-        if found is None:
+        row = self._database.execute(f"SELECT path FROM {table} WHERE {column} = ?", [value]).fetchone()
+        if row is None:
             raise BadInput(f"no {column} with hash {value[:12]} in these sweeps")
-        return Path(found[0])
+        return Path(row[0])

@@ -141,8 +141,8 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         first: Annotated[int, Query(ge=0)] = 0,
         limit: Annotated[int, Query(ge=1)] = episode_list.LISTED,
     ) -> dict[str, Any]:
-        count, found = episode_list.find(store.dataset(task, data)[1], query, first, limit)
-        return {"count": count, "episodes": found}
+        count, page = episode_list.find(store.dataset(task, data)[1], query, first, limit)
+        return {"count": count, "episodes": page}
 
     @router.get(
         "/api/trace/{task}/{filter}/{episode}",

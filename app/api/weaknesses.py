@@ -33,15 +33,15 @@ def weaknesses_of(store: TraceStore, jobs: Jobs, selection: Selection) -> list[W
     path = found_failures(store, jobs, selection)
     scores = [] if path is None else json.loads(path.read_bytes())["scores"]
     filter_, faults, episode = checkpoint.filter, selection.faults, selection.episode
-    found = [
+    entries = [
         *weaknesses.diagnosed(diagnosis, filter_, faults, episode),
         *weaknesses.failing(scores, filter_),
         *weaknesses.untrained(checkpoint),
     ]
-    if not any(weakness.source == "diagnosis" for weakness in found):
-        found = [*weaknesses.injected(faults, filter_, episode), *found]
-    return [Weakness(**vars(weakness) | _training(weakness.settings)) for weakness in found]
+    if not any(weakness.source == "diagnosis" for weakness in entries):
+        entries = [*weaknesses.injected(faults, filter_, episode), *entries]
+    return [Weakness(**vars(weakness) | _training(weakness.settings)) for weakness in entries]
 
 
 def _training(settings: FineTune) -> dict[str, Any]:
-    return {"settings": settings.to_json(), "slices": [SliceInfo.of(slice_) for slice_, _ in settings.mix]}
+    return {"settings": settings.to_json(), "slices": [SliceInfo.from_slice(slice_) for slice_, _ in settings.mix]}

@@ -29,7 +29,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         settings = store.settings
         checkpoint, data = settings.checkpoints.get(selection.filter), settings.data.get(selection.data)
         path = str(checkpoint) if isinstance(checkpoint, Path) else ""
-        shown = [] if quantity == "likelihood" else ["--map", quantity]
+        map_option = [] if quantity == "likelihood" else ["--map", quantity]
         quantity = None if quantity in missing_quantities(traced.checkpoint, trace) else quantity
         serve = serve_command(filter(None, [path]), data, settings.seed)
 
@@ -48,7 +48,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             links_note=f"Permalinks work while this command runs: {serve}.",
             commands=(
                 trace_command(trace, "run.trace", path, data),
-                report_command(["run.trace"], events, slow, title, *shown),
+                report_command(["run.trace"], events, slow, title, *map_option),
             ),
             quantity=quantity,
             progress=lambda share: report(0.1 + 0.4 * share, "computing diagnostics"),

@@ -70,8 +70,8 @@ def wrist(force: float) -> Ingredient:
         "force_noise": (0.1 * force, 0.4 * force),
         "torque_noise": (0.01 * force, 0.04 * force),
     }
-    of = {"force": "N", "drift": "N/s", "torque": "N m"}
-    units = {name: of[name.partition("_")[0]] for name in ranges}
+    unit_of = {"force": "N", "drift": "N/s", "torque": "N m"}
+    units = {name: unit_of[name.partition("_")[0]] for name in ranges}
     return Ingredient("bias (N, N m), drift (N/s) and noise of the force/torque sensor", ranges, units)
 
 

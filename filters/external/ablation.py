@@ -52,7 +52,7 @@ def _neutral(readings: NDArray[Any], absent: Literal["mean", "nan"]) -> Any:
     """Reading (...) without information, of readings (T, ...)."""
     if absent == "nan":
         return np.nan if readings.dtype.kind == "f" else 0
-    known = np.isfinite(readings)
-    total = np.where(known, readings, 0).sum(0, dtype=np.float64)
-    mean = total / np.maximum(known.sum(0), 1)
+    is_finite = np.isfinite(readings)
+    total = np.where(is_finite, readings, 0).sum(0, dtype=np.float64)
+    mean = total / np.maximum(is_finite.sum(0), 1)
     return mean if readings.dtype.kind == "f" else np.rint(mean)

@@ -337,14 +337,18 @@ def derived(values: Values, task: Task) -> Values:
     if particles is None:
         return values
     has_likelihood = {"log_likelihood", "prior_log_weights"} <= values.keys()
-    one = has_likelihood and _posterior_is_of_one_model(values)
+    is_of_one_model = has_likelihood and _posterior_is_of_one_model(values)
     for name in ("log_weights", "prior_log_weights"):
         for (weights,) in _blocks(particles, values[name]) if name in values else ():
             weights.copy_(torch.log_softmax(weights, dim=-1))
-    posterior = _moments(task, particles, values["log_weights"]) if one or "estimate_covariance" not in values else None
+    posterior = (
+        _moments(task, particles, values["log_weights"])
+        if is_of_one_model or "estimate_covariance" not in values
+        else None
+    )
     if posterior is not None:
         values.setdefault("estimate_covariance", posterior.covariance)
-    if posterior is not None and one:
+    if posterior is not None and is_of_one_model:
         values.setdefault("modality_mean", posterior.mean.unsqueeze(-2))
         values.setdefault("modality_covariance", posterior.covariance.unsqueeze(-3))
     elif has_likelihood and "modality_mean" not in values:

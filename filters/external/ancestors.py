@@ -67,8 +67,8 @@ def _matches(after: Words, before: Words, table: NDArray[np.int32]) -> NDArray[n
     hidden = np.flatnonzero(_take(table, slots) != index) if len(missing) else missing
     result[missing] = count
     if len(hidden):
-        found = _search(after[:, missing], wanted[missing], before[:, hidden], hashes[hidden])
-        result[missing] = _take(np.append(hidden, count), found)
+        parents = _search(after[:, missing], wanted[missing], before[:, hidden], hashes[hidden])
+        result[missing] = _take(np.append(hidden, count), parents)
     return result
 
 

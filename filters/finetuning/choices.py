@@ -55,7 +55,7 @@ class SliceInfo:
     text: str
 
     @classmethod
-    def of(cls, slice_: Slice) -> SliceInfo:
+    def from_slice(cls, slice_: Slice) -> SliceInfo:
         return cls(**slice_.to_json(), text=str(slice_))
 
 
@@ -99,7 +99,7 @@ def choices(checkpoint: Checkpoint) -> Choices:
             PresetInfo(name, preset_help(name), [key for key in parameters if key in names])
             for name, names in trained.items()
         ],
-        [SliceInfo.of(slice_) for slice_ in slices],
+        [SliceInfo.from_slice(slice_) for slice_ in slices],
         [slice_.name for slice_ in criterion_slices(checkpoint.task, filter_.names)],
         default_settings(filter_).to_json(),
         reason(filter_),

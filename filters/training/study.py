@@ -292,7 +292,7 @@ def held_out(episodes: Sequence[Episode]) -> list[Episode]:
 
 def offset_metrics(filter_: Filter | ExternalFilter, episodes: Sequence[Episode]) -> Document:
     """As ``measure``, on held-out episodes, from starts with ``STUDY_OFFSET``."""
-    return measure(filter_, held_out(episodes), STUDY_OFFSET.of(filter_.task))
+    return measure(filter_, held_out(episodes), STUDY_OFFSET.for_task(filter_.task))
 
 
 @lru_cache(maxsize=1)

@@ -130,7 +130,7 @@ def _row(task: Task, name: str, key: str, blackout: float, requested: Sequence[D
         standalone=_rmse_by_name([{k: m for k, m in by_name.items() if k != "fused"} for by_name in metrics]),
         updates=_rmse_by_name([m.get("updates", {}) for m in fused]),
         by_seed=by_seed,
-        start=str(STUDY_OFFSET.of(task)) if key == OFFSET else "",
+        start=str(STUDY_OFFSET.for_task(task)) if key == OFFSET else "",
         from_step_0=_over_seeds([m.get("rmse_from_step_0", {}) for m in fused])[0],
         baselines=_rmse_by_name([{k: m for k, m in f.get("baselines", {}).items() if m} for f in fused]),
         main=task.main_error.key,

@@ -163,8 +163,8 @@ def read_map(path: Path) -> ColumnMap:
     for key in estimate:
         check_name("key of [estimate]", key, ESTIMATE)
     dt = values.get("dt")
-    known = dt is not None or "time" in values or "clock" in values
-    if not known or not (dt is None or (type(dt) in (int, float) and 0 < dt < math.inf)):
+    has_time = dt is not None or "time" in values or "clock" in values
+    if not has_time or not (dt is None or (type(dt) in (int, float) and 0 < dt < math.inf)):
         raise BadInput(f"{path.name} needs either dt, in s and more than 0, or time, the name of a column in s")
     if "clock" in values and dt is not None:
         raise BadInput(f"{path.name} has dt and clock, expected dt or the topic whose messages are the steps")

@@ -69,8 +69,8 @@ def _table(columns: Columns) -> list[str]:
         # Standard deviations of some components only cannot be imported.
         complete = len(std) == len(mean) or mean[:1] == [name for name in mean if name in rows]
         deviations = std if complete and not covariance else []
-        found = {"mean": mean, "std": deviations, "covariance": covariance, "particles": ensemble}
-        lines += [f"{key} = {_text(n[0]) if len(n) == 1 else _texts(n)}" for key, n in found.items() if n]
+        columns_of = {"mean": mean, "std": deviations, "covariance": covariance, "particles": ensemble}
+        lines += [f"{key} = {_text(n[0]) if len(n) == 1 else _texts(n)}" for key, n in columns_of.items() if n]
     return lines
 
 

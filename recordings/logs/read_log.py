@@ -227,13 +227,15 @@ def _sample_covariance(ensemble: Array) -> Array:
 
 def _states(columns: Columns, mapping: ColumnMap) -> Array:
     """(T, n) true states, SI units; NaN where they are unknown."""
-    known = {name: _scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column}
-    count = len(next(iter((known or columns).values())))
-    for name, part in known.items():
+    states = {
+        name: _scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column
+    }
+    count = len(next(iter((states or columns).values())))
+    for name, part in states.items():
         if part.shape != (expected := (count, mapping.state[name].size)):
             reference = mapping.state[name].column
             raise BadInput(f"state {name!r} has column {reference!r} of shape {part.shape}, expected {expected}")
-    parts = [known.get(name, np.full((count, entry.size), np.nan)) for name, entry in mapping.state.items()]
+    parts = [states.get(name, np.full((count, entry.size), np.nan)) for name, entry in mapping.state.items()]
     return np.concatenate(parts, axis=1) * mapping.factors
 
 
@@ -353,16 +355,16 @@ def _task(
     units = [component.unit for component in mapping.components]
     spans = np.ptp(np.nan_to_num(states), axis=0)
     large = max((span for span, unit in zip(spans, units, strict=True) if unit == "m"), default=0.0) > LARGE
-    shown = [replace(c, display=("m", 1.0)) if c.unit == "m" and large else c for c in mapping.components]
+    displayed = [replace(c, display=("m", 1.0)) if c.unit == "m" and large else c for c in mapping.components]
     extent = max(span for span, unit in zip(spans[:2], units, strict=False) if unit == units[0]) / 2.0
     task = Task(
         name=mapping.task,
-        components=tuple(shown),
+        components=tuple(displayed),
         observations={name: array.shape[1:] for name, array in sensors.items()},
         modalities={name: (name,) for name in sensors},
         control_size=controls,
         dt=dt,
-        map_components=tuple(component.name for component in shown[:2]),
+        map_components=tuple(component.name for component in displayed[:2]),
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
         periods=periods,

@@ -49,7 +49,7 @@ def open_log(path: Path, timeline: str | None) -> Iterator[RerunLog]:
         batches = [chunk.to_record_batch() for chunk in reader.stream(store=store)]
         for batch in batches:
             batch.validate(full=True)  # offsets outside of a damaged array would be read
-        yield RerunLog.of(batches, timeline)
+        yield RerunLog.from_batches(batches, timeline)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class RerunLog:
         return tuple(sorted(self.parts))
 
     @classmethod
-    def of(cls, batches: Sequence[pa.RecordBatch], timeline: str | None) -> RerunLog:
+    def from_batches(cls, batches: Sequence[pa.RecordBatch], timeline: str | None) -> RerunLog:
         """The components in the chunks of a recording."""
         indices = {f.name: f.type for batch in batches for f in _fields(batch, b"index")}
         own = sorted(indices.keys() - {*AUTOMATIC}, key=lambda name: (pa.types.is_int64(indices[name]), name))

@@ -157,8 +157,8 @@ def _draw_curve(
     if map_ is not None:
         log = map_.log_likelihood[map_.layers.index(layer), 0]
         axes.plot(factor * map_.offsets_x, np.exp(log - log.max()), color=colour(layer, trace.modalities), lw=1.2)
-    known = (*trace.modalities_with_posterior, "fused")
-    for name in known if map_ is None else {layer} & {*known}:
+    layers = (*trace.modalities_with_posterior, "fused")
+    for name in layers if map_ is None else {layer} & {*layers}:
         axes.axvline(positions[name][0], color=colour(name, trace.modalities), lw=0.8, ls="--")
     axes.set(ylim=(0.0, 1.05), yticks=[])
 

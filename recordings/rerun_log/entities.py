@@ -297,10 +297,10 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     weighted = ". It weights its modalities at every step" if trace.weights is not None else ""
     components = ", ".join(component.label for component in task.components)
     main = task.main_error
-    shown = [task.components[i] for i in task.map_indices]
-    extent = " and ".join(f"{c.label} {main.text(2 * task.map_half_width, 0)}" for c in shown[: len(main.indices)])
+    mapped = [task.components[i] for i in task.map_indices]
+    extent = " and ".join(f"{c.label} {main.text(2 * task.map_half_width, 0)}" for c in mapped[: len(main.indices)])
     units = ", ".join(with_unit(c.label, c.shown[0]) for c in task.components)
-    contours_of = " and ".join(c.label for c in shown)
+    contours_of = " and ".join(c.label for c in mapped)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
@@ -319,7 +319,7 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
   {contours_of}. Brighter particles have larger weights. Gray: the end
   effector and its recent path.
 * **Likelihood maps**: likelihood or posterior (see the titles) of states around the true one, relative to the
-  maximum of each map; {shown[0].label} to the right. Extent: {extent}. Squares
+  maximum of each map; {mapped[0].label} to the right. Extent: {extent}. Squares
   frame the true state (large) and the estimate (small).
 * **Plots**: {units}. Thin lines around the fused estimate are the 2 sigma band.
 

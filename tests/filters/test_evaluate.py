@@ -248,7 +248,7 @@ def test_invalid_start_offset(text: str) -> None:
 def test_start_offset_of_another_task() -> None:
     offset = StartOffset.parse("3cm,20deg", DOOR)
     assert str(offset) == "3cm,20deg"
-    assert str(offset.of(find_task("push"))) == "3cm"
+    assert str(offset.for_task(find_task("push"))) == "3cm"
     with pytest.raises(BadInput, match=r"'20deg' is not in a unit of task 'push': cm"):
         StartOffset.parse("3cm,20deg", find_task("push"))
 

@@ -35,12 +35,12 @@ def experiments(
         raise BadInput(f"no steps in phase {phase!r}. Available: {', '.join(tables.phases())}")
     if output is not None:
         write_rows(rows, output)
-    shown = rows.slice(0, top)
+    top_rows = rows.slice(0, top)
     more = f"\n{len(rows) - top} more rows: --top {len(rows)}" if len(rows) > top else ""
-    document = {"rows": shown.to_pylist(), "count": len(rows)}
+    document = {"rows": top_rows.to_pylist(), "count": len(rows)}
     if sql is not None:
-        return console.Result(document, console.arrow("Results", shown) + more, output)
-    text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(DOCUMENTS))
+        return console.Result(document, console.arrow("Results", top_rows) + more, output)
+    text = console.arrow(f"Checkpoints, {phase} steps", top_rows.drop_columns(DOCUMENTS))
     return console.Result(document, text + more + _provenance_note(tables.provenance_keys()), output)
 
 

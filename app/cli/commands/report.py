@@ -67,8 +67,8 @@ def report(
     steps = [parse_event(text, traces) for text in events or ()]
     link, links_note = _permalinks(traces, checkpoint, filter, data, url)
     commands = [trace_command(trace, file.name, filter, data) for file, trace in zip(files, traces, strict=True)]
-    shown = ["--map", quantity] if quantity else []
-    source = [*shown, *(["--filter", filter] if filter else []), *(["--data", str(data)] if data else [])]
+    map_option = ["--map", quantity] if quantity else []
+    source = [*map_option, *(["--filter", filter] if filter else []), *(["--data", str(data)] if data else [])]
     commands.append(report_command([file.name for file in files], events or (), every, title, *source))
     with console.progress("Reporting") as advance:
         content = compose(
