@@ -17,6 +17,10 @@ CELLS_CHUNK = 1 << 14
 """Cells of feature maps convolved at once: enough to use all cores, few enough to stay in the CPU caches, and for the
 allocator to keep their memory: what it returns to the system is mapped page by page at the next layer."""
 
+IMAGES_CHUNK = 32
+"""Least number of images encoded at once. Blocks of more than half as many have the same bits in any batch: products of
+matrices with fewer than 16 rows sum in another order."""
+
 ROW_CHUNK = 1024
 """Particles or map cells evaluated at once, so that their activations stay in the CPU caches."""
 
@@ -165,7 +169,7 @@ class ImageEncoder(nn.Module):
     resolution.
 
     Attributes:
-        chunk: number of images to encode at once.
+        chunk: largest number of images to encode at once.
         table: (images + 1, units) cached features of each training image and, last, of a black one; only while the
             encoder is frozen during training.
         images: image indices (...) to images (..., H, W), standardised; only while the encoder is trained on indices.
@@ -196,7 +200,7 @@ class ImageEncoder(nn.Module):
         # With channels last, convolutions on a CPU take two thirds of the time.
         self.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         cells = -(-shape[0] // stride) * -(-shape[1] // stride)
-        self.chunk = max(1, CELLS_CHUNK // cells)
+        self.chunk = max(IMAGES_CHUNK, CELLS_CHUNK // cells)
         size, self.pooling = {
             "flatten": (8 * cells, nn.Flatten()),
             "spatial-softmax": (16, SpatialSoftmax()),
@@ -247,8 +251,9 @@ class Encoders(nn.Module):
                 assert encoder.table is not None
                 features.append(encoder.table[observed])
             elif isinstance(encoder, ImageEncoder):
-                parts = [encoder(part) for part in observed.flatten(0, 1).split(encoder.chunk)]
-                features.append(torch.cat(parts).unflatten(0, observed.shape[:2]))
+                images = observed.flatten(0, 1)
+                blocks = images.tensor_split(max(1, -(-len(images) // encoder.chunk)))  # of almost equal size
+                features.append(torch.cat([encoder(block) for block in blocks]).unflatten(0, observed.shape[:2]))
             else:
                 features.append(encoder(observed))
         return torch.cat(features, dim=-1)

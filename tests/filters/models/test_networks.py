@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import nn
 
 from beliefscope.filters.models.dynamics import Dynamics
-from beliefscope.filters.models.networks import Residual, Stack
+from beliefscope.filters.models.networks import Encoders, Residual, Stack
 from beliefscope.filters.models.resampling import effective_sample_size, multinomial, resample, soft, systematic
 
 
@@ -123,3 +124,15 @@ def test_stacks_have_equal_outputs_with_and_without_gradients() -> None:
         torch.testing.assert_close(stack(inputs), expected.detach(), rtol=1e-12, atol=1e-12)  # sums in another order
     assert torch.equal(inputs, copy)
     assert expected.shape == (3, 4, 2)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_encoded_images_have_the_same_bits_in_any_batch(stride: int) -> None:
+    """Sweeps encode several episodes at once, traces one."""
+    torch.manual_seed(0)
+    encoder = Encoders({"image": (32, 32)}, 64, stride)
+    images = torch.randn(100, 5, 32, 32)
+    with torch.no_grad():
+        together = encoder({"image": images})
+        for count in (1, 2, 3):  # 100, 200 and 300 images are no multiples of a block
+            assert torch.equal(encoder({"image": images[:, :count]}), together[:, :count])
