@@ -70,7 +70,8 @@ class Stack(nn.Sequential):
     def forward(self, x: Tensor) -> Tensor:
         shape = x.shape[:-1]
         if not torch.is_grad_enabled():
-            return self._without_gradients(x.reshape(-1, x.shape[-1])).view(*shape, -1)
+            x = self._without_gradients(x.reshape(-1, x.shape[-1]))
+            return x.view(*shape, x.shape[-1])
         for layer in self:
             if not isinstance(layer, nn.ReLU):
                 # With more axes, a layer's output is a view: operations in place on it would copy its gradient.

@@ -81,7 +81,7 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path:
         )
         panel.locator(".episodes a").first.click()
         page.until("() => beliefscope.state().tab === 'scene'")
-        shown = {"filter": "haptics-ekf", "faults": "blackout=0.8", "episode": episode["episode"]}
-        assert page.state.items() >= {**shown, "step": episode["worst_step"]}.items()
+        selection = {"filter": "haptics-ekf", "faults": "blackout=0.8", "episode": episode["episode"]}
+        assert page.state.items() >= {**selection, "step": episode["worst_step"]}.items()
     finally:
         shutil.rmtree(folder)

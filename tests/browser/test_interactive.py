@@ -30,11 +30,11 @@ def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
     page.goto(f"{address}#step=42")
     assert page.text_content("#place") == "step 42 of 99, 4.20 s"
     assert page.locator("#maps canvas").count() == 3
-    shown = "() => document.querySelector('#maps canvas').toDataURL()"
-    first = page.evaluate(shown)
+    image = "() => document.querySelector('#maps canvas').toDataURL()"
+    first = page.evaluate(image)
     page.keyboard.press("ArrowRight")
     assert page.evaluate("() => location.hash") == "#step=43"
-    assert page.evaluate(shown) != first
+    assert page.evaluate(image) != first
     page.keyboard.press("End")
     assert page.text_content("#place").startswith("step 99 of 99")
     page.locator("#moments a").first.click()

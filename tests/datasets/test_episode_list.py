@@ -29,8 +29,8 @@ class ManyEpisodes(Dataset):
 
 
 def indices(query: str, first: int = 0, limit: int = LISTED) -> tuple[int, list[int]]:
-    count, found = find(ManyEpisodes(), query, first, limit)
-    return count, [episode["index"] for episode in found]
+    count, episodes = find(ManyEpisodes(), query, first, limit)
+    return count, [episode["index"] for episode in episodes]
 
 
 def test_every_episode_is_found_by_its_index_and_comes_first() -> None:

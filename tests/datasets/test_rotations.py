@@ -137,5 +137,5 @@ def test_a_recorded_attitude_filter_is_consistent(tmp_path: Path) -> None:
     assert max(np.degrees(measures.main_error(trace)[10:, -1]).max() for trace in traces) < 6.0
     low, high = consistency(traces).entry("fused").interval
     assert low < 1.0 < high
-    shown = traces[0].task.near(traces[0].estimate_mean, traces[0].episode.states)
-    assert np.allclose(shown - traces[0].episode.states, measures.errors(traces[0])[:, -1], atol=1e-5)
+    estimates = traces[0].task.near(traces[0].estimate_mean, traces[0].episode.states)
+    assert np.allclose(estimates - traces[0].episode.states, measures.errors(traces[0])[:, -1], atol=1e-5)

@@ -83,12 +83,12 @@ def test_metrics_do_not_depend_on_the_number_of_processes(monkeypatch: pytest.Mo
         episodes = [shortened(dataset[i], 36 if i == 0 else 40) for i in range(4)]
     filter_ = load_checkpoint(shipped("push", "crossmodal-pf")).filter
     shares: list[float] = []
-    one, two = (
+    serial, parallel = (
         evaluate(filter_, episodes, particles=20, baselines=True, modalities=True, workers=n, progress=shares.append)
         for n in (1, 2)
     )
-    assert one.to_dict() == two.to_dict()
-    np.testing.assert_array_equal(one.squares, two.squares)
+    assert serial.to_dict() == parallel.to_dict()
+    np.testing.assert_array_equal(serial.squares, parallel.squares)
     end = shares.index(1.0)
     assert shares[: end + 1] == sorted(shares[: end + 1]), "progress of one process"
     assert sorted(shares[-3:]) == shares[-3:]

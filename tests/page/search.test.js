@@ -13,24 +13,24 @@ const TITLES = [
   'image frozen Faults',
 ];
 /** @param {string} query */
-const found = (query) => search(query, TITLES, (title) => title);
+const searchTitles = (query) => search(query, TITLES, (title) => title);
 
 test('an empty query matches all in their order', () => {
-  assert.deepEqual(found(''), TITLES);
-  assert.deepEqual(found('  '), TITLES);
+  assert.deepEqual(searchTitles(''), TITLES);
+  assert.deepEqual(searchTitles('  '), TITLES);
 });
 
 test('the order of words and their case do not matter, and more words never match more', () => {
-  assert.deepEqual(found('FILTER ekf'), found('ekf filter'));
+  assert.deepEqual(searchTitles('FILTER ekf'), searchTitles('ekf filter'));
   for (const query of ['ekf', 'image', 'diag', 'fault'])
     for (const more of ['filter', 'fro', 'x']) {
-      const narrower = found(`${query} ${more}`);
-      assert.ok(narrower.every((title) => found(query).includes(title)));
+      const narrower = searchTitles(`${query} ${more}`);
+      assert.ok(narrower.every((title) => searchTitles(query).includes(title)));
     }
 });
 
 test('starts of the text come before starts of words, and those before other places', () => {
-  assert.deepEqual(found('image'), ['image frozen Faults', '40 % image blackout Faults']);
+  assert.deepEqual(searchTitles('image'), ['image frozen Faults', '40 % image blackout Faults']);
   assert.ok((rating('modal', 'modal x') ?? 0) > (rating('modal', 'x modal') ?? 0));
   assert.ok((rating('modal', 'x modal') ?? 0) > (rating('modal', 'unimodal') ?? 0));
   assert.equal(rating('modal pf', 'unimodal-ekf'), null);

@@ -94,12 +94,12 @@ def test_audits_use_the_groups(tmp_path: Path) -> None:
 
 
 def test_slices_are_searched_over_the_covariates(run: Trace) -> None:
-    found = {covariate.name: covariate for covariate in covariates_of([run])}
-    assert found["stage"].categories == ("lift", "slide")
-    assert found["fix"].categories == ("fix", "no fix")
-    assert int(np.isnan(found["fix"].values).sum()) == 20
-    assert (found["speed"].unit, found["speed"].values.max()) == ("m/s", pytest.approx(0.95))
-    assert "contact" not in found
+    covariates = {covariate.name: covariate for covariate in covariates_of([run])}
+    assert covariates["stage"].categories == ("lift", "slide")
+    assert covariates["fix"].categories == ("fix", "no fix")
+    assert int(np.isnan(covariates["fix"].values).sum()) == 20
+    assert (covariates["speed"].unit, covariates["speed"].values.max()) == ("m/s", pytest.approx(0.95))
+    assert "contact" not in covariates
 
 
 def by_trace(run: Trace, folder: Path) -> Trace:

@@ -83,8 +83,8 @@ export async function episodeCommands(catalog, store, query) {
     .find(({ name }) => name === task)
     ?.data.find(({ name }) => name === data);
   if (!set || isComplete(set) || !query.trim()) return [];
-  const found = await episodes(task, data, { query, limit: MAX_EPISODES });
-  return found.episodes.map((entry) => ({
+  const matches = await episodes(task, data, { query, limit: MAX_EPISODES });
+  return matches.episodes.map((entry) => ({
     group: 'Episode',
     title: episodeLabel(entry),
     run: () => store.set({ episode: entry.index, step: 0, playing: false }),

@@ -27,9 +27,11 @@ export function bindMaximise() {
 
 /** Toggles the panel below the pointer, the one with the focus, or the first one. */
 export function toggleMaximised() {
-  const shown = document.querySelector('.panel.maximised');
+  const maximised = document.querySelector('.panel.maximised');
   const chosen =
-    shown ?? document.querySelector('.panel:hover') ?? document.activeElement?.closest('.panel');
+    maximised ??
+    document.querySelector('.panel:hover') ??
+    document.activeElement?.closest('.panel');
   toggle(chosen instanceof HTMLElement ? chosen : panels()[0]);
 }
 

@@ -40,10 +40,10 @@ export function search(query, items, textOf) {
  */
 function positions(word, text) {
   /** @type {number[]} */
-  const found = [];
+  const places = [];
   for (let place = text.indexOf(word); place >= 0; place = text.indexOf(word, place + 1))
-    found.push(place);
-  return found;
+    places.push(place);
+  return places;
 }
 
 /**

@@ -253,8 +253,8 @@ function drawSteps(context, sheets) {
       if (!column) context.fillText(layer.name, 0, y + 12);
       context.save();
       context.translate(x, y);
-      const shown = { ...options, textColour: INK, withY: !column, named: false, hover: null };
-      drawMap(context, layer, side, shown);
+      const style = { ...options, textColour: INK, withY: !column, named: false, hover: null };
+      drawMap(context, layer, side, style);
       context.restore();
     });
   });

@@ -13,10 +13,10 @@
  */
 export function mapPlane({ plane }, trace) {
   const names = plane.split(',');
-  const known = names.every((name) =>
+  const isAvailable = names.every((name) =>
     trace.components.some((component) => component.name === name),
   );
-  return known && new Set(names).size === 2 ? names : trace.task.map.components;
+  return isAvailable && new Set(names).size === 2 ? names : trace.task.map.components;
 }
 
 /**

@@ -130,11 +130,11 @@ export class MapPanel {
     if (!this.#maps || !this.#trace) return;
     const missing = this.#trace.header.missing_quantities;
     const host = html('#maps-map', this.#panel);
-    const shown = missing[this.#store.state.map] ? this.#maps.quantity : this.#store.state.map;
+    const selected = missing[this.#store.state.map] ? this.#maps.quantity : this.#store.state.map;
     choice(
       host,
       MAP_QUANTITIES.map((quantity) => [quantity, QUANTITY_NAMES[quantity]]),
-      shown,
+      selected,
       (map) => this.#store.set({ map: /** @type {Maps['quantity']} */ (map) }),
     );
     host.querySelectorAll('input').forEach((input, i) => {
@@ -266,8 +266,8 @@ export class MapPanel {
   #showTitle(reference) {
     const log = this.#store.state.scale === 'log';
     const kind = html('#maps-kind', this.#panel);
-    const shown = this.#maps?.quantity ?? 'likelihood';
-    kind.textContent = log ? `Log ${shown}` : QUANTITY_NAMES[shown];
+    const quantity = this.#maps?.quantity ?? 'likelihood';
+    kind.textContent = log ? `Log ${quantity}` : QUANTITY_NAMES[quantity];
     if (reference) kind.textContent = `Gain over ${reference.name}`;
     html('h2', this.#panel).title = this.#title();
     const title = this.#maps ? mapTitle(this.#maps) : '';

@@ -143,8 +143,8 @@ export function colourScale(quantity, scale, range, layers, reference) {
     return { low: '0', high: '1', label: `of ${peak}` };
   }
   const ends = layers.map(({ shade, peak }) => {
-    const shown = log && own ? { ...shade, low: shade.low - peak, high: 0 } : shade;
-    const [low, high] = rangeLabels(shown, rangeDigits(shade));
+    const limits = log && own ? { ...shade, low: shade.low - peak, high: 0 } : shade;
+    const [low, high] = rangeLabels(limits, rangeDigits(shade));
     return { low, high };
   });
   const common = ends.every(({ low, high }) => low === ends[0].low && high === ends[0].high);

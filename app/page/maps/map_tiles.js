@@ -37,7 +37,7 @@ export class MapTiles {
   #kept = new Map();
   #key = '';
   /** @type {Shown | null} */
-  #shown = null;
+  #displayed = null;
   #loading = false;
   #cells = create('canvas');
   /** Content of each tile. @type {WeakMap<HTMLElement, {maps: Maps | null, style: string}>} */
@@ -63,14 +63,14 @@ export class MapTiles {
     host.addEventListener('pointerleave', () => readout.hide());
   }
 
-  /** @param {Shown} shown maps at the cursor and how they are displayed */
-  draw(shown) {
-    const { maps, trace } = shown;
+  /** @param {Shown} displayed maps at the cursor and how they are displayed */
+  draw(displayed) {
+    const { maps, trace } = displayed;
     const { angle, follow } = this.#store.state;
     const key = JSON.stringify([trace.selection, content(maps), angle]);
     if (key !== this.#key) this.#kept.clear();
     this.#key = key;
-    this.#shown = shown;
+    this.#displayed = displayed;
     if (this.#kept.size > MAX_KEPT) this.#kept.clear();
     if (this.#kept.get(maps.step)?.size !== MAP_SIZE.fine) this.#kept.set(maps.step, maps);
     this.redraw();
@@ -80,9 +80,9 @@ export class MapTiles {
 
   /** Requests the missing maps, one after the other, until the cursor moves. */
   async #load() {
-    if (this.#loading || !this.#shown) return;
+    if (this.#loading || !this.#displayed) return;
     this.#loading = true;
-    const [key, { trace, maps }] = [this.#key, this.#shown];
+    const [key, { trace, maps }] = [this.#key, this.#displayed];
     const { state } = this.#store;
     // The nearest step comes last, because the server then computes maps around it ahead of the cursor.
     const steps = tileSteps(trace.contact, maps.step).map(({ step }) => step);
@@ -96,14 +96,14 @@ export class MapTiles {
       this.redraw();
     }
     this.#loading = false;
-    const moved = this.#shown.maps;
+    const moved = this.#displayed.maps;
     if (moved !== maps && moved.size === MAP_SIZE.fine) this.#load();
   }
 
   redraw() {
-    const shown = this.#shown;
-    if (!shown || this.#host.hidden) return;
-    const { trace, maps, layers } = shown;
+    const displayed = this.#displayed;
+    if (!displayed || this.#host.hidden) return;
+    const { trace, maps, layers } = displayed;
     const steps = tileSteps(trace.contact, maps.step);
     const { clientWidth, clientHeight } = this.#host;
     const side = Math.max(
@@ -171,16 +171,16 @@ export class MapTiles {
     const canvas = /** @type {HTMLCanvasElement} */ (html('canvas', tile));
     const pixels = Math.round(side * devicePixelRatio);
     const { scale, range, colours, regions } = this.#store.state;
-    const style = [pixels, scale, range, colours, regions, this.#shown?.zoom].join();
+    const style = [pixels, scale, range, colours, regions, this.#displayed?.zoom].join();
     const painted = this.#painted.get(tile);
     if (painted?.maps === maps && painted.style === style) return;
     this.#painted.set(tile, { maps, style });
     if (canvas.width !== pixels) [canvas.width, canvas.height] = [pixels, pixels];
     const context = context2d(canvas);
     context.clearRect(0, 0, pixels, pixels);
-    if (!maps || !this.#shown) return;
-    const layer = maps.layers.indexOf(this.#shown.layers[row]);
-    const { zoom } = this.#shown;
+    if (!maps || !this.#displayed) return;
+    const layer = maps.layers.indexOf(this.#displayed.layers[row]);
+    const { zoom } = this.#displayed;
     paintCells(
       this.#cells,
       this.#shade(maps, layer),
@@ -225,10 +225,10 @@ export class MapTiles {
 
   /** @param {HTMLElement} host shows the colour bar of all tiles */
   showColours(host) {
-    if (!this.#shown) return;
+    if (!this.#displayed) return;
     host.hidden = false;
     const { colours } = this.#store.state;
-    showColourBar(host, /** @type {ColourMap} */ (colours), this.#scale(this.#shown.maps));
+    showColourBar(host, /** @type {ColourMap} */ (colours), this.#scale(this.#displayed.maps));
   }
 
   /** @param {Maps} maps of any step */
@@ -245,11 +245,11 @@ export class MapTiles {
     const canvas = target instanceof HTMLCanvasElement ? target : null;
     const tile = canvas?.closest('button');
     const maps = this.#kept.get(Number(tile?.dataset.step));
-    if (!canvas || !tile || !maps || !this.#shown) return this.#readout.hide();
+    if (!canvas || !tile || !maps || !this.#displayed) return this.#readout.hide();
     const { left, top, width, height } = canvas.getBoundingClientRect();
-    const offset = offsetAt(maps, this.#shown.zoom, (x - left) / width, (y - top) / height);
+    const offset = offsetAt(maps, this.#displayed.zoom, (x - left) / width, (y - top) / height);
     if (!offset) return this.#readout.hide();
-    const name = this.#shown.layers[Number(tile.dataset.row)];
+    const name = this.#displayed.layers[Number(tile.dataset.row)];
     const position = positionText(maps, offset, this.#store.state.axes === 'world');
     const values = valuesAt(maps, maps.layers.indexOf(name), offset, null);
     const title = `${displayName(name)}, step ${maps.step}, ${tile.dataset.phase}`;
@@ -262,9 +262,9 @@ export class MapTiles {
    * @returns {DisplayedMaps[]}
    */
   sheets(options) {
-    if (!this.#shown) return [];
-    const title = this.#scale(this.#shown.maps).label;
-    const { trace, layers, maps: current } = this.#shown;
+    if (!this.#displayed) return [];
+    const title = this.#scale(this.#displayed.maps).label;
+    const { trace, layers, maps: current } = this.#displayed;
     const colourMap = /** @type {ColourMap} */ (this.#store.state.colours);
     return tileSteps(trace.contact, current.step).flatMap(({ step, phase }) => {
       const maps = this.#kept.get(step);

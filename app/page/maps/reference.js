@@ -22,7 +22,7 @@ export class References {
   #changed;
   #requested = '';
   /** @type {{maps: Maps, trace: Trace, comparisonName: string} | null} */
-  #shown = null;
+  #displayed = null;
 
   /**
    * @param {Store} store
@@ -38,9 +38,9 @@ export class References {
   /** The reference of the displayed maps. @returns {Reference | null} */
   get current() {
     if (this.pinned) return { ...this.pinned, name: `step ${this.pinned.maps.step}` };
-    const maps = this.#shown?.maps;
+    const maps = this.#displayed?.maps;
     if (!maps?.beside || !comparable(maps.beside, maps)) return null;
-    return { maps: maps.beside, name: this.#shown?.comparisonName ?? '', selection: null };
+    return { maps: maps.beside, name: this.#displayed?.comparisonName ?? '', selection: null };
   }
 
   /**
@@ -51,7 +51,7 @@ export class References {
    * @param {string} comparisonName label of the comparison run
    */
   follow(maps, trace, comparisonName) {
-    this.#shown = { maps, trace, comparisonName };
+    this.#displayed = { maps, trace, comparisonName };
     const pinned = this.pinned;
     if (pinned && content(pinned.maps) !== content(maps))
       [this.pinned, this.#requested] = [null, ''];
@@ -65,8 +65,8 @@ export class References {
 
   /** Pins the displayed maps, or releases the pinned ones. */
   toggle() {
-    if (!this.#shown) return;
-    const { maps, trace } = this.#shown;
+    if (!this.#displayed) return;
+    const { maps, trace } = this.#displayed;
     const { selection } = trace;
     this.#set(this.pinned ? null : { maps, selection });
     const pin = this.pinned ? formatPin(selection, maps.step, this.#store.state.angle) : '';
@@ -77,14 +77,14 @@ export class References {
   async restore() {
     const { pin, task } = this.#store.state;
     if (!pin && this.pinned) this.#set(null);
-    if (!pin || !this.#shown || this.pinned || this.#requested === pin) return;
+    if (!pin || !this.#displayed || this.pinned || this.#requested === pin) return;
     this.#requested = pin;
     const { selection, step, angle } = parsePin(pin, task);
-    const shown = content(this.#shown.maps);
-    const choices = mapChoices(this.#store.state, this.#shown.trace);
+    const contentKey = content(this.#displayed.maps);
+    const choices = mapChoices(this.#store.state, this.#displayed.trace);
     const maps = await this.#requestMaps({ ...selection, step, angle, ...choices });
-    const displayed = this.#shown.maps;
-    if (!maps || this.#store.state.pin !== pin || this.pinned || shown !== content(displayed))
+    const displayed = this.#displayed.maps;
+    if (!maps || this.#store.state.pin !== pin || this.pinned || contentKey !== content(displayed))
       return;
     if (comparable(maps, displayed)) this.#set({ maps, selection });
     else this.#store.set({ pin: '' });

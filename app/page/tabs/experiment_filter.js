@@ -150,8 +150,8 @@ const texts = new WeakMap();
  * @param {ExperimentRow} row
  */
 function searched(row) {
-  const known = texts.get(row);
-  if (known !== undefined) return known;
+  const cached = texts.get(row);
+  if (cached !== undefined) return cached;
   const entries = Object.entries(provenanceOf(row)).map(([name, value]) => `${name} ${value}`);
   const text = normal([...TEXT_KEYS.map((key) => row[key]), ...entries].join('\n'));
   texts.set(row, text);

@@ -61,12 +61,13 @@ export const differingEntries = (rows) =>
 export function settingEntries(rows) {
   return [...entryValues(rows)]
     .filter(([name, values]) => {
-      const known = values.filter((value) => value !== null);
+      const entries = values.filter((value) => value !== null);
       if (new Set(values).size < 2 || hasWord(name, 'seed')) return false;
-      if (known.every(isAddress) || known.every((value) => DATE.test(String(value)))) return false;
+      if (entries.every(isAddress) || entries.every((value) => DATE.test(String(value))))
+        return false;
       // A number that always differs can be a setting that was drawn at random, such as a learning rate.
-      const isRun = hasWord(name, 'id') || known.some((value) => numberIn(value) === null);
-      return !isRun || new Set(known).size < known.length || known.length < 2;
+      const isRun = hasWord(name, 'id') || entries.some((value) => numberIn(value) === null);
+      return !isRun || new Set(entries).size < entries.length || entries.length < 2;
     })
     .map(([name]) => name);
 }
@@ -89,8 +90,8 @@ const hasWord = (name, word) =>
  * @param {string} name
  */
 export function isNumeric(rows, name) {
-  const known = rows.map((row) => provenanceOf(row)[name] ?? null).filter((v) => v !== null);
-  return known.length > 0 && known.every((value) => numberIn(value) !== null);
+  const values = rows.map((row) => provenanceOf(row)[name] ?? null).filter((v) => v !== null);
+  return values.length > 0 && values.every((value) => numberIn(value) !== null);
 }
 
 /**

@@ -90,9 +90,9 @@ export class Finetune {
         setPanelState(this.#host, 'loading', 'Loading the modules of the filter …');
         const offer = await api.finetuneOptions(this.#store.state, signal);
         const { state } = this.#store;
-        const found = offer.why_not || run ? [] : await api.weaknesses(state, signal);
+        const weaknesses = offer.why_not || run ? [] : await api.weaknesses(state, signal);
         [this.#offer, this.#offerKey] = [offer, key];
-        this.#form.show(offer, found);
+        this.#form.show(offer, weaknesses);
         await this.#lineage.load(signal);
       }
       this.#run = run ? await api.finetuneRun(run, signal) : null;

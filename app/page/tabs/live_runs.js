@@ -35,10 +35,10 @@ export function addLiveRuns(catalog, { runs, tasks }) {
     task.filters = task.filters.filter(({ live }) => !live);
   }
   for (const run of runs.filter(isReadable)) {
-    const known = catalog.tasks.find(({ name }) => name === run.task);
-    const task = known ?? tasks.find(({ name }) => name === run.task);
+    const entry = catalog.tasks.find(({ name }) => name === run.task);
+    const task = entry ?? tasks.find(({ name }) => name === run.task);
     if (!task) continue;
-    if (!known) catalog.tasks.push(task);
+    if (!entry) catalog.tasks.push(task);
     const label = `${run.episode} · ${run.state === 'running' ? 'live' : 'live, ended'}`;
     task.data.push({
       name: run.data,

@@ -16,8 +16,8 @@ export const DEFAULT_CHARTS = Object.keys(FIXED_CHARTS);
  * @param {readonly string[]} available keys beside the fixed ones
  */
 export function chartKeys({ charts, track }, available) {
-  const known = new Set([...DEFAULT_CHARTS, ...available]);
-  const keys = [...new Set(charts.split(','))].filter((key) => known.has(key) && key !== track);
+  const choices = new Set([...DEFAULT_CHARTS, ...available]);
+  const keys = [...new Set(charts.split(','))].filter((key) => choices.has(key) && key !== track);
   return keys.length ? keys : DEFAULT_CHARTS;
 }
 

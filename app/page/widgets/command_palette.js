@@ -21,7 +21,7 @@ export class CommandPalette {
   /** @type {Command[]} */
   #all = [];
   /** @type {Command[]} */
-  #shown = [];
+  #displayed = [];
   #active = 0;
 
   /**
@@ -61,8 +61,8 @@ export class CommandPalette {
 
   #draw() {
     const query = this.#input.value;
-    const found = search(query, this.#all, ({ group, title }) => `${title} ${group}`);
-    this.#show([...this.#byQuery(query), ...found]);
+    const matches = search(query, this.#all, ({ group, title }) => `${title} ${group}`);
+    this.#show([...this.#byQuery(query), ...matches]);
     this.#activate(0);
     clearTimeout(this.#timer);
     this.#timer = setTimeout(() => this.#request(query), PAUSE);
@@ -73,24 +73,24 @@ export class CommandPalette {
    * @param {string} query
    */
   async #request(query) {
-    const found = await this.#remote(query).catch(() => []);
-    if (!found.length || query !== this.#input.value || !this.#dialog.open) return;
-    this.#show([...this.#shown, ...found]);
+    const matches = await this.#remote(query).catch(() => []);
+    if (!matches.length || query !== this.#input.value || !this.#dialog.open) return;
+    this.#show([...this.#displayed, ...matches]);
     this.#activate(this.#active);
   }
 
   /** @param {Command[]} commands */
   #show(commands) {
-    this.#shown = commands.slice(0, MAX_OPTIONS);
-    this.#list.replaceChildren(...this.#shown.map(option));
-    this.#list.hidden = !this.#shown.length;
-    this.#none.textContent = this.#shown.length ? '' : 'No command has these words.';
-    this.#input.ariaExpanded = String(this.#shown.length > 0);
+    this.#displayed = commands.slice(0, MAX_OPTIONS);
+    this.#list.replaceChildren(...this.#displayed.map(option));
+    this.#list.hidden = !this.#displayed.length;
+    this.#none.textContent = this.#displayed.length ? '' : 'No command has these words.';
+    this.#input.ariaExpanded = String(this.#displayed.length > 0);
   }
 
   /** @param {KeyboardEvent} event */
   #press(event) {
-    const last = this.#shown.length - 1;
+    const last = this.#displayed.length - 1;
     /** @type {Record<string, number>} */
     const targets = {
       ArrowDown: this.#active === last ? 0 : this.#active + 1,
@@ -118,7 +118,7 @@ export class CommandPalette {
 
   /** @param {number} index */
   #run(index) {
-    const command = this.#shown[index];
+    const command = this.#displayed[index];
     if (!command) return;
     this.#close();
     command.run();

@@ -31,8 +31,8 @@ export const estimatorOf = (filter, kinds) =>
  * @param {string[]} [filters] all displayed filters: those of other names have different colours
  */
 export function colourOf(filter, filters = [filter]) {
-  const known = COLOURS[fusionRule(filter)];
-  if (known) return known;
+  const colour = COLOURS[fusionRule(filter)];
+  if (colour) return colour;
   const others = [...new Set(filters.map(fusionRule))].filter((name) => !(name in COLOURS));
   return OTHERS[Math.max(0, others.indexOf(fusionRule(filter))) % OTHERS.length];
 }

@@ -130,12 +130,12 @@ def test_edited_file_has_a_new_address(tmp_path: Path) -> None:
 
 def test_unknown_address_is_a_page_for_browsers_and_json_for_programs(shared_client: TestClient) -> None:
     path = "/door/<script>"
-    shown = shared_client.get(path, headers={"Accept": "text/html,*/*;q=0.8"})
-    assert shown.status_code == 404
-    assert 'href="/"' in shown.text
-    assert "/door/&lt;script&gt;" in shown.text
-    assert "<script" not in shown.text
-    assert "style-src 'unsafe-inline'" in shown.headers["content-security-policy"]
+    page = shared_client.get(path, headers={"Accept": "text/html,*/*;q=0.8"})
+    assert page.status_code == 404
+    assert 'href="/"' in page.text
+    assert "/door/&lt;script&gt;" in page.text
+    assert "<script" not in page.text
+    assert "style-src 'unsafe-inline'" in page.headers["content-security-policy"]
     program = shared_client.get(path)
     assert program.status_code == 404
     assert set(program.json()) == {"error"}

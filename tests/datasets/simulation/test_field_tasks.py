@@ -32,9 +32,9 @@ SENSORS = {"camera-pose", "sleeve", "image-quality", "outages", "wrist", "hand-p
 
 @pytest.fixture(scope="module", params=FIELD_TASKS, ids=lambda task: task.name)
 def task(request: pytest.FixtureRequest) -> Task:
-    found = request.param
-    assert isinstance(found, Task)
-    return found
+    definition = request.param
+    assert isinstance(definition, Task)
+    return definition
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +100,9 @@ def test_ingredients_of_the_physics_change_the_motion(task: Task) -> None:
 
 def test_hidden_frame_is_invisible_to_the_camera_only() -> None:
     off = [name for name in DOOR_FIELD.ingredients if name != "hidden-frame"]
-    hidden, shown = simulate_door_field(1, 0, 5, off), simulate_door_field(1, 0, 5, [*off, "hidden-frame"])
-    assert (hidden.observations["image"] != shown.observations["image"]).any()
-    np.testing.assert_array_equal(hidden.qpos, shown.qpos)
+    hidden, visible = simulate_door_field(1, 0, 5, off), simulate_door_field(1, 0, 5, [*off, "hidden-frame"])
+    assert (hidden.observations["image"] != visible.observations["image"]).any()
+    np.testing.assert_array_equal(hidden.qpos, visible.qpos)
 
 
 def test_without_ingredients_only_the_control_loop_differs_from_the_paper_task() -> None:

@@ -36,9 +36,9 @@ def external(filter_: Any, **adapter: Any) -> ExternalFilter:
 def test_numpy_filter_of_one_trajectory_equals_the_batched_torch_filter() -> None:
     episodes = [vehicle.drive(seed) for seed in (1, 2)]
     single, batched = external(vehicle.NumpyKalman(), batched=False), external(vehicle.TorchKalman(), std=STD)
-    one, other = trace(single, episodes[1]), trace(batched, episodes[1])
-    np.testing.assert_allclose(one.estimate_mean, other.estimate_mean, atol=1e-4)
-    np.testing.assert_allclose(one.estimate_covariance, other.estimate_covariance, atol=1e-6)
+    single_trace, batched_trace = trace(single, episodes[1]), trace(batched, episodes[1])
+    np.testing.assert_allclose(single_trace.estimate_mean, batched_trace.estimate_mean, atol=1e-4)
+    np.testing.assert_allclose(single_trace.estimate_covariance, batched_trace.estimate_covariance, atol=1e-6)
     assert evaluate(single, episodes).nees == pytest.approx(evaluate(batched, episodes).nees, rel=1e-4)
 
 

@@ -61,11 +61,11 @@ def evidence(weights: tuple[float, float] = (0.5, 0.5)) -> Evidence:
     )
 
 
-def estimate(filter_: InformationFilter, of: Evidence, particles: int) -> Gaussian:
+def estimate(filter_: InformationFilter, sequence: Evidence, particles: int) -> Gaussian:
     default = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
-        return rollout(filter_, of, START, torch.Generator().manual_seed(0), particles).estimate
+        return rollout(filter_, sequence, START, torch.Generator().manual_seed(0), particles).estimate
     finally:
         torch.set_default_dtype(default)
 

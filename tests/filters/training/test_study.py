@@ -151,12 +151,12 @@ def test_tables_contain_the_results_of_the_cells(finished: Path) -> None:
         cells = [document(finished, f"door/{row['filter']}/seed{seed}") for seed in range(2)]
         start = OFFSET if row["start_offset"] else TRUTH
         fused = [cell[start][f"{float(row['blackout']):g}"]["fused"] for cell in cells]
-        for part, of in {
+        for part, selector in {
             "from_step_0": lambda metrics: metrics["rmse_from_step_0"],
             "stay": lambda metrics: metrics["baselines"]["stay"]["rmse"],
             "dynamics": lambda metrics: (metrics["baselines"]["dynamics"] or {}).get("rmse"),
         }.items():
-            values = [of(metrics) for metrics in fused]
+            values = [selector(metrics) for metrics in fused]
             expected = "" if values[0] is None else statistics.fmean(value["angle_deg"] for value in values)
             written = row[f"angle_deg_{part}"]
             assert written == expected or float(written) == pytest.approx(expected, rel=1e-12), part
