@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -31,12 +32,13 @@ def test_collect_compares_statistics_with_the_paper(run: Run, folder: Path, task
     code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
     assert code == 0
     head, _, _, title, *rows = out.splitlines()
-    assert title.split() == ["this", "dataset", "paper", "ratio"]
+    assert re.split("  +", title.strip()) == ["quantity", "measure", "unit", "this dataset", "paper", "this / paper"]
     assert head.startswith("one.h5")
-    row = next(row for row in rows if row.startswith("  contact fraction"))
-    assert row.split()[3] == str(PAPER_DATA[task].statistics["contact_fraction"])
-    force = next(row for row in rows if row.startswith("  force std, N"))
-    assert len(force.split()) == 3 + 3 * 3, "three axes each"
+    row = next(row for row in rows if row.startswith("  steps in contact"))
+    assert float(row.split()[-2]) == PAPER_DATA[task].statistics["contact_fraction"]
+    forces = [re.split("  +", row.strip()) for row in rows if row.startswith("  force ")]
+    assert [force[:3] for force in forces] == [[f"force {axis}", "standard deviation", "N"] for axis in "xyz"]
+    assert all(float(ratio) == pytest.approx(float(own) / float(paper), rel=0.01) for *_, own, paper, ratio in forces)
 
 
 def test_from_collect_to_record(run: Run, folder: Path) -> None:
