@@ -84,29 +84,27 @@ class Stack(nn.Sequential):
 
         Their hooks are therefore called with gradients enabled only.
         """
-        for layer in self:
-            if isinstance(layer, nn.ReLU):
-                x = x.relu_()
-            elif isinstance(layer, nn.Linear):
-                x = linear(layer, x)
-            else:
-                assert isinstance(layer, Residual)
-                x = layer.in_place(x)
-        return x
+        return self._through(x, Tensor.relu_, Residual.in_place)
 
     def with_tangents(self, x: Tensor) -> Tensor:
         """``x + dx_i`` and, in the last row, x to ``f(x) + f'(x) dx_i`` and f(x): (n + 1, ..., d).
 
         All rows pass through the linear piece of the network that contains x, so dx need not be small.
         """
+        return self._through(x, relu_with_tangents, Residual.with_tangents)
+
+    def _through(
+        self, x: Tensor, relu: Callable[[Tensor], Tensor], residual: Callable[[Residual, Tensor], Tensor]
+    ) -> Tensor:
+        """The layers with other functions for ReLU and residual layers, which are not called as modules."""
         for layer in self:
             if isinstance(layer, nn.ReLU):
-                x = relu_with_tangents(x)
+                x = relu(x)
             elif isinstance(layer, nn.Linear):
                 x = linear(layer, x)
             else:
                 assert isinstance(layer, Residual)
-                x = layer.with_tangents(x)
+                x = residual(layer, x)
         return x
 
 
