@@ -23,11 +23,22 @@ export function provenanceOf(displayed) {
   return entries;
 }
 
+/** Of each sweep: every key that is pressed needs them. @type {WeakMap<ExperimentRow[], Map<string, Entry[]>>} */
+const valuesOfRows = new WeakMap();
+
 /**
- * Values of each entry by checkpoint, in the order of the rows. Checkpoints without provenance are left out.
+ * Values of each entry by checkpoint, in the order of the rows, which must not change. Checkpoints without provenance
+ * are left out.
  * @param {ExperimentRow[]} rows
  */
 function entryValues(rows) {
+  const values = valuesOfRows.get(rows) ?? collectValues(rows);
+  valuesOfRows.set(rows, values);
+  return values;
+}
+
+/** @param {ExperimentRow[]} rows */
+function collectValues(rows) {
   const checkpoints = new Map(rows.map((row) => [row.checkpoint, provenanceOf(row)]));
   const all = [...checkpoints.values()].filter((entries) => Object.keys(entries).length);
   return new Map(
