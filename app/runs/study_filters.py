@@ -1,12 +1,13 @@
 """Checkpoints of studies as filters. Their names identify them in any server with the study, also after a restart."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from beliefscope.app.runs.catalog import result_folders
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.sweep_filters import HASH_DIGITS, NAME
+from beliefscope.app.runs.sweep_filters import HASH_DIGITS, NAME, Candidate
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
@@ -33,12 +34,8 @@ def load_study_filter(study: Study, cell: str, hash_: str, settings: Settings) -
     return loaded
 
 
-def find_study_filter(task: str, name: str, settings: Settings) -> Checkpoint | None:
-    """Filter of a name from ``study_filter_name``; None if no study of the server has it.
-
-    Raises BadInput if the file is missing or was changed.
-    """
-    problem: BadInput | None = None
+def study_candidates(task: str, name: str, settings: Settings) -> Iterator[Candidate]:
+    """The checkpoints of the server's studies with a name from ``study_filter_name``."""
     for study in all_studies(settings.studies, settings.workspace) if NAME.fullmatch(name) else ():
         checkpoints: Mapping[str, str] = {}
         if study.has_checkpoints:
@@ -46,10 +43,4 @@ def find_study_filter(task: str, name: str, settings: Settings) -> Checkpoint | 
                 checkpoints = study.read().checkpoints
         for cell, hash_ in checkpoints.items():
             if cell.startswith(f"{task}/") and study_filter_name(cell, hash_) == name:
-                try:
-                    return load_study_filter(study, cell, hash_, settings)
-                except BadInput as error:
-                    problem = problem or BadInput(f"filter {name!r} of study {study.name!r}: {error}")
-    if problem is not None:
-        raise problem
-    return None
+                yield f"study {study.name!r}", partial(load_study_filter, study, cell, hash_, settings)

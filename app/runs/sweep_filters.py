@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +21,9 @@ HASH_DIGITS = 8
 """Digits of the checkpoint's hash at the end of a name."""
 
 NAME = re.compile(rf"(.+)-([0-9a-f]{{{HASH_DIGITS}}})", re.DOTALL)
+
+Candidate = tuple[str, Callable[[], Checkpoint]]
+"""Where a checkpoint is stored, such as ``sweep 'lr'``, and the function that loads it, which may raise BadInput."""
 
 
 def sweep_folders(settings: Settings) -> dict[str, Path]:
@@ -38,27 +43,21 @@ def load_sweep_filter(sweep: Experiments, checkpoint: str, settings: Settings) -
     return f"{path.stem}-{checkpoint[:HASH_DIGITS]}", loaded
 
 
-def find_sweep_filter(task: str, name: str, settings: Settings) -> Checkpoint | None:
-    """Filter of a name from ``load_sweep_filter``; None if no sweep of the server has it.
-
-    Raises BadInput if the file is missing or was changed.
-    """
+def sweep_candidates(task: str, name: str, settings: Settings) -> Iterator[Candidate]:
+    """The checkpoints of the server's sweeps with a name from ``load_sweep_filter``."""
     match = NAME.fullmatch(name)
     folders = sweep_folders(settings) if match else {}
     if match is None or not folders:
-        return None
+        return
     from beliefscope.recordings.sweep_table import Experiments  # pyarrow and DuckDB are slow to import
 
-    problem: BadInput | None = None
     for sweep, folder in folders.items():
         with suppress(BadInput):  # damaged tables; the list of sweeps reports them
             tables = Experiments([folder])
             query = "SELECT checkpoint FROM checkpoints WHERE task = ? AND name = ? AND starts_with(checkpoint, ?)"
             for row in tables.query(query, [task, *match.groups()]).to_pylist():
-                try:
-                    return load_sweep_filter(tables, row["checkpoint"], settings)[1]
-                except BadInput as error:
-                    problem = problem or BadInput(f"filter {name!r} of sweep {sweep!r}: {error}")
-    if problem is not None:
-        raise problem
-    return None
+                yield f"sweep {sweep!r}", partial(_load, tables, row["checkpoint"], settings)
+
+
+def _load(sweep: Experiments, checkpoint: str, settings: Settings) -> Checkpoint:
+    return load_sweep_filter(sweep, checkpoint, settings)[1]

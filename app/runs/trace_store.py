@@ -10,6 +10,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cached_property, lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -22,8 +23,8 @@ from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.study_filters import find_study_filter
-from beliefscope.app.runs.sweep_filters import find_sweep_filter
+from beliefscope.app.runs.study_filters import study_candidates
+from beliefscope.app.runs.sweep_filters import sweep_candidates
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.workspace.json_files import RecordCache, read_record
@@ -274,11 +275,18 @@ class TraceStore:
 
     def _add_stored_filter(self, task: str, name: str) -> None:
         """Add a filter that only a sweep or a study has. Raises BadInput if its file is missing or changed."""
-        if name not in self._catalog(task).filters:
-            settings = self.settings
-            filter_ = find_sweep_filter(task, name, settings) or find_study_filter(task, name, settings)
-            if filter_ is not None:
-                self.add_filter(task, name, filter_, first=False)
+        if name in self._catalog(task).filters:
+            return
+        problems = []
+        in_sweeps, in_studies = (f(task, name, self.settings) for f in (sweep_candidates, study_candidates))
+        for source, load in chain(in_sweeps, in_studies):
+            try:
+                self.add_filter(task, name, load(), first=False)
+                return
+            except BadInput as error:
+                problems.append(f"filter {name!r} of {source}: {error}")
+        if problems:
+            raise BadInput(problems[0])
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
         """The recorded live run, if the selection is exactly that run."""
