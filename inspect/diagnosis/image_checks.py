@@ -11,6 +11,7 @@ from beliefscope.inspect.statistics.reference_images import (
     HAND,
     Gray,
     Reference,
+    gradients,
     median_image,
     normalised,
     object_positions,
@@ -36,44 +37,56 @@ def frozen_images(images: Gray, held: int = 0) -> Mask:
 
 
 def image_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
-    """Statistics of one image sensor; some only with a reference of the same sensor and size.
+    """Statistics of one image sensor in an episode or a window; some only with a reference of the same sensor and size.
 
     Steps without an image do not count.
     """
     images, present = episode.observations[key], episode.present(key)
     if not present.any():
         return {}
-    lost = lost_images(images)
+    lost, frozen = lost_images(images), frozen_images(images, episode.task.held_steps(key))
     usable, dark = present & ~lost, lost[present]
     middle = median_image(images[present])
-    is_comparable = (
-        reference is not None and (reference.key, reference.image.shape) == (key, middle.shape) and usable.any()
-    )
-    brightness = float(brightness_of(middle, reference)) if reference is not None and is_comparable else 1.0
+    comparable = reference if usable.any() and _is_comparable(reference, key, images) else None
+    brightness = 1.0 if comparable is None else float(brightness_of(middle, comparable))
     values = {
         f"black/{key}/all": float(dark.mean()),
         f"losses/{key}/all": float((np.diff(dark, prepend=False) & dark).mean()),
-        f"frozen/{key}/all": float(frozen_images(images, episode.task.held_steps(key))[present].mean()),
+        f"frozen/{key}/all": float(frozen[present].mean()),
         f"noise/{key}/all": _noise(images[usable & ~frozen_images(images)], brightness),
         f"sharpness/{key}/all": _sharpness(middle),
     }
-    if HAND in episode.observations:
-        values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND], present)
-    if reference is None or not is_comparable:
+    if comparable is None:
         return values
     values |= {
         f"brightness/{key}/all": brightness,
-        f"occlusion/{key}/all": float(occluded_pixels(middle, brightness, reference).mean()),
+        f"occlusion/{key}/all": float(occluded_pixels(middle, brightness, comparable).mean()),
     }
-    seen = normalised(images[usable])
-    if reference.has_hand and HAND in episode.observations and (both := usable & episode.present(HAND)).any():
-        hand = episode.observations[HAND].astype(np.float64)[both]
-        shift = registration(reference.images(hand), seen[both[usable]])
+    if comparable.has_hand and HAND in episode.observations and (both := usable & episode.present(HAND)).any():
+        hand, seen = episode.observations[HAND].astype(np.float64)[both], normalised(images[both])
+        shift = registration(comparable, hand, seen)
         values |= {f"shift/{key} {axis}/all": pixels for axis, pixels in zip("xy", shift, strict=True)}
-        values |= _landmark("hand", key, reference.hand, seen[both[usable]], hand)
-    if (positions := object_positions(episode)) is not None:
-        values |= _landmark("object", key, reference.object, seen, positions[usable])
+        values |= _landmark("hand", key, comparable.hand, seen, hand)
     return values
+
+
+def motion_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
+    """Statistics of one image sensor in an episode: its delay behind the hand, and where the object is seen."""
+    images, present = episode.observations[key], episode.present(key)
+    if not present.any():
+        return {}
+    values: dict[str, float] = {}
+    if HAND in episode.observations:
+        values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND], present)
+    usable, positions = present & ~lost_images(images), object_positions(episode)
+    if reference is None or positions is None or not usable.any() or not _is_comparable(reference, key, images):
+        return values
+    return values | _landmark("object", key, reference.object, normalised(images[usable]), positions[usable])
+
+
+def _is_comparable(reference: Reference | None, key: str, images: Gray) -> bool:
+    """Whether the reference is of images of this sensor and size."""
+    return reference is not None and (reference.key, reference.image.shape) == (key, images.shape[1:])
 
 
 def _landmark(
@@ -95,7 +108,7 @@ def is_usable(images: Gray, present: Mask, held: int = 0) -> bool:
 def occluded_share(images: Gray, key: str, reference: Reference | None) -> dict[str, float]:
     """Share of the pixels of a window's median image that are outside of the range of all healthy images."""
     middle = median_image(images)
-    if reference is None or reference.range is None or (reference.key, reference.image.shape) != (key, middle.shape):
+    if reference is None or reference.range is None or not _is_comparable(reference, key, images):
         return {}
     low, high = reference.range.astype(np.float64)
     corrected = middle / max(float(brightness_of(middle, reference)), 1e-3)
@@ -119,19 +132,18 @@ def image_lag(images: Gray, hand: Array, present: Mask) -> float:
     return lag(late[:, None], early[:, None], valid)[0]
 
 
-def registration(reference: Array, images: Array) -> tuple[float, float]:
-    """(x, y) pixels by which images (T, H, W) are shifted to the right and downwards against others (T, H, W).
+def registration(reference: Reference, hand: Array, images: Array) -> tuple[float, float]:
+    """(x, y) pixels by which normalised images (T, H, W) are shifted to the right and downwards.
 
-    Maximum of the cross-correlation of horizontal and vertical gradients, pooled over the images, over all shifts up to
-    a quarter of an image, refined by a parabola.
+    Maximum of the cross-correlation of horizontal and vertical gradients with those expected at hand positions (T, d),
+    pooled over the images, over all shifts up to a quarter of an image, refined by a parabola. The expected images are
+    sums of few images, so those are correlated, each with the sum of the images weighted alike.
     """
     height, width = images.shape[1:]
-    shape, rows, columns = (2 * height, 2 * width), height // 4, width // 4
-    spectrum = np.zeros((shape[0], width + 1), dtype=np.complex128)
-    for axis in (1, 2):
-        a, b = (fft.rfft2(np.gradient(stack, axis=axis), shape) for stack in (images, reference))
-        spectrum += (a * np.conj(b)).sum(0)
-    product = np.roll(fft.irfft2(spectrum, shape), (rows, columns), axis=(0, 1))
+    rows, columns = height // 4, width // 4
+    pooled = np.tensordot(reference.terms(hand), images, axes=(0, 0))
+    spectrum = sum((a * np.conj(b)).sum(0) for a, b in zip(gradients(pooled), reference.gradients, strict=True))
+    product = np.roll(fft.irfft2(spectrum, (2 * height, 2 * width)), (rows, columns), axis=(0, 1))
     power = product[: 2 * rows + 1, : 2 * columns + 1]
     i, j = (int(k) for k in np.unravel_index(int(power.argmax()), power.shape))
     return j - columns + _vertex(power[i], j), i - rows + _vertex(power[:, j], i)

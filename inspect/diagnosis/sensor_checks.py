@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
-from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
+from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
     axis_index,
     contact_changes,
     contact_distance_statistics,
     free_motion,
-    impedance_statistics,
+    law_statistics,
     saturated,
     stuck,
     vector_statistics,
@@ -40,8 +40,8 @@ def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str
     """All statistics of sensors and controls; some of images only with a reference."""
     values: dict[str, float] = {}
     for key in image_keys(episode):
-        values |= image_statistics(episode, key, reference)
-    values |= vector_statistics(episode) | impedance_statistics(episode)
+        values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
+    values |= vector_statistics(episode) | law_statistics(episode)
     values |= contact_distance_statistics(episode, reference)
     values |= window_statistics(episode, reference)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.

@@ -108,28 +108,46 @@ def contact_statistics(episode: Episode) -> dict[str, float]:
     }
 
 
+def size_statistics(episode: Episode) -> dict[str, float]:
+    """Standard deviation of the force in contact, and its roughness, noise relative to the standard deviation.
+
+    The roughness separates noise from a gain, which does not change it.
+    """
+    force, at = _force(episode), in_contact(episode)
+    if force is None:
+        return {}
+    size = _size(force[at])
+    noise = float(np.linalg.norm(noise_level(force, at)))
+    return {f"size/{FORCE}/contact": size, f"roughness/{FORCE}/contact": noise / size if size > 0.0 else np.nan}
+
+
+def _force(episode: Episode) -> Array | None:
+    """(T, 3) measured force; None without it, or if less than ``MIN_STEPS`` steps are in contact."""
+    force = episode.observations.get(FORCE)
+    if force is None or force.shape[1] != 3 or in_contact(episode).sum() < MIN_STEPS:
+        return None
+    return force.astype(np.float64)
+
+
+def _size(values: Array) -> float:
+    """Root mean square distance of vectors (T, 3) from their mean."""
+    return float(np.sqrt(np.square(values - values.mean(0)).sum(1).mean()))
+
+
 def wrench_statistics(episode: Episode) -> dict[str, float]:
     """Laws of a rigid contact: torque = lever x force + constant, and a force that opposes the hand's motion.
 
     A gain g of the force divides the lever by g; a sign inverts lever and motion; an exchange of axes breaks both laws.
-    A bias of force or torque changes only the constant. The roughness, noise relative to the standard deviation,
-    separates noise from a gain, which does not change it.
+    A bias of force or torque changes only the constant.
     """
-    observations = episode.observations
+    observations, at = episode.observations, in_contact(episode)
     values: dict[str, float] = {}
-    if FORCE not in observations:
+    if (readings := _force(episode)) is None:
         return values
-    at = in_contact(episode)
-    readings = observations[FORCE].astype(np.float64)
     force = readings[at]
-    if len(force) < MIN_STEPS or force.shape[1] != 3:
-        return values
-    size = float(np.sqrt(np.square(force - force.mean(0)).sum(1).mean()))
-    noise = float(np.linalg.norm(noise_level(readings, at)))
-    values |= {f"size/{FORCE}/contact": size, f"roughness/{FORCE}/contact": noise / size if size > 0.0 else np.nan}
     if TORQUE in observations and observations[TORQUE].shape[1] == 3:
         torque = observations[TORQUE].astype(np.float64)[at]
-        values[f"size/{TORQUE}/contact"] = float(np.sqrt(np.square(torque - torque.mean(0)).sum(1).mean()))
+        values[f"size/{TORQUE}/contact"] = _size(torque)
         residuals = {order: lever(force[:, order], torque) for order in permutations(range(3))}
         arm, rest = residuals.pop((0, 1, 2))
         values |= {f"lever/{FORCE} {axis}/contact": float(r) for axis, r in zip(AXES, arm, strict=True)}
@@ -247,7 +265,7 @@ def free_motion(episode: Episode) -> Mask:
 
 
 def vector_statistics(episode: Episode) -> dict[str, float]:
-    """Statistics of all vector sensors and controls."""
+    """Statistics of all vector sensors in an episode or a window."""
     values: dict[str, float] = {}
     for key, readings in episode.observations.items():
         if readings.ndim == 2 and key not in (CONTACT, HAND):
@@ -258,7 +276,12 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
         values[f"position noise/{HAND}/all"] = float(np.sqrt(np.square(noise).mean()))
         if present.any():
             values[f"stuck/{HAND}/all"] = float(repeats(hand, episode.task.held_steps(HAND))[present].mean())
-    return values | contact_statistics(episode) | wrench_statistics(episode) | control_statistics(episode)
+    return values | contact_statistics(episode) | size_statistics(episode)
+
+
+def law_statistics(episode: Episode) -> dict[str, float]:
+    """Statistics of an episode about laws between sensors and controls: of contact, and of the controller."""
+    return wrench_statistics(episode) | control_statistics(episode) | impedance_statistics(episode)
 
 
 def _moving(episode: Episode) -> Mask:

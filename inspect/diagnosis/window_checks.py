@@ -6,7 +6,6 @@ A median over a complete episode ignores what lasts for less than half of it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -64,8 +63,6 @@ def window_statistics(episode: Episode, reference: Reference | None) -> dict[str
 def window_values(episode: Episode, reference: Reference | None) -> dict[str, Array]:
     """Statistic of a window -> its values (W,); NaN where it is not defined."""
     starts = window_starts(len(episode))
-    if reference is not None:
-        reference = replace(reference, object=None)  # no statistic of windows is about the object
     rows = [_statistics(_part(episode, first), reference) for first in starts]
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}

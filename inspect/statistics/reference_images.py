@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from beliefscope.datasets.episode import Episode, lost_images
 from beliefscope.inspect.statistics.contact_distance import HARMONICS, fit_contact_distance
@@ -19,6 +21,7 @@ from beliefscope.inspect.statistics.image_landmarks import DIGITS, LandmarkFilte
 from beliefscope.inspect.statistics.signals import Array
 
 Gray = NDArray[np.uint8]
+Spectrum = NDArray[np.complex128]
 
 HAND = "effector_position"
 """Observation key of the measured hand position."""
@@ -105,9 +108,21 @@ class Reference:
         """Whether the data have hand positions."""
         return bool(self.scale.size)
 
-    def images(self, hand: Array) -> Array:
-        """(T, H, W): the normalised images expected for hand positions (T, d), m."""
-        return np.tensordot(quadratic((hand - self.scale[0]) / self.scale[1]), self.expected, axes=1)
+    def terms(self, hand: Array) -> Array:
+        """(T, F): factors of ``expected`` whose sum is the image expected for hand positions (T, d), m."""
+        return quadratic((hand - self.scale[0]) / self.scale[1])
+
+    @cached_property
+    def gradients(self) -> tuple[Spectrum, Spectrum]:
+        """Vertical and horizontal ``gradients`` of ``expected``."""
+        return gradients(self.expected)
+
+
+def gradients(images: Array) -> tuple[Spectrum, Spectrum]:
+    """Fourier transforms (N, 2 H, W + 1) of the vertical and horizontal gradients of images (N, H, W), zero around."""
+    shape = (2 * images.shape[1], 2 * images.shape[2])
+    vertical, horizontal = (fft.rfft2(np.gradient(images, axis=axis), shape) for axis in (1, 2))
+    return vertical, horizontal
 
 
 def image_keys(episode: Episode) -> list[str]:

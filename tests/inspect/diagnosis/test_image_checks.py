@@ -1,0 +1,45 @@
+"""Registration of images with those expected at the positions of the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage, signal
+
+from beliefscope.inspect.diagnosis.image_checks import registration
+from beliefscope.inspect.statistics.reference_images import Reference, normalised
+from beliefscope.inspect.statistics.signals import Array
+
+HEIGHT, WIDTH = 24, 32
+
+
+def reference(rng: np.random.Generator) -> Reference:
+    """Expected images that depend on the position of the hand (T, 2), drawn at random and smooth."""
+    expected = ndimage.gaussian_filter(rng.normal(size=(6, HEIGHT, WIDTH)), (0, 2, 2))
+    gray = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    return Reference("image", gray, gray, expected, np.stack([np.zeros(2), np.ones(2)]))
+
+
+def scene(rng: np.random.Generator, healthy: Reference, shift: tuple[int, int]) -> tuple[Array, Array]:
+    """(T, 2) hand positions, and (T, H, W) normalised images that are shifted by x and y pixels, with noise."""
+    hand = rng.normal(size=(12, 2))
+    images = np.tensordot(healthy.terms(hand), healthy.expected, axes=1)
+    images = np.roll(images, shift[::-1], axis=(1, 2)) + 0.05 * rng.normal(size=images.shape)
+    low, high = images.min(), images.max()
+    return hand, normalised((255.0 * (images - low) / (high - low)).astype(np.uint8))
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, 0), (-2, 4), (0, -5)])
+def test_the_shift_is_that_of_the_largest_correlation_summed_over_the_images(shift: tuple[int, int]) -> None:
+    rng = np.random.default_rng(abs(shift[0]) + 10 * abs(shift[1]))
+    healthy = reference(rng)
+    hand, images = scene(rng, healthy, shift)
+    total = np.zeros((2 * HEIGHT - 1, 2 * WIDTH - 1))
+    for image, expected in zip(images, np.tensordot(healthy.terms(hand), healthy.expected, axes=1), strict=True):
+        for axis in (0, 1):
+            total += signal.correlate(np.gradient(image, axis=axis), np.gradient(expected, axis=axis), method="direct")
+    rows, columns = HEIGHT // 4, WIDTH // 4
+    middle = total[HEIGHT - 1 - rows : HEIGHT + rows, WIDTH - 1 - columns : WIDTH + columns]
+    i, j = np.unravel_index(middle.argmax(), middle.shape)
+    x, y = registration(healthy, hand, images)
+    assert (round(x), round(y)) == (j - columns, i - rows) == shift
