@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from beliefscope.datasets.dataset_statistics import statistics
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.statistics import statistics
 from beliefscope.datasets.store import open_dataset, sample_path
 
 FIRST = 140

@@ -17,7 +17,7 @@ from torch import Tensor
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.html import html_table
+from beliefscope.datasets.notebook_html import html_table
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian

@@ -13,8 +13,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
+from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
-from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 from beliefscope.inspect.traces.batch import Progress, trace_all

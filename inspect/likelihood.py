@@ -24,9 +24,9 @@ from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, MapOptions, Quantity
+from beliefscope.inspect.maps.map_statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.maps.plane import OTHERS, Others, Plane, describe_others, other_components, plane_of
-from beliefscope.inspect.maps.statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.trace import Trace
 
 Doubles = NDArray[np.float64]

@@ -27,7 +27,7 @@ EKF = "door --filter ekf.safetensors"
 
 @pytest.mark.parametrize("task", ["door", "push"])
 def test_collect_compares_statistics_with_the_paper(run: Run, folder: Path, task: str) -> None:
-    from beliefscope.datasets.statistics import PAPER_DATA
+    from beliefscope.datasets.dataset_statistics import PAPER_DATA
 
     code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
     assert code == 0

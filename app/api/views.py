@@ -12,7 +12,7 @@ from beliefscope.app.protocol.etag import tagged
 from beliefscope.app.protocol.messages import close_reason
 from beliefscope.app.views.embedded_viser import client_page
 from beliefscope.app.views.registry import Views
-from beliefscope.app.views.view import View
+from beliefscope.app.views.view_socket import View
 
 
 class ViewAddresses(Reply):

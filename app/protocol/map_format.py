@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_statistics import measure_maps, particle_cloud
 from beliefscope.inspect.maps.shape import SHAPES
-from beliefscope.inspect.maps.statistics import measure_maps, particle_cloud
 from beliefscope.inspect.trace import Trace
 
 LOG_RANGE = 64.0

@@ -7,7 +7,7 @@ from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.views.memory import release_memory
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
-from beliefscope.app.views.view import View
+from beliefscope.app.views.view_socket import View
 from beliefscope.datasets.errors import BadInput
 
 

@@ -12,10 +12,10 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import Cause
+from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
-from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace

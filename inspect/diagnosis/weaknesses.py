@@ -13,7 +13,7 @@ from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice, fault_slice
 from beliefscope.filters.finetuning.success import Criterion
-from beliefscope.inspect.diagnosis.training import training_for, training_on
+from beliefscope.inspect.diagnosis.finetune_settings import training_for, training_on
 
 PROBABLE = 0.2
 """Smallest probability of a cause that is offered."""

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.html import html_paragraph, html_table
+from beliefscope.datasets.notebook_html import html_paragraph, html_table
 from beliefscope.datasets.task import Task
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.html import html_paragraph
+from beliefscope.datasets.notebook_html import html_paragraph
 from beliefscope.inspect.maps.plane import Others
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.inspect.maps.statistics import has_layer_weights, layer_weights
+from beliefscope.inspect.maps.map_statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.trace import Trace
 
 

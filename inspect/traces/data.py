@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.html import html_paragraph, html_table
+from beliefscope.datasets.notebook_html import html_paragraph, html_table
 from beliefscope.datasets.task import Task
 from beliefscope.filters.models.resampling import effective_sample_size
 

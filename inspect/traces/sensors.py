@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import is_image
-from beliefscope.datasets.points import extent_of, point_sensors, points_of
+from beliefscope.datasets.point_clouds import extent_of, point_sensors, points_of
 from beliefscope.inspect.traces.data import Trace
 
 

@@ -16,9 +16,9 @@ from beliefscope.filters.evaluate import metrics
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
+from beliefscope.inspect.maps.map_statistics import measure_maps
 from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES
-from beliefscope.inspect.maps.statistics import measure_maps
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.report.diagnosis import ReportedDiagnosis

@@ -11,7 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from beliefscope.datasets.points import extent_of, point_sensors, points_of
+from beliefscope.datasets.point_clouds import extent_of, point_sensors, points_of
 from beliefscope.datasets.task import Component, Task, display_name, with_unit
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap

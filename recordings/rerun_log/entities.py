@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.points import point_sensors, points_of
+from beliefscope.datasets.point_clouds import point_sensors, points_of
 from beliefscope.datasets.task import Component, Outline, Task, with_unit
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label

@@ -18,7 +18,7 @@ from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults, available_presets
-from beliefscope.datasets.points import MAX_POINTS, points_of
+from beliefscope.datasets.point_clouds import MAX_POINTS, points_of
 from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.datasets.task import Component, Task
 from beliefscope.datasets.task_json import check_definition, task_from_json, task_to_json

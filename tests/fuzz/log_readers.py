@@ -14,17 +14,17 @@ import mutate
 import numpy as np
 from reader import Reader, check_serializable
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "recordings" / "logs"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "recordings" / "log_readers"))
 
 import log_files
 
 from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.inspect.trace import load_trace, save_trace
-from beliefscope.recordings.logs import rerun_file
-from beliefscope.recordings.logs.column_map import ColumnMap, read_map
-from beliefscope.recordings.logs.columns import preview_columns, read_columns
-from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.read_log import read_log, recorded_trace
+from beliefscope.recordings.log_readers import rerun_file
+from beliefscope.recordings.log_readers.column_map import ColumnMap, read_map
+from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
+from beliefscope.recordings.log_readers.guess import guess_map
+from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
 from beliefscope.recordings.probe import RecordingInfo
 
 SECONDS = 0.4

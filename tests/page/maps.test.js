@@ -16,7 +16,7 @@ import {
 import { moved, offsetAt } from '../../app/page/maps/crosshair.js';
 import { csv } from '../../app/page/maps/export_map.js';
 import { fitsCloseUp, mapLayout } from '../../app/page/maps/map_layout.js';
-import { comparable } from '../../app/page/maps/reference.js';
+import { comparable } from '../../app/page/maps/reference_maps.js';
 import {
   areaUnit,
   borders,

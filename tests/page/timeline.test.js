@@ -1,7 +1,7 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 
-import { cssVariable } from '../../app/page/core/palette.js';
+import { cssVariable } from '../../app/page/core/colours.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
 import { chartData, shadeIntervals, valueRange } from '../../app/page/timeline/chart.js';
 import { secondsAxis } from '../../app/page/timeline/step_axis.js';

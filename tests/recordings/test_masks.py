@@ -25,9 +25,9 @@ from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader
 from beliefscope.recordings.live import LiveRecorder
-from beliefscope.recordings.logs.column_map import read_map
-from beliefscope.recordings.logs.columns import read_columns
-from beliefscope.recordings.logs.read_log import check_complete, read_log
+from beliefscope.recordings.log_readers.column_map import read_map
+from beliefscope.recordings.log_readers.columns import read_columns
+from beliefscope.recordings.log_readers.read_log import check_complete, read_log
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
 

@@ -52,7 +52,7 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
 
     from beliefscope.datasets.errors import BadInput
     from beliefscope.datasets.store import open_dataset
-    from beliefscope.recordings.logs.columns import preview_columns
+    from beliefscope.recordings.log_readers.columns import preview_columns
     from beliefscope.recordings.open_trace import open_recording
 
     guarded = {"recording": open_recording, "log-rerun": preview_columns} | dict.fromkeys(readers.HDF5, open_dataset)

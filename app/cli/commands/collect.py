@@ -35,8 +35,8 @@ def collect(
       beliefscope collect push-field --episodes 300 --steps 200 --without outages --without nudges -o field.h5
     """
     from beliefscope.datasets.catalog import load_task
+    from beliefscope.datasets.dataset_statistics import PAPER_DATA, comparison_table, default_size, statistics
     from beliefscope.datasets.simulation.collect import collect as simulate
-    from beliefscope.datasets.statistics import PAPER_DATA, comparison_table, default_size, statistics
     from beliefscope.datasets.store import open_dataset
 
     name = load_task(task).name

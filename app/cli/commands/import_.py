@@ -50,10 +50,10 @@ def import_(
       beliefscope import drive.mcap --map map.toml -o drive.h5
     """
     from beliefscope.datasets.store import write_dataset
-    from beliefscope.recordings.logs.column_map import read_map
-    from beliefscope.recordings.logs.columns import preview_columns, read_columns
-    from beliefscope.recordings.logs.guess import guess_map
-    from beliefscope.recordings.logs.read_log import check_complete, read_log, recorded_trace
+    from beliefscope.recordings.log_readers.column_map import read_map
+    from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
+    from beliefscope.recordings.log_readers.guess import guess_map
+    from beliefscope.recordings.log_readers.read_log import check_complete, read_log, recorded_trace
     from beliefscope.recordings.open_trace import open_recording
 
     if guess:

@@ -6,8 +6,8 @@ import { ServerError } from '../data/api.js';
 import { stepSummary } from '../step/step_summary.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { element, html, messageOf } from './dom.js';
-import { swatch } from './palette.js';
-import { stats } from './stats.js';
+import { swatch } from './colours.js';
+import { stats } from './measurements.js';
 import { displayName, sentence } from './units.js';
 
 const LOADING_DELAY = 150; // ms until a panel shows that it loads

@@ -44,10 +44,10 @@ import {
 } from './common_panels.js';
 import { element, html, messageOf } from './dom.js';
 import { layoutMenu, layoutSetter } from './layouts.js';
-import { assignSpareColours } from './palette.js';
+import { assignSpareColours } from './colours.js';
 import { Splitters } from './splitters.js';
 import { parsePermalink } from './state.js';
-import { addLatency, stats } from './stats.js';
+import { addLatency, stats } from './measurements.js';
 import { tabBar } from './tab_bar.js';
 import { Theme } from './theme.js';
 import { Undo } from './undo.js';

@@ -5,7 +5,7 @@
 import { html } from './dom.js';
 import { LIMITS, parseSizes, permittedShare, shareAfterKey } from './pane_sizes.js';
 
-const STORAGE_KEY = 'beliefscope.sizes'; // also in early.js
+const STORAGE_KEY = 'beliefscope.sizes'; // also in before_paint.js
 
 /** The space that each pane divides with its neighbour, and the pane. @type {Record<Pane, [space: string, pane: string]>} */
 const PARTS = {

@@ -2,7 +2,7 @@
 
 const STORAGE_KEY = 'beliefscope.theme';
 
-/** Follows the system until the user chooses a theme; `early.js` restores it. */
+/** Follows the system until the user chooses a theme; `before_paint.js` restores it. */
 export class Theme {
   #media = matchMedia('(prefers-color-scheme: dark)');
   #changed;

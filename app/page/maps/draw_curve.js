@@ -2,7 +2,7 @@
 
 /** @import { Context, Layer, MapOptions } from './draw_map.js' */
 
-import { lineStyle } from '../core/palette.js';
+import { lineStyle } from '../core/colours.js';
 import { drawXAxis, mapAxis } from './draw_map.js';
 import { offsetOf, rangeDigits, rangeLabels } from './map_values.js';
 

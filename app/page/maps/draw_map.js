@@ -1,11 +1,11 @@
 /** Draws one likelihood map on a canvas or as SVG. */
 
-/** @import { ColourMap, LineStyle } from '../core/palette.js' */
+/** @import { ColourMap, LineStyle } from '../core/colours.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Maps, Shade } from './map_values.js' */
 /** @import { SvgContext } from './svg_context.js' */
 
-import { COLOUR_TABLES, lineStyle, scaled } from '../core/palette.js';
+import { COLOUR_TABLES, lineStyle, scaled } from '../core/colours.js';
 import { context2d } from '../core/dom.js';
 import { displayName, displayUnit, fixed } from '../core/units.js';
 import { offsetOf } from './map_values.js';

@@ -4,7 +4,7 @@
 /** @import { DisplayedMaps } from './map_panel.js' */
 
 import { context2d, create, element, html, messageOf } from '../core/dom.js';
-import { COLOUR_TABLES } from '../core/palette.js';
+import { COLOUR_TABLES } from '../core/colours.js';
 import { fixed, sentence } from '../core/units.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap } from './draw_map.js';

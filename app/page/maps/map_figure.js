@@ -1,11 +1,11 @@
 /** The figure of a likelihood map, with its title, shape and canvas, and the colour bar of all maps. */
 
-/** @import { ColourMap } from '../core/palette.js' */
+/** @import { ColourMap } from '../core/colours.js' */
 /** @import { ColourScale } from './map_summary.js' */
 /** @import { Shade } from './map_values.js' */
 
 import { create, html } from '../core/dom.js';
-import { cssVariable, gradient } from '../core/palette.js';
+import { cssVariable, gradient } from '../core/colours.js';
 import { displayName } from '../core/units.js';
 
 /**

@@ -1,17 +1,17 @@
 /** The panel with the likelihood maps, one per layer. */
 
-/** @import { ColourMap } from '../core/palette.js' */
+/** @import { ColourMap } from '../core/colours.js' */
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { Layer, MapOptions } from './draw_map.js' */
 /** @import { Figure } from './map_figure.js' */
 /** @import { Maps, Range, Scale } from './map_values.js' */
-/** @import { Reference } from './reference.js' */
+/** @import { Reference } from './reference_maps.js' */
 
 import { MAP_QUANTITIES } from '../core/constants.js';
 import { context2d, html } from '../core/dom.js';
-import { colour } from '../core/palette.js';
+import { colour } from '../core/colours.js';
 import { displayName, sentence } from '../core/units.js';
 import { choice } from '../widgets/pickers.js';
 import { Crosshair } from './crosshair.js';
@@ -35,7 +35,7 @@ import {
   valuesAt,
 } from './map_summary.js';
 import { REGION_SHARES, borders, isCurve, shades } from './map_values.js';
-import { References } from './reference.js';
+import { References } from './reference_maps.js';
 
 const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom', 'tiles']; // keys of the state
 const EXPLANATIONS = {

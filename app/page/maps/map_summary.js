@@ -2,7 +2,7 @@
 
 /** @import { Task } from '../data/api.js' */
 /** @import { Maps, Range, Scale, Shade } from './map_values.js' */
-/** @import { Reference } from './reference.js' */
+/** @import { Reference } from './reference_maps.js' */
 
 import { displayName, displayUnit, fixed, mainName, percent, signed } from '../core/units.js';
 import { areaUnit, cellAt, rangeDigits, rangeLabels, valueAt } from './map_values.js';

@@ -1,6 +1,6 @@
 /** Small maps of several steps: the last one in free motion beside the first one in contact, and those around the cursor. */
 
-/** @import { ColourMap } from '../core/palette.js' */
+/** @import { ColourMap } from '../core/colours.js' */
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
@@ -18,7 +18,7 @@ import { mapChoices } from './map_choices.js';
 import { showColourBar } from './map_figure.js';
 import { positionText, tilesScale, valuesAt } from './map_summary.js';
 import { REGION_SHARES, borders, tileShade, tileSteps } from './map_values.js';
-import { content } from './reference.js';
+import { content } from './reference_maps.js';
 
 const GAP = 3; // px between tiles
 const NAMES = 66; // px of the column with the names of the layers

@@ -7,7 +7,7 @@
 /** @import { Trace } from '../data/trace.js' */
 
 import { context2d, create, element, html } from '../core/dom.js';
-import { COLOUR_TABLES, colour } from '../core/palette.js';
+import { COLOUR_TABLES, colour } from '../core/colours.js';
 import { displayName, significant } from '../core/units.js';
 import { sensorImages } from '../data/api.js';
 import { imageAt } from '../data/trace.js';

@@ -5,7 +5,7 @@
 
 import { SCENE_LAYERS, VIEWPOINTS } from '../core/constants.js';
 import { create } from '../core/dom.js';
-import { lineSample, swatch } from '../core/palette.js';
+import { lineSample, swatch } from '../core/colours.js';
 import { choice } from '../widgets/pickers.js';
 
 /** @typedef {typeof SCENE_LAYERS[number]} SceneLayer */

@@ -3,7 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 
 import { create } from '../core/dom.js';
-import { cssVariable, swatch } from '../core/palette.js';
+import { cssVariable, swatch } from '../core/colours.js';
 import { displayName, fixed, percent } from '../core/units.js';
 
 const ROWS = 5; // for which there is room; more are scrolled

@@ -5,7 +5,7 @@
 /** @import { NumberKey } from './experiment_rows.js' */
 
 import { svgElement } from '../core/dom.js';
-import { scaled } from '../core/palette.js';
+import { scaled } from '../core/colours.js';
 import { fixed, significant } from '../core/units.js';
 import { colourOf, estimatorOf } from '../widgets/filter_colours.js';
 import { extent, padded } from '../widgets/plots.js';

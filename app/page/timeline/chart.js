@@ -3,7 +3,7 @@
 /** @import { StepAxis } from './step_axis.js' */
 
 import { context2d } from '../core/dom.js';
-import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
+import { colour, lineStyle, scaled, translucent } from '../core/colours.js';
 import { typeset } from '../core/units.js';
 import { drawStack } from './stack.js';
 import { STEPS } from './step_axis.js';

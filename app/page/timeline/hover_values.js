@@ -4,7 +4,7 @@
 /** @import { Track } from './chart.js' */
 
 import { create } from '../core/dom.js';
-import { cssVariable } from '../core/palette.js';
+import { cssVariable } from '../core/colours.js';
 import { formatValue } from './legend.js';
 
 const DISTANCE = 14; // px from the pointer

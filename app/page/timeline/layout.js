@@ -3,7 +3,7 @@
 /** @import { Track } from './chart.js' */
 
 import { create } from '../core/dom.js';
-import { scaled } from '../core/palette.js';
+import { scaled } from '../core/colours.js';
 import { GUTTER } from './chart.js';
 
 const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart

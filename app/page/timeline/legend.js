@@ -4,7 +4,7 @@
 /** @import { Track } from './chart.js' */
 
 import { create } from '../core/dom.js';
-import { cssVariable, lineSample } from '../core/palette.js';
+import { cssVariable, lineSample } from '../core/colours.js';
 import { displayName, fixed, significant } from '../core/units.js';
 import { seriesStyle } from './chart.js';
 import { areaSample } from './stack.js';

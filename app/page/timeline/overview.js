@@ -6,7 +6,7 @@
 /** @import { StepWindow } from './step_window.js' */
 
 import { create, context2d } from '../core/dom.js';
-import { colour } from '../core/palette.js';
+import { colour } from '../core/colours.js';
 import { GUTTER, hatching } from './chart.js';
 
 /**

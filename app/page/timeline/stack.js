@@ -3,7 +3,7 @@
 /** @import { Series, Track } from './chart.js' */
 /** @import { StepAxis } from './step_axis.js' */
 
-import { colour, cssVariable, lineStyle, translucent } from '../core/palette.js';
+import { colour, cssVariable, lineStyle, translucent } from '../core/colours.js';
 
 const SUM_TOLERANCE = 1e-3; // of weights in single precision, and of the normalisation of networks
 /** Opacity of the areas, from below: neighbours differ without colour too. */

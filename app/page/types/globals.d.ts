@@ -8,7 +8,7 @@ declare global {
     /** Access for the browser tests and the benchmarks. */
     beliefscope: {
       state(): State;
-      stats: typeof import('../core/stats.js').stats;
+      stats: typeof import('../core/measurements.js').stats;
       timeline: Page['timeline'];
       live: Page['live'];
       rerun: {

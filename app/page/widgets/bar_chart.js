@@ -1,7 +1,7 @@
 /** Grouped bars with error bars and dots as SVG, each bar a link; colours and textures of filters, also for legends. */
 
 import { svgElement } from '../core/dom.js';
-import { scaled } from '../core/palette.js';
+import { scaled } from '../core/colours.js';
 import { fixed } from '../core/units.js';
 import { colourOf, estimatorOf } from './filter_colours.js';
 

@@ -5,7 +5,7 @@
 /** @import { Curve, DiagnosticResult, Table } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
-import { scaled, swatch } from '../core/palette.js';
+import { scaled, swatch } from '../core/colours.js';
 import { sentence, significant, typeset } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { GUTTER, LABEL, shadeBounds, shadeIntervals } from '../timeline/chart.js';

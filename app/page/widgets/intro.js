@@ -49,7 +49,7 @@ export class Intro {
     html('.chip', this.#host).focus();
   }
 
-  /** `early.js` sets the class before the first paint, so that the layout does not shift. */
+  /** `before_paint.js` sets the class before the first paint, so that the layout does not shift. */
   set #isShown(/** @type {boolean} */ isShown) {
     document.documentElement.classList.toggle('first-visit', isShown);
   }

@@ -10,7 +10,7 @@ import {
   lineSample,
   lineStyle,
   scaled,
-} from '../core/palette.js';
+} from '../core/colours.js';
 import { displayName, significant, typeset } from '../core/units.js';
 import { FONT, LABEL, tickLabels } from '../timeline/chart.js';
 

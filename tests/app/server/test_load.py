@@ -29,7 +29,7 @@ from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
-from beliefscope.app.views.view import PREFETCH_STEPS
+from beliefscope.app.views.view_socket import PREFETCH_STEPS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.maps.likelihood_map import MapOptions

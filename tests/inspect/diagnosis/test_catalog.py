@@ -12,6 +12,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges, probability_text
 from beliefscope.inspect.diagnosis.conclusion import is_unused, next_action
+from beliefscope.inspect.diagnosis.episode_statistics import with_scatter
 from beliefscope.inspect.diagnosis.scoring import (
     Explanation,
     applicable,
@@ -21,7 +22,6 @@ from beliefscope.inspect.diagnosis.scoring import (
     strength,
     support,
 )
-from beliefscope.inspect.diagnosis.statistics import with_scatter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 

@@ -19,10 +19,10 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.diagnose import required_profile
+from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
 from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood, recovery
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
-from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, brings_back, undo
 from beliefscope.inspect.diagnosis.vector_checks import free_motion
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation

@@ -12,8 +12,8 @@ import pytest
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.inspect.diagnostics.likelihood_maps import median_interval
 from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap
+from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.maps.shape import SHAPES
-from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
 
 HALF = 0.135
 Centre = tuple[float, float]

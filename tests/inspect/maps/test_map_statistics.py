@@ -15,7 +15,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.likelihood_maps import ENTRY
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
+from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.trace import trace
 
 SIZE, HALF = 135, 0.135

@@ -18,8 +18,8 @@ from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
-from beliefscope.recordings.logs.arrays import Columns
-from beliefscope.recordings.logs.column_map import (
+from beliefscope.recordings.log_readers.arrays import Columns
+from beliefscope.recordings.log_readers.column_map import (
     QUATERNION,
     ROTATIONS,
     ColumnMap,
@@ -29,8 +29,8 @@ from beliefscope.recordings.logs.column_map import (
     base_name,
     listed,
 )
-from beliefscope.recordings.logs.columns import column, joined
-from beliefscope.recordings.logs.messages import CLOCK, NEW
+from beliefscope.recordings.log_readers.columns import column, joined
+from beliefscope.recordings.log_readers.messages import CLOCK, NEW
 
 Array = NDArray[np.float64]
 

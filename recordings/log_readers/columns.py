@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.recordings.logs.arrays import Columns, check_downloaded
-from beliefscope.recordings.logs.column_map import ELEMENTS, ColumnMap, base_name
-from beliefscope.recordings.logs.messages import Preview, on_clock, preview
+from beliefscope.recordings.log_readers.arrays import Columns, check_downloaded
+from beliefscope.recordings.log_readers.column_map import ELEMENTS, ColumnMap, base_name
+from beliefscope.recordings.log_readers.messages import Preview, on_clock, preview
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
@@ -53,7 +53,7 @@ def preview_columns(path: Path) -> Preview:
 
 def _read(path: Path, mapping: ColumnMap | None) -> Preview:
     with _reading(path):
-        reader = import_module(f"beliefscope.recordings.logs.{_reader(path)}")
+        reader = import_module(f"beliefscope.recordings.log_readers.{_reader(path)}")
         if hasattr(reader, "open_log"):
             with reader.open_log(path, None if mapping is None else mapping.time) as log:
                 result = preview(log) if mapping is None else Preview(on_clock(log, mapping))

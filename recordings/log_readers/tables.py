@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.logs.arrays import Wanted
+from beliefscope.recordings.log_readers.arrays import Wanted
 
 MAX_HEADER = 1 << 20
 """Bytes of the first line of a CSV file that are checked."""

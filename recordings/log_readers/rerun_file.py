@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from pyarrow import compute
 
 from beliefscope.datasets.errors import BadInput, check_name
-from beliefscope.recordings.logs.arrays import check_size
-from beliefscope.recordings.logs.images import channels, decoded
-from beliefscope.recordings.logs.tables import from_arrow
+from beliefscope.recordings.log_readers.arrays import check_size
+from beliefscope.recordings.log_readers.images import channels, decoded
+from beliefscope.recordings.log_readers.tables import from_arrow
 from beliefscope.recordings.probe import RecordingProbe
 from beliefscope.recordings.rerun_log.metadata import reading
 

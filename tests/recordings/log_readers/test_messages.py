@@ -20,10 +20,10 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.export import export_trace
-from beliefscope.recordings.logs.column_map import read_map
-from beliefscope.recordings.logs.columns import preview_columns, read_columns
-from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.read_log import read_log, recorded_trace
+from beliefscope.recordings.log_readers.column_map import read_map
+from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
+from beliefscope.recordings.log_readers.guess import guess_map
+from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
 
 ROOT = Path(__file__).parents[3]
 DT = 0.05

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.recordings.logs.arrays import Wanted, check_downloaded, check_size, unread
-from beliefscope.recordings.logs.images import decoded
-from beliefscope.recordings.logs.tables import from_arrow
+from beliefscope.recordings.log_readers.arrays import Wanted, check_downloaded, check_size, unread
+from beliefscope.recordings.log_readers.images import decoded
+from beliefscope.recordings.log_readers.tables import from_arrow
 
 VERSION = "v3."
 LARGEST_INDEX = 10**6

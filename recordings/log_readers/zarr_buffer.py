@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.logs.arrays import Wanted, check_size, unread
+from beliefscope.recordings.log_readers.arrays import Wanted, check_size, unread
 
 DATA = "data/"
 

@@ -15,11 +15,11 @@ from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.statistics.measures import errors, nees
 from beliefscope.inspect.trace import load_trace, save_trace
-from beliefscope.recordings.logs.column_map import read_map
-from beliefscope.recordings.logs.columns import column, joined, read_columns
-from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.messages import Preview
-from beliefscope.recordings.logs.read_log import read_log, recorded_trace
+from beliefscope.recordings.log_readers.column_map import read_map
+from beliefscope.recordings.log_readers.columns import column, joined, read_columns
+from beliefscope.recordings.log_readers.guess import guess_map
+from beliefscope.recordings.log_readers.messages import Preview
+from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
 
 MAP = """
 task = "vehicle"

@@ -15,10 +15,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 import log_files as logs
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.logs.column_map import read_map
-from beliefscope.recordings.logs.columns import preview_columns, read_columns
-from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.read_log import read_log, recorded_trace
+from beliefscope.recordings.log_readers.column_map import read_map
+from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
+from beliefscope.recordings.log_readers.guess import guess_map
+from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
 
 pytestmark = pytest.mark.slow  # a process reads each recording first
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.logs import ros_types
+from beliefscope.recordings.log_readers import ros_types
 
 
 @contextmanager

@@ -7,7 +7,7 @@
 /** @import { Maps } from './map_values.js' */
 
 import { mapChoices } from './map_choices.js';
-import { formatPin, parsePin } from './pin.js';
+import { formatPin, parsePin } from './pinned_step.js';
 
 /**
  * @typedef {{maps: Maps, selection: Selection}} Pinned

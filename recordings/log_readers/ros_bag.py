@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from beliefscope.recordings.logs import ros_types
+from beliefscope.recordings.log_readers import ros_types
 
 STORAGES = (".db3", ".mcap")
 """Suffixes of the files of a bag."""

@@ -6,9 +6,9 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 
-from beliefscope.recordings.logs.arrays import Columns
-from beliefscope.recordings.logs.column_map import QUATERNION, base_name
-from beliefscope.recordings.logs.messages import Preview
+from beliefscope.recordings.log_readers.arrays import Columns
+from beliefscope.recordings.log_readers.column_map import QUATERNION, base_name
+from beliefscope.recordings.log_readers.messages import Preview
 
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"est|mean|pred|filter|posterior|belief"

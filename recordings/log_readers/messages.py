@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.recordings.logs.arrays import Columns, check_size
-from beliefscope.recordings.logs.column_map import ColumnMap, base_name
-from beliefscope.recordings.logs.images import image_of, is_image
+from beliefscope.recordings.log_readers.arrays import Columns, check_size
+from beliefscope.recordings.log_readers.column_map import ColumnMap, base_name
+from beliefscope.recordings.log_readers.images import image_of, is_image
 
 LONGEST = 10_000_000
 """Largest number of ticks."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.catalog import TASKS
+from beliefscope.datasets.dataset_statistics import PAPER_DATA, comparison_table, default_size, statistics
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.door import DOOR
-from beliefscope.datasets.statistics import PAPER_DATA, comparison_table, default_size, statistics
 from beliefscope.datasets.store import open_dataset, sample_path
 
 

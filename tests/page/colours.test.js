@@ -8,7 +8,7 @@ import {
   gradient,
   scaled,
   translucent,
-} from '../../app/page/core/palette.js';
+} from '../../app/page/core/colours.js';
 
 test('colour tables start and end at the ends of their colour map', () => {
   const { viridis } = COLOUR_TABLES;
