@@ -18,7 +18,7 @@ from beliefscope.filters.batch import Batch, Statistics
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import CovarianceRule
-from beliefscope.filters.models.networks import Encoders, Networks, Pooling, Residual, Stack
+from beliefscope.filters.models.networks import Encoders, Networks, Pooling
 from beliefscope.filters.models.resampling import Resampling
 
 Kind = Literal["ekf", "ukf", "pf", "lstm", "transformer"]
@@ -238,34 +238,3 @@ def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
             f"only vectors. Use a filter of your own."
         )
     return shapes[0] if is_image else (sum(shape[0] for shape in shapes),)
-
-
-MAX_LOGIT = 3.0
-"""Bound of the weight model's logits: a weight of 0 or 1 would have no gradient."""
-
-
-class WeightModel(nn.Module):
-    """Crossmodal weights: the joined features of all modalities' encoders to log beta (T, N, K, W).
-
-    A softmax over K makes the weights positive and sum to one in each component; bounded logits keep each between
-    0.0025 and 0.9975.
-    """
-
-    def __init__(self, task: Task, architecture: Architecture, width: int) -> None:
-        super().__init__()
-        models, units = architecture.models, architecture.units
-        self.shape = (len(models), width)
-        modalities = dict.fromkeys(m for model in models for m in model.split("+"))
-        self.encoders = encoders(task, modalities, architecture)
-        # The published weight models: one residual block where there is a weight per component, three for a scalar.
-        blocks = 3 if architecture.networks == "authors" and width == 1 else 1
-        residuals = (Residual(units) for _ in range(blocks))
-        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), *residuals)
-        self.output = nn.Linear(units, len(models) * width)
-        nn.init.normal_(self.output.weight, std=1e-2)
-        nn.init.zeros_(self.output.bias)
-
-    def forward(self, observations: Mapping[str, Tensor]) -> Tensor:
-        logits = self.output(self.trunk(self.encoders(observations))).unflatten(-1, self.shape)
-        logits = MAX_LOGIT * torch.tanh(logits / MAX_LOGIT)
-        return torch.log_softmax(logits, dim=-2)

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from beliefbench import equations
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.filter import MAX_LOGIT, Architecture, Filter
+from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.models.information import InformationFilter
+from beliefscope.filters.models.weight_model import MAX_LOGIT
 
 
 @dataclass(frozen=True)

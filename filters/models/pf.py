@@ -13,12 +13,13 @@ from torch import Tensor, nn
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, Particles, StepTrace
-from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
+from beliefscope.filters.filter import Architecture, Filter, encoders
 from beliefscope.filters.models import common_random_numbers
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import mixture, only_present
 from beliefscope.filters.models.networks import Residual, Stack, in_chunks, vector_stack
 from beliefscope.filters.models.resampling import resample
+from beliefscope.filters.models.weight_model import WeightModel
 
 
 class MeasurementModel(nn.Module):

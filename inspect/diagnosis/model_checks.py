@@ -16,10 +16,10 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.filter import MAX_LOGIT
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
+from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array

@@ -19,10 +19,11 @@ from beliefscope.filters.belief import Evidence
 from beliefscope.filters.catalog import build
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.filter import MAX_LOGIT, Filter
+from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
+from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.setting import Deviations, Setting, Undo, without_sensor
 from beliefscope.inspect.diagnosis.undo_readings import READINGS, advance
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation

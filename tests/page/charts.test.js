@@ -9,7 +9,7 @@ import {
   toggled,
 } from '../../app/page/timeline/chart_list.js';
 import { trackHeights } from '../../app/page/timeline/layout.js';
-import { areShares, upperEdges } from '../../app/page/timeline/stack.js';
+import { areShares, upperEdges } from '../../app/page/timeline/stacked_weights.js';
 import { withMovedBorder } from '../../app/page/timeline/track_sizes.js';
 import { TRACKS, tracks } from '../../app/page/timeline/tracks.js';
 import { FUSION, makeTrace } from './fixtures.js';

@@ -5,7 +5,7 @@
 import { context2d } from '../core/dom.js';
 import { colour, lineStyle, scaled, translucent } from '../core/colours.js';
 import { typeset } from '../core/units.js';
-import { drawStack } from './stack.js';
+import { drawStack } from './stacked_weights.js';
 import { STEPS } from './step_axis.js';
 
 /**

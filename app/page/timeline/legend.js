@@ -7,7 +7,7 @@ import { create } from '../core/dom.js';
 import { cssVariable, lineSample } from '../core/colours.js';
 import { displayName, fixed, significant } from '../core/units.js';
 import { seriesStyle } from './chart.js';
-import { areaSample } from './stack.js';
+import { areaSample } from './stacked_weights.js';
 
 const CHARACTER = 0.61; // rem
 const SAMPLE_AND_VALUE = { full: 8, compact: 7.1, dense: 7.5 }; // rem

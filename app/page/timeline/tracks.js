@@ -7,7 +7,7 @@
 
 import { displayName, fixed } from '../core/units.js';
 import { chartKeys } from './chart_list.js';
-import { areShares } from './stack.js';
+import { areShares } from './stacked_weights.js';
 
 /** Options for the lowest chart, and their labels. */
 export const TRACKS = {
