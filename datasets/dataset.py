@@ -36,7 +36,8 @@ def no_training_episodes(task: Task, splits: Iterable[str], data: str = "the dat
     collect = f"collect some, beliefscope collect {name} -o {name}.h5, or " if task.simulate is not None else ""
     return BadInput(
         f"{data} has no episode of split 'train', only of {present or 'none'}: {collect}store some of the episodes "
-        "with dataclasses.replace(episode, split='train') and bs.save_dataset"
+        "with dataclasses.replace(episode, split='train') and bs.save_dataset, or import a log with beliefscope import "
+        "--split train"
     )
 
 

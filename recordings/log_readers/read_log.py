@@ -44,8 +44,8 @@ MARGIN = 1.2
 """Half width of maps relative to the largest half range of the map components."""
 
 
-def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]:
-    """The episodes of a log, in the order of their first rows.
+def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "test") -> list[Episode]:
+    """The episodes of a log, in the order of their first rows. split: of all episodes, ``train``, ``val`` or ``test``.
 
     Raises BadInput for missing columns, columns of different lengths and times that do not ascend.
     """
@@ -84,7 +84,7 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
             qpos=np.zeros((len(at), 0), np.float32),
             dt=dt,
             seed=-1,
-            split="test",
+            split=split,
             provenance={"source": source, "episode": name},
             covariates={name: numbers[at] for name, numbers in values.items()},
             time=time,

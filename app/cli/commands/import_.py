@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, check_name
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
@@ -26,6 +26,9 @@ def import_(
     map: Path | None = opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", None, "--map"),
     guess: bool = opt.flag("Print a first map of a log instead of importing it.", "--guess"),
     episode: int = opt.option("I", "Index of the episode of a log that becomes a trace.", 0, "--episode"),
+    split: str | None = opt.option(
+        "NAME", "train, val or test: split of all episodes of a log. Default: test.", None, "--split"
+    ),
     task: str = opt.TASK_OF_FILES,
 ) -> console.Result:
     """Import a recording or a log as a trace or data set.
@@ -35,7 +38,8 @@ def import_(
 
     Of a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
-    run that the page displays.
+    run that the page displays. Filters are trained and fine-tuned on the episodes of --split train and evaluated on
+    those of val and test.
 
     Formats of logs: NumPy (.npz), CSV, Parquet, MCAP, ROS 2 bags (folder or .db3), Zarr replay buffers (folder or
     .zip), LeRobot data sets (folder, version 3), and Rerun recordings of other programs (.rrd with --map or --guess).
@@ -45,10 +49,12 @@ def import_(
       beliefscope import run.rrd -o run.trace
       beliefscope import log.csv --guess
       beliefscope import log.csv --map map.toml -o log.h5
+      beliefscope import log.csv --map map.toml --split train -o train.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
       beliefscope import log.csv --map map.toml -o run.live
       beliefscope import drive.mcap --map map.toml -o drive.h5
     """
+    from beliefscope.datasets.dataset import SPLITS
     from beliefscope.datasets.store import write_dataset
     from beliefscope.recordings.log_readers.column_map import read_map
     from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
@@ -62,13 +68,16 @@ def import_(
     if output is None:
         raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")
     if source.suffix.lower() in RECORDINGS and map is None:
+        if split is not None:
+            raise BadInput(f"--split is of logs: {source.name} is a recording, whose episode has a split already")
         opt.check_output(output, ".trace", ".live")
         return _written(open_recording(source, task), output)
     if map is None:
         raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
+    check_name("split", split or "test", SPLITS)
     mapping = read_map(map)
     columns = read_columns(source, mapping)
-    episodes = read_log(columns, mapping, source.name)
+    episodes = read_log(columns, mapping, source.name, split or "test")
     if output.suffix != ".h5":
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")

@@ -1,0 +1,76 @@
+"""``beliefscope import``: the split of the episodes of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.store import open_dataset
+from beliefscope.inspect.trace import load_trace
+
+Run = Callable[..., tuple[int, str, str]]
+
+STEPS = 40
+
+MAP = """
+task = "car"
+time = "t"
+episode = "run"
+control = "t"
+[state]
+x = "x"
+y = "y"
+[sensors]
+gps = ["x", "y"]
+[estimate]
+mean = ["x", "y"]
+"""
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A log of three episodes; its map is beside it."""
+    t = np.tile(0.1 * np.arange(STEPS), 3)
+    run = np.repeat(np.arange(3), STEPS)
+    np.savez(tmp_path / "log.npz", t=t, run=run, x=np.sin(t + run), y=np.cos(t + run))
+    (tmp_path / "map.toml").write_text(MAP)
+    return tmp_path / "log.npz"
+
+
+@pytest.mark.parametrize(("option", "expected"), [("", "test"), ("--split train", "train"), ("--split val", "val")])
+def test_the_episodes_are_in_the_selected_split(run: Run, log: Path, option: str, expected: str) -> None:
+    inputs = (log, "--map", log.with_name("map.toml"), "-o")
+    assert run(f"import {option}", *inputs, log.with_name("data.h5"))[0] == 0
+    with open_dataset(log.with_name("data.h5")) as data:
+        assert [episode.split for episode in data] == [expected] * 3
+    assert run(f"import {option} --episode 1", *inputs, log.with_name("run.trace"))[0] == 0
+    assert load_trace(log.with_name("run.trace")).episode.split == expected
+
+
+@pytest.mark.slow
+def test_a_filter_is_trained_on_an_imported_log(run: Run, log: Path) -> None:
+    data = log.with_name("data.h5")
+    for split in ("test", "train"):
+        run(f"import --split {split}", log, "--map", log.with_name("map.toml"), "-o", data)
+        line = "train car --filter unimodal-ekf --preset smoke"
+        code, _, error = run(line, "--data", data, "-o", log.with_name("filter.safetensors"))
+        if split == "test":
+            assert code == 2
+            assert "beliefscope import --split train" in error
+    assert code == 0, error
+
+
+def test_another_split_is_refused(run: Run, log: Path) -> None:
+    output = log.with_name("data.h5")
+    code, _, error = run("import --split validation", log, "--map", log.with_name("map.toml"), "-o", output)
+    assert (code, error) == (2, "error: split 'validation' does not exist. Available: train, val, test.\n")
+    assert not output.exists()
+
+
+def test_a_recording_has_a_split_already(run: Run, tmp_path: Path) -> None:
+    code, _, error = run("import --split train", tmp_path / "run.rrd", "-o", tmp_path / "run.trace")
+    assert code == 2
+    assert error == "error: --split is of logs: run.rrd is a recording, whose episode has a split already\n"
