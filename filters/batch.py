@@ -221,7 +221,7 @@ class Statistics(nn.Module):
         """Computes the statistics of these episodes' steps."""
         rows = steps.rows()
         values = {"state": steps.states, "control": steps.controls, **steps.observations}
-        values = {name: array[rows] for name, array in values.items()}
+        values = {name: array[rows] for name, array in values.items() if array.shape[-1]}  # a task may have no controls
         for name, array in values.items():
             mean, std = self.mean_std(name)
             if array.dtype == torch.uint8:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
@@ -9,6 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+warnings.filterwarnings("ignore", "Initializing zero-element tensors")  # the first layer of no controls
 
 Pooling = Literal["flatten", "spatial-softmax", "mean"]
 Networks = Literal["default", "authors"]
@@ -69,13 +72,14 @@ class Stack(nn.Sequential):
 
     def forward(self, x: Tensor) -> Tensor:
         shape = x.shape[:-1]
+        rows = shape.numel()  # -1 would be ambiguous for vectors without entries, such as no controls
         if not torch.is_grad_enabled():
-            x = self._without_gradients(x.reshape(-1, x.shape[-1]))
+            x = self._without_gradients(x.reshape(rows, x.shape[-1]))
             return x.view(*shape, x.shape[-1])
         for layer in self:
             if not isinstance(layer, nn.ReLU):
                 # With more axes, a layer's output is a view: operations in place on it would copy its gradient.
-                x = x.reshape(-1, x.shape[-1])
+                x = x.reshape(rows, x.shape[-1])
             x = layer(x)
         return x.view(*shape, x.shape[-1])
 

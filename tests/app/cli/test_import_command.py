@@ -51,6 +51,19 @@ def test_the_episodes_are_in_the_selected_split(run: Run, log: Path, option: str
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("error:std")
+@pytest.mark.parametrize("name", ["unimodal-ekf", "unimodal-pf", "lstm"])
+def test_a_filter_is_trained_on_a_log_without_controls(run: Run, log: Path, name: str) -> None:
+    data, checkpoint = log.with_name("data.h5"), log.with_name("filter.safetensors")
+    log.with_name("map.toml").write_text(MAP.replace('control = "t"\n', ""))
+    assert run("import --split train", log, "--map", log.with_name("map.toml"), "-o", data)[0] == 0
+    code, _, error = run(f"train car --filter {name} --preset smoke", "--data", data, "-o", checkpoint)
+    assert code == 0, error
+    inputs = ("--filter", checkpoint, "--data", data)
+    assert run("trace car --episode 0", *inputs, "-o", log.with_name("run.trace"))[0] == 0
+
+
+@pytest.mark.slow
 def test_a_filter_is_trained_on_an_imported_log(run: Run, log: Path) -> None:
     data = log.with_name("data.h5")
     for split in ("test", "train"):
