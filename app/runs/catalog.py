@@ -41,13 +41,14 @@ class TaskCatalog:
     """Filters and data sets of one task by name. The included ones are loaded on first use.
 
     secondary: filters of the user that do not replace the default filter: listed after it, and after the user's
-    other filters.
+    other filters. removed: names of filters that were removed since the server started.
     """
 
     task: Task
     user_filters: dict[str, Checkpoint] = field(default_factory=dict)
     user_data: dict[str, Dataset] = field(default_factory=dict)
     secondary: set[str] = field(default_factory=set)
+    removed: set[str] = field(default_factory=set)
 
     @cached_property
     def filters(self) -> dict[str, Checkpoint]:
@@ -76,16 +77,23 @@ class TaskCatalog:
         (self.secondary.discard if first else self.secondary.add)(name)
         others = {key: value for key, value in self.user_filters.items() if key != name}
         self.user_filters = {name: checkpoint, **others} if first else {**others, name: checkpoint}
+        self.removed.discard(name)
         vars(self).pop("filters", None)
 
     def remove_filter(self, name: str) -> None:
         """Remove one of the user's filters, if it exists."""
-        self.user_filters.pop(name, None)
+        if self.user_filters.pop(name, None) is not None:
+            self.removed.add(name)
         self.secondary.discard(name)
         vars(self).pop("filters", None)
 
     def filter(self, name: str) -> Checkpoint:
-        """Raises BadInput for an unknown name."""
+        """Raises BadInput for an unknown name, and for a filter that was removed."""
+        if name in self.removed and name not in self.filters:
+            raise BadInput(
+                f"filter {name!r} was removed from the saved filters of the workspace; to list it again, save it in "
+                f"the Fine-tune tab. Available: {', '.join(self.filters)}."
+            )
         if name not in self.filters:
             raise unknown_name("filter", name, self.filters)
         return self.filters[name]

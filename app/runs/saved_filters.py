@@ -11,7 +11,7 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.app.workspace.json_files import read_record, write_record
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.checkpoint import load_checkpoint
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 
 FILE = "kept.json"
 
@@ -42,24 +42,28 @@ def with_saved_filters(settings: Settings) -> Settings:
     first = {saved.name: Path(saved.path) for saved in filters if saved.default}
     last = {saved.name: Path(saved.path) for saved in filters if not saved.default}
     checkpoints, secondary = {**first, **settings.checkpoints, **last}, last.keys() - settings.checkpoints.keys()
-    return replace(settings, checkpoints=checkpoints, secondary=frozenset(secondary)) if filters else settings
+    names = frozenset(checkpoints.keys() - settings.checkpoints.keys())
+    return replace(settings, checkpoints=checkpoints, secondary=frozenset(secondary), saved=names)
 
 
 def refresh_saved_filters(store: TraceStore) -> None:
-    """Add filters that another server of the workspace has saved, and remove those whose checkpoint was deleted."""
-    settings = store.settings
-    runs = FineTuneRuns(settings.workspace)
-    for name, path in settings.checkpoints.items():
-        if not isinstance(path, Path) or path.is_file():
-            continue
-        if runs.folder(path.parent.name).resolve() == path.parent.resolve():  # not a file that was given to the server
-            for task in store.tasks():
-                if name in store.filters(task):
-                    store.remove_filter(task, name)
-    for saved in read_saved_filters(settings.workspace):
+    """Add filters that another server of the workspace has saved, and remove filters that left its list.
+
+    Filters whose checkpoint was deleted are removed as well. A list that cannot be read changes nothing.
+    """
+    try:
+        listed = _read(store.settings.workspace)
+    except BadInput:
+        return
+    names = {(saved.task, saved.name) for saved in listed}
+    for task in store.tasks():
+        for name in store.settings.saved & store.filters(task).keys():
+            if (task, name) not in names:
+                store.remove_filter(task, name)
+    for saved in listed:
         with suppress(BadInput):  # damaged, or of a task that this server does not have
             if saved.name not in store.filters(saved.task):
-                store.add_filter(saved.task, saved.name, load_checkpoint(Path(saved.path)), first=saved.default)
+                _add(store, saved, load_checkpoint(Path(saved.path)))
 
 
 def save_filter(store: TraceStore, new: SavedFilter) -> None:
@@ -70,8 +74,9 @@ def save_filter(store: TraceStore, new: SavedFilter) -> None:
     others = [saved for saved in _read(store.settings.workspace) if (saved.task, saved.name) != (new.task, new.name)]
     if new.default:
         others = [replace(saved, default=saved.default and saved.task != new.task) for saved in others]
-    store.add_filter(new.task, new.name, load_checkpoint(Path(new.path)), first=new.default)
-    write_record([new, *others], store.settings.workspace / FILE)
+    checkpoint = load_checkpoint(Path(new.path))
+    write_record([new, *others], store.settings.workspace / FILE)  # first: a page that is loading removes other filters
+    _add(store, new, checkpoint)
 
 
 def remove_filter(store: TraceStore, task: str, name: str) -> None:
@@ -80,6 +85,10 @@ def remove_filter(store: TraceStore, task: str, name: str) -> None:
     others = [saved for saved in _read(workspace) if (saved.task, saved.name) != (task, name)]
     write_record(others, workspace / FILE)  # first: a page that is loading adds the filters of the list
     store.remove_filter(task, name)
+
+
+def _add(store: TraceStore, saved: SavedFilter, checkpoint: Checkpoint) -> None:
+    store.add_filter(saved.task, saved.name, checkpoint, first=saved.default, saved=True)
 
 
 def _read(workspace: Path) -> list[SavedFilter]:

@@ -24,6 +24,7 @@ class Settings:
         checkpoints: displayed name -> checkpoint file or external filter; listed before the pretrained filters, of
             which it replaces those with the same name.
         secondary: names of checkpoints that are listed after the default filter of their task.
+        saved: names of checkpoints that are from the workspace's list of saved filters.
         hosts: additional host names that the server answers to.
         views: maximum number of pages open at a time.
         tasks: user-defined tasks, as accepted by ``load_task``.
@@ -41,6 +42,7 @@ class Settings:
     studies: Mapping[str, Path] = field(default_factory=dict)
     sweeps: Mapping[str, Path] = field(default_factory=dict)
     secondary: frozenset[str] = frozenset()
+    saved: frozenset[str] = frozenset()
 
     @property
     def definitions(self) -> list[Task]:

@@ -238,19 +238,24 @@ class TraceStore:
             catalog = self._catalog(task)
             return name or next(iter(catalog.data)), catalog.dataset(name)
 
-    def add_filter(self, task: str, name: str, checkpoint: Checkpoint, first: bool) -> None:
-        """Add a filter to the catalog and the settings, so that jobs find it by its name."""
+    def add_filter(self, task: str, name: str, checkpoint: Checkpoint, first: bool, saved: bool = False) -> None:
+        """Add a filter to the catalog and the settings, so that jobs find it by its name.
+
+        saved: whether it is from the list of saved filters.
+        """
         with self._lock:
             self._catalog(task).add_filter(name, checkpoint, first)
             source = checkpoint.path or checkpoint
-            self.settings = replace(self.settings, checkpoints={**self.settings.checkpoints, name: source})
+            checkpoints = {**self.settings.checkpoints, name: source}
+            names = self.settings.saved | ({name} if saved else set())
+            self.settings = replace(self.settings, checkpoints=checkpoints, saved=names)
 
     def remove_filter(self, task: str, name: str) -> None:
         """Remove a filter from the catalog and the settings."""
         with self._lock:
             self._catalog(task).remove_filter(name)
             others = {key: source for key, source in self.settings.checkpoints.items() if key != name}
-            self.settings = replace(self.settings, checkpoints=others)
+            self.settings = replace(self.settings, checkpoints=others, saved=self.settings.saved - {name})
 
     def close(self) -> None:
         """Stop the computations and close the data sets."""
@@ -375,6 +380,11 @@ def _run_in_worker(worker: TraceWorker, request: RunRequest, progress: Callable[
         with suppress(BadInput):
             return load_trace(path)
         path.unlink()
+    if not request.external and not Path(request.checkpoint).is_file():
+        raise BadInput(
+            f"filter {request.filter!r} cannot run: its checkpoint {request.checkpoint!r} was deleted or moved; reload "
+            "the page and select another filter"
+        )
     worker.run(request, progress)
     try:
         return load_trace(path)

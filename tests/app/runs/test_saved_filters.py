@@ -11,11 +11,15 @@ from beliefscope.app.runs.saved_filters import (
     SavedFilter,
     read_saved_filters,
     refresh_saved_filters,
+    remove_filter,
     save_filter,
     with_saved_filters,
 )
+from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_worker import TraceWorker
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.filters.checkpoint import shipped
 
@@ -62,6 +66,51 @@ def test_another_server_of_the_workspace_follows_the_list(tmp_path: Path, defaul
         refresh_saved_filters(server)
         assert [*server.filters("push")] == before
         assert "tuned" not in server.settings.checkpoints
+
+
+def test_a_filter_that_another_server_removed_is_not_listed(tmp_path: Path) -> None:
+    """Its checkpoint is kept, and a filter of the same folder that was given to the server stays."""
+    new = saved(tmp_path, default=True)
+    given = {"mine": Path(shutil.copy(new.path, Path(new.path).with_name("copy.safetensors")))}
+    store = TraceStore(Settings(tmp_path))
+    save_filter(store, new)
+    other = TraceStore(with_saved_filters(Settings(tmp_path, checkpoints=given)))
+    third = TraceStore(Settings(tmp_path))
+    refresh_saved_filters(third)
+    remove_filter(store, "push", "tuned")
+    for server, expected in ((other, ["mine"]), (third, [])):
+        assert "tuned" in server.filters("push")
+        server.checkpoint("push", "tuned")
+        refresh_saved_filters(server)
+        assert [*server.settings.checkpoints] == expected
+        assert "tuned" not in server.filters("push")
+        with pytest.raises(BadInput, match=r"filter 'tuned' was removed from the saved filters .* Available: "):
+            server.checkpoint("push", "tuned")
+    save_filter(store, new)
+    refresh_saved_filters(other)
+    assert other.checkpoint("push", "tuned").hash == store.checkpoint("push", "tuned").hash
+
+
+def test_an_unreadable_list_removes_no_filter(tmp_path: Path) -> None:
+    store = TraceStore(Settings(tmp_path))
+    save_filter(store, saved(tmp_path, default=False))
+    (tmp_path / "kept.json").write_text("[")
+    refresh_saved_filters(store)
+    assert "tuned" in store.filters("push")
+
+
+def test_the_message_of_a_deleted_checkpoint_names_the_filter_and_the_next_step(tmp_path: Path) -> None:
+    worker = TraceWorker()
+    store = TraceStore(Settings(tmp_path), worker)
+    new = saved(tmp_path, default=False)
+    try:
+        save_filter(store, new)
+        worker.start()
+        Path(new.path).unlink()
+        with pytest.raises(BadInput, match=r"filter 'tuned' cannot run: .* was deleted or moved; reload the page"):
+            store.request(Selection("push", "tuned", 0)).future.result(60.0)
+    finally:
+        store.close()
 
 
 def test_a_damaged_checkpoint_of_another_server_is_not_listed(tmp_path: Path) -> None:
