@@ -63,20 +63,57 @@ def shipped(task: str | Task, name: str) -> Path:
     return paths[name]
 
 
+def check_trainable(definition: Task, task: str, text: str) -> None:
+    """Raise BadInput if ``train`` has no filter of this name, such as for a file or an external filter.
+
+    definition: of the task. task: its name or source on the command line. text: the filter.
+    """
+    names = filter_names(definition)
+    if text in names:
+        return
+    is_external = text.endswith(".py") or is_code(text)
+    if not (is_external or is_path(text)):
+        raise unknown_name("filter", text, names)
+    file = text.rpartition(":")[0] if is_code(text) else text
+    if (file.endswith(".py") or is_path(file)) and not Path(file).is_file():
+        problem = f"is no filter that this command trains, and no file {file!r} exists"
+    elif is_external:
+        source = text if is_code(text) else f"{text}:{_build_function(_functions(text))}"
+        problem = "is an external filter, which this command does not train; fine-tune it: "
+        problem += f"beliefscope finetune {task} --filter {source} -o finetuned.safetensors (docs/finetune.md)"
+    elif text.endswith(".safetensors"):
+        problem = f"is a checkpoint; fine-tune it: beliefscope finetune {text} -o finetuned.safetensors"
+    else:
+        problem = "is no filter that this command trains"
+    raise BadInput(f"filter {text!r} {problem}. Filters that can be trained: {', '.join(names)}.")
+
+
 def check_not_source(text: str) -> None:
     """Raise BadInput for the path of a Python file without the name of a function. The file is read, not run."""
     if not text.endswith(".py"):
         return
-    functions: list[str] = []
-    with suppress(OSError, ValueError, SyntaxError):
-        body = ast.parse(Path(text).read_bytes()).body
-        public = (node for node in body if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"))
-        functions = [node.name for node in public if _is_callable(node.args)]
+    if not Path(text).is_file():
+        raise BadInput(f"filter {text!r} does not exist: expected a file and its function, such as {text}:build.")
+    functions = _functions(text)
     listed = f" Functions without arguments: {', '.join(functions)}." if functions else ""
-    function = "build" if "build" in functions or not functions else functions[0]
+    function = _build_function(functions)
     raise BadInput(
         f"filter {text!r} is a Python file: add the function that returns the filter, {text}:{function}.{listed}"
     )
+
+
+def _functions(path: str) -> list[str]:
+    """Names of the public functions of a Python file without required arguments; none for other files."""
+    with suppress(OSError, ValueError, SyntaxError):
+        body = ast.parse(Path(path).read_bytes()).body
+        public = (node for node in body if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"))
+        return [node.name for node in public if _is_callable(node.args)]
+    return []
+
+
+def _build_function(functions: list[str]) -> str:
+    """The function that probably returns the filter: ``build``, or the first one."""
+    return "build" if "build" in functions or not functions else functions[0]
 
 
 def _is_callable(arguments: ast.arguments) -> bool:

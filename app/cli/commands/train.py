@@ -1,7 +1,15 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
+
+if TYPE_CHECKING:
+    from beliefscope.datasets.episode import Episode
+    from beliefscope.datasets.task import Task
 
 ARCHITECTURES = (
     "{crossmodal,information,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf, lstm or transformer "
@@ -39,6 +47,11 @@ def train(
     """
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.faults.injection import faulty_copies, read_faults
+    from beliefscope.filters.names import check_trainable
+
+    opt.check_folder(log, "--log")
+    target = load_task(opt.definition_of(task, data))
+    check_trainable(target, task, filter)
     from beliefscope.filters.catalog import architecture
     from beliefscope.filters.checkpoint import save_checkpoint
     from beliefscope.filters.training.plan import BLACKOUTS, PLANS, parse_blackouts
@@ -46,8 +59,6 @@ def train(
     from beliefscope.inspect.healthy import measure_profile
     from beliefscope.recordings.rerun_log.training_curves import log_losses
 
-    opt.check_folder(log, "--log")
-    target = load_task(opt.definition_of(task, data))
     settings = architecture(target, filter, networks)
     probabilities = parse_blackouts(blackouts)
     check_name("preset", preset, PLANS)
@@ -65,11 +76,8 @@ def train(
             write("training", stage, step, loss)
 
         episodes = list(dataset)
-        if data is None and target.simulate is not None and all(episode.split != "train" for episode in episodes):
-            raise BadInput(
-                f"the sample set of {target.name} has no training episodes; collect some, beliefscope collect "
-                f"{target.name} -o {target.name}.h5, and train with --data {target.name}.h5"
-            )
+        if data is None:
+            _check_sample(target, episodes)
         trained = train_filter(
             settings,
             episodes + (faulty_copies(injected, episodes, seed) if injected else []),
@@ -90,3 +98,12 @@ def train(
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
     return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, lines)
+
+
+def _check_sample(task: Task, episodes: Sequence[Episode]) -> None:
+    """Raise BadInput for a sample set without training episodes, if some can be simulated."""
+    if task.simulate is not None and all(episode.split != "train" for episode in episodes):
+        raise BadInput(
+            f"the sample set of {task.name} has no training episodes; collect some, beliefscope collect "
+            f"{task.name} -o {task.name}.h5, and train with --data {task.name}.h5"
+        )
