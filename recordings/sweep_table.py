@@ -109,8 +109,13 @@ def _type(name: str) -> pa.DataType:
 
 
 def write_tables(cells: Sequence[Cell], folder: Path) -> None:
-    """Join the rows of finished cells in the order of the cells, in constant memory, and describe the checkpoints."""
+    """Join the rows of finished cells in the order of the cells, in constant memory, and describe the checkpoints.
+
+    Raises BadInput for a deleted file of a cell.
+    """
     files = [_file(cell, folder) for cell in cells]
+    if deleted := [str(file) for file in files if not file.is_file()]:
+        raise BadInput(f"{deleted[0]} was deleted while the sweep ran; run the same command again to restore it")
     names = dict.fromkeys(name for file in files for name in pq.read_schema(file).names)
     schema = pa.schema([(name, _type(name)) for name in names])
     temporary = folder / f".{RESULTS}.parquet.partial"
@@ -220,9 +225,7 @@ class Experiments:
         Raises BadInput for a folder without results, and for damaged ones.
         """
         self.folders = tuple(dict.fromkeys(Path(folder).resolve() for folder in folders))
-        for folder in self.folders:
-            if not (folder / f"{RESULTS}.parquet").is_file():
-                raise BadInput(f"{folder} has no results of a sweep; write them: beliefscope sweep ... -o {folder}")
+        self._check_files()
         self._database = duckdb.connect(config={"autoinstall_known_extensions": False})
         for table in TABLES:
             files = [str(folder / f"{table}.parquet") for folder in self.folders]
@@ -234,19 +237,46 @@ class Experiments:
                     rows = self._database.sql(f"SELECT DISTINCT ON ({KEYS[table]}) * FROM rows")
                 rows.create_view(table)
             except duckdb.Error as error:
-                raise BadInput(f"damaged results of a sweep: {error}") from None
+                raise BadInput(
+                    f"damaged results of a sweep: {error}; delete this file and run the sweep again, which keeps the "
+                    "finished cells"
+                ) from None
         paths = [str(folder) for folder in self.folders]
         self._database.execute(f"SET allowed_directories={paths}")
         self._database.execute("SET enable_external_access=false")
         self._database.execute("SET lock_configuration=true")
 
+    def _check_files(self) -> None:
+        """Raise BadInput with the first missing file and the next step."""
+        for folder in self.folders:
+            command = f"beliefscope sweep --checkpoints ... -o {folder}"
+            for table in TABLES:
+                if (folder / f"{table}.parquet").is_file():
+                    continue
+                if table == RESULTS:
+                    missing = f"{table}.parquet is missing" if folder.is_dir() else "there is no such folder"
+                    raise BadInput(f"{folder} has no results of a sweep: {missing}; write them: {command}")
+                raise BadInput(
+                    f"{folder} has results of a sweep, but {table}.parquet is missing; run the sweep again, which "
+                    f"keeps the finished cells: {command}"
+                )
+
+    def _rows(self, sql: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """The rows of a query of this class. Raises BadInput for a file that was deleted since they were opened."""
+        try:
+            return self._database.execute(sql, parameters).fetchall()
+        except duckdb.Error:
+            self._check_files()
+            raise
+
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
-        """The result of a query. Raises BadInput with the message of the database."""
+        """The result of a query. Raises BadInput with the message of the database, or with a deleted file."""
         try:
             if len(self._database.extract_statements(sql)) > 1:
                 raise BadInput(f"query {sql!r} has several statements, expected one SELECT.")
             relation = self._database.sql(sql, params=list(parameters))
         except duckdb.Error as error:
+            self._check_files()
             raise BadInput(f"query {sql!r}: {str(error).strip()}") from None
         if relation is None:  # no statement, or one without a result
             raise BadInput(f"query {sql!r} has no result; write one that starts with SELECT")
@@ -267,14 +297,12 @@ class Experiments:
 
     def phases(self) -> list[str]:
         """Names of the phases of all results."""
-        return [
-            name for (name,) in self._database.execute(f"SELECT DISTINCT phase FROM {RESULTS} ORDER BY 1").fetchall()
-        ]
+        return [name for (name,) in self._rows(f"SELECT DISTINCT phase FROM {RESULTS} ORDER BY 1")]
 
     def provenance_keys(self) -> list[str]:
         """Keys of the provenance of all checkpoints, in alphabetical order."""
         keys = f"SELECT DISTINCT unnest(json_keys(provenance)) FROM {CHECKPOINTS} ORDER BY 1"
-        return [name for (name,) in self._database.execute(keys).fetchall()]
+        return [name for (name,) in self._rows(keys)]
 
     def episodes(self, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> pa.Table:
         """The results of one checkpoint by episode and seed, largest error first."""
@@ -303,8 +331,11 @@ class Experiments:
             return trace(checkpoint, data[row["episode"]], row["episode"], row["seed"], particles, faults)
 
     def path(self, table: str, column: str, value: str) -> Path:
-        """File of a checkpoint or data set with this hash. Raises BadInput for an unknown hash."""
-        row = self._database.execute(f"SELECT path FROM {table} WHERE {column} = ?", [value]).fetchone()
-        if row is None:
+        """File of a checkpoint or data set with this hash. Raises BadInput for an unknown hash or a missing file."""
+        rows = self._rows(f"SELECT path FROM {table} WHERE {column} = ?", [value])
+        if not rows:
             raise BadInput(f"no {column} with hash {value[:12]} in these sweeps")
-        return Path(row[0])
+        path = Path(rows[0][0])
+        if not path.exists():
+            raise BadInput(f"{column} {str(path)!r} was deleted or moved after the sweep; move it back")
+        return path

@@ -22,7 +22,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.sweep import Inputs, describe_checkpoint, summary
 from beliefscope.inspect.trace import trace
-from beliefscope.recordings.sweep_table import RESULTS, Experiments, is_finished, run_sweep
+from beliefscope.recordings.sweep_table import RESULTS, TABLES, Experiments, is_finished, run_sweep, write_tables
 
 pytestmark = pytest.mark.slow
 
@@ -201,6 +201,49 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
         assert message in error
         assert error.count("\n") == 1
     assert "has no results of a sweep" in run("experiments", tmp_path)[2]
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_missing_table_is_named_with_the_next_step(sweep: Path, run: Run, tmp_path: Path, table: str) -> None:
+    """Before the tables are opened, and when one is deleted afterwards."""
+    folder = Path(shutil.copytree(sweep, tmp_path / "sweep"))
+    tables = Experiments([folder])
+    (folder / f"{table}.parquet").unlink()
+    command = f"beliefscope sweep --checkpoints ... -o {folder}\n"
+    for line in ("experiments", "serve --port 0 --sweep"):
+        code, _, error = run(line, folder)
+        assert code == 2
+        assert f"{table}.parquet is missing; " in error
+        assert error.endswith(command)
+    with pytest.raises(BadInput, match=rf"{table}\.parquet is missing"):
+        tables.query(f"SELECT * FROM {table}")
+    if table == RESULTS:
+        with pytest.raises(BadInput, match=r"results\.parquet is missing"):
+            tables.phases()
+
+
+def test_a_damaged_table_is_named_with_the_next_step(sweep: Path, run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(sweep, tmp_path / "sweep"))
+    (folder / "results.parquet").write_text("x")
+    code, _, error = run("experiments", folder)
+    assert code == 2
+    assert "results.parquet" in error
+    assert "delete this file and run the sweep again" in error
+
+
+def test_a_deleted_file_of_a_cell_or_checkpoint_is_named(inputs: Inputs, sweep: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(sweep, tmp_path / "sweep"))
+    file = next((folder / "cells").glob("*/*.parquet"))
+    file.unlink()
+    with pytest.raises(BadInput, match=f"{file.name} was deleted while the sweep ran; run the same command again"):
+        write_tables(inputs.cells(BLOCK), folder)
+    checkpoint = Path(shutil.copy(inputs.checkpoints[0], tmp_path / "moved.safetensors"))
+    run_sweep(replace(inputs, checkpoints=(checkpoint,), faults=("",)).cells(BLOCK), tmp_path / "other")
+    checkpoint.unlink()
+    with pytest.raises(BadInput, match=r"moved\.safetensors' was deleted or moved after the sweep"):
+        Experiments([tmp_path / "other"]).path(
+            "checkpoints", "checkpoint", describe_checkpoint(checkpoint)["checkpoint"]
+        )
 
 
 def test_unusable_inputs(inputs: Inputs, run: Run, tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ def test_names_of_checkpoints_are_valid_in_another_server(
         with open_client(new_server) as client:
             (problem,) = catalog(client)[1]
             assert problem.startswith(f"filter '{name}' of sweep 'mine': checkpoint")
-            assert problem.endswith("mine.safetensors' does not exist")
+            assert problem.endswith("mine.safetensors' was deleted or moved after the sweep; move it back")
     finally:
         file.write_bytes(content)
 
