@@ -25,7 +25,7 @@ from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
-from beliefscope.filters.external.load import UnavailableFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.traces.live_run import LiveRun
 from beliefscope.inspect.traces.sensors import camera_images
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -303,6 +304,19 @@ def definition_of(task: str, path: Path | None) -> Task | str:
         return task
     with open_dataset(path) as data:
         return data.task if data.task.name == task else task
+
+
+def own_definitions(paths: Iterable[Path]) -> dict[str, Task]:
+    """Name -> task of the data sets whose task is not shipped. Files that cannot be read have none."""
+    from beliefscope.datasets.catalog import TASKS
+    from beliefscope.datasets.store import open_dataset
+
+    tasks: dict[str, Task] = {}
+    for path in paths:
+        with suppress(BadInput), open_dataset(path) as data:
+            if data.task.name not in TASKS:
+                tasks.setdefault(data.task.name, data.task)
+    return tasks
 
 
 def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:

@@ -23,7 +23,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import UnavailableFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, missing_quantities, no_maps
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.trace import Trace

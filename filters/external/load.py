@@ -137,6 +137,9 @@ class ExternalFilter(Checkpoint):
         unknown = torch.full((count, n, n), torch.nan)
         return Gaussian(values.get("estimate_mean", unknown[..., 0]), values.get("estimate_covariance", unknown))
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.name} of task {self.task.name}, {self.hash[:12]}>"
+
     def run(
         self,
         episodes: Sequence[Episode],
@@ -322,20 +325,9 @@ class ExternalFilter(Checkpoint):
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)
 
 
-class UnavailableFilter(ExternalFilter):
-    """Stands for the filter of a live run that this server does not have. It can be drawn, but not run."""
-
-    def __init__(self, name: str, hash_: str, task: Task) -> None:
-        values = {"name": name, "record": {}, "hash": hash_, "source": name}
-        for key, value in (values | {"_task": task}).items():
-            object.__setattr__(self, key, value)  # checkpoints are frozen
-
-    def run(self, *_: Any, **__: Any) -> Any:
-        """Raises BadInput."""
-        raise BadInput(f"this server has only a live run of filter {self.name!r}; add the filter with --filter")
-
-
-def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()) -> ExternalFilter:
+def load_external(
+    source: str, task: str | Task = "", given: Sequence[Task] = (), named: Sequence[Task] = ()
+) -> ExternalFilter:
     """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` returns when called without arguments.
 
     The global generators of torch and NumPy are seeded for the call. ``NAME@FILE.safetensors`` loads weights into the
@@ -343,7 +335,7 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
 
     Args:
         task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.
-        given: user-defined tasks that the filter may name.
+        given: user-defined tasks that the filter may name. named: further ones, which are never the default.
 
     Raises:
         BadInput: the name does not exist, the call fails or does not return a filter, or the task differs.
@@ -367,16 +359,22 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
     if weights:
         load_weights(result.module if isinstance(result, Adapter) else result, Path(weights), place)
     names = [Path(place).stem if place.endswith(".py") else place, attribute, Path(weights).stem]
-    return as_external(result, source, task, given, "-".join(filter(None, names)))
+    return as_external(result, source, task, given, "-".join(filter(None, names)), named)
 
 
 def as_external(
-    filter_: object, source: str, task: str | Task = "", given: Sequence[Task] = (), name: str = ""
+    filter_: object,
+    source: str,
+    task: str | Task = "",
+    given: Sequence[Task] = (),
+    name: str = "",
+    named: Sequence[Task] = (),
 ) -> ExternalFilter:
     """A filter of another project, or an ``Adapter`` of one, as a checkpoint.
 
     Args:
-        source: its origin, for messages and the hash. task, given: as for ``load_external``. name: default: the source.
+        source: its origin, for messages and the hash. task, given, named: as for ``load_external``.
+        name: default: the source.
 
     Raises BadInput if it is not a filter, or if it does not fit the task.
     """
@@ -389,7 +387,8 @@ def as_external(
     loaded = load_task(task) if task else None
     own = adapter.task or getattr(adapter.module, "task", "")
     if isinstance(own, str | Task) and own:
-        own_task = next((t for t in (loaded, *given) if t is not None and t.name == own), None) or load_task(own)
+        tasks = (*filter(None, [loaded]), *given, *named)
+        own_task = next((t for t in tasks if t.name == own), None) or load_task(own)
         if loaded is not None and (other := difference(loaded, own_task)):
             raise BadInput(f"filter {source!r} is for {other}, not for {loaded.name!r}")
         loaded = loaded or own_task

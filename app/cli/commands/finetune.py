@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -122,7 +123,11 @@ def finetune(
         raise BadInput(f"--rerun {rerun!r} requires --log DIR")
     if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
-    base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
+    base = (
+        load_checkpoint(Path(target))
+        if filter is None
+        else open_filter(opt.definition_of(target, learning.data), filter)
+    )
     settings, data = learning.settings(base), learning.data
     with opt.open_episodes(base.task, data, learning.skip_bad) as episodes:
         members, data_hash = _training_episodes(episodes, data, output.parent)
@@ -130,7 +135,7 @@ def finetune(
         partial = output.with_name(f"{output.name}.partial")  # from which an interrupted run resumes
         source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
-            return _external(base, members, output, source)
+            return _external(base, members, output, source, data)
         with _progress(base, partial, log, rerun) as callbacks:
             tuned = tune(base, members, callbacks=callbacks, **source)
         assert tuned is not None, "runs without a stop callback always complete"
@@ -181,8 +186,13 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: 
         yield Callbacks(report, on_validation, on_resume)
 
 
-def _external(base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any]) -> console.Result:
-    """Fine-tune the module of an external filter on its own loss. source: other arguments of ``finetune_external``."""
+def _external(
+    base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any], data: Path | None
+) -> console.Result:
+    """Fine-tune the module of an external filter on its own loss.
+
+    source: other arguments of ``finetune_external``. data: file of the episodes, for the suggested command.
+    """
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.external.weights import save_weights
     from beliefscope.filters.finetuning.external import finetune_external, loss_of
@@ -194,7 +204,9 @@ def _external(base: ExternalFilter, episodes: list[Episode], output: Path, sourc
     save_weights(tensors, output)
     tuned = f"{base.source.partition('@')[0]}@{output}"
     digest = load_external(tuned, base.task).hash
-    lines = [*_summary(record), "", f"beliefscope change {base.source} {tuned} --task {base.task.name}"]
+    command = ["beliefscope", "change", base.source, tuned, "--task", base.task.name]
+    command += ["--data", str(data)] if data else []
+    lines = [*_summary(record), "", shlex.join(command)]
     return opt.checkpoint_result(output, base.task.name, base.name, digest, record, lines)
 
 

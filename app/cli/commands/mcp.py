@@ -28,8 +28,9 @@ def mcp(
     from beliefscope.app.server.assistant import Assistant, build_server
     from beliefscope.datasets.catalog import load_task
 
-    checkpoints = filters_of_command_line(filter or (), task or ())
-    tasks = [load_task(name) for name in task or ()]
+    checkpoints = filters_of_command_line(filter or (), task or (), data or ())
+    own = opt.own_definitions(data or ())
+    tasks = [own.get(name) or load_task(name) for name in task or ()]
     catalogs, problems = task_catalogs(checkpoints, short_names(data or (), {SAMPLE}), tasks)
     if problems:
         raise BadInput("; ".join(problems))

@@ -74,11 +74,11 @@ def serve(
     settings = Settings(
         workspace=workspace,
         data=short_names(data or (), {SAMPLE}),
-        checkpoints=filters_of_command_line(filter or (), task or ()),
+        checkpoints=filters_of_command_line(filter or (), task or (), data or ()),
         hosts=(*host_names(host), *(allow_host or ())),
         seed=seed,
         views=views,
-        tasks=tuple(task or ()),
+        tasks=tuple(name for name in task or () if name not in opt.own_definitions(data or ())),
         studies=short_names(study or (), {SHIPPED}),
         sweeps=short_names(sweep or ()),
     )
@@ -113,20 +113,27 @@ def serve_page(
         signal.signal(number, signal.SIG_IGN)  # the server has stopped; do not interrupt interpreter shutdown
 
 
-def filters_of_command_line(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path | Checkpoint]:
-    """Displayed name -> checkpoint file or external filter; the page opens the first one."""
+def filters_of_command_line(
+    filters: Sequence[str], tasks: Sequence[str], data: Sequence[Path] = ()
+) -> dict[str, Path | Checkpoint]:
+    """Displayed name -> checkpoint file or external filter; the page opens the first one.
+
+    tasks: names, definitions in files, or names that the data define. data: files whose tasks the filters may name.
+    """
     from beliefscope.app.runs.catalog import PRETRAINED, short_names
     from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.names import is_code
 
-    given = [load_task(name) for name in tasks]
+    needed = any(map(is_code, filters)) or any(":" not in name for name in tasks)
+    own = opt.own_definitions(data) if needed else {}
+    given = [own.get(name) or load_task(name) for name in tasks]
     files = short_names((Path(name) for name in filters if not is_code(name)), PRETRAINED)
     names = {path.resolve(): name for name, path in files.items()}
     checkpoints: dict[str, Path | Checkpoint] = {}
     for text in filters:
         if is_code(text):
-            external = load_external(text, given=given)
+            external = load_external(text, given=given or list(own.values()), named=list(own.values()))
             checkpoints[external.name] = external
         else:
             name = names[Path(text).resolve()]

@@ -14,6 +14,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server import timeouts
 from beliefscope.app.server.main import create_app
 from beliefscope.app.server.timeouts import HTTPProtocol
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+from beliefscope.filters.external.load import ExternalFilter
 
 pytestmark = pytest.mark.slow
 
@@ -100,6 +104,34 @@ def test_filters_keep_their_order(tmp_path: Path) -> None:
     filters = filters_of_command_line([str(tmp_path / "b.safetensors"), code, str(tmp_path / "a.safetensors")], [])
     assert [type(source).__name__ for source in filters.values()] == ["PosixPath", "ExternalFilter", "PosixPath"]
     assert [name for name in filters if len(name) == 1] == ["b", "a"]
+
+
+OWN = """
+def build(): return lambda *, observations, controls: controls[..., :2]
+def named():
+    def still(*, observations, controls): return controls[..., :2]
+    still.task = "own"
+    return still
+"""
+
+
+def test_data_define_the_task_of_filters(tmp_path: Path) -> None:
+    """As for all other commands: the name is enough where the data contain the definition."""
+    with open_dataset(sample_path("push")) as sample:
+        own = replace(sample.task, name="own")
+        write_dataset(tmp_path / "own.h5", own, [replace(sample[0], task=own)])
+    code = tmp_path / "own_filters.py"
+    code.write_text(OWN)
+    for function in ("build", "named"):
+        for tasks in ([], ["own"]):
+            (external,) = filters_of_command_line([f"{code}:{function}"], tasks, [tmp_path / "own.h5"]).values()
+            assert isinstance(external, ExternalFilter)
+            assert external.task.name == "own"
+    (external,) = filters_of_command_line([f"{code}:named"], ["push"], [tmp_path / "own.h5"]).values()
+    assert isinstance(external, ExternalFilter)
+    assert external.task.name == "own"
+    with pytest.raises(BadInput, match="task 'other' does not exist"):
+        filters_of_command_line([f"{code}:build"], ["other"], [tmp_path / "own.h5"])
 
 
 def test_workspace_is_private(settings: Settings) -> None:

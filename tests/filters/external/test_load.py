@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,3 +155,23 @@ def test_a_python_file_without_a_function_is_refused_with_its_functions(
 @pytest.mark.parametrize(("value", "name"), [(3, "an int"), (None, "a NoneType"), (nn.ReLU(), "a ReLU")])
 def test_type_name_has_its_article(value: object, name: str) -> None:
     assert type_name(value) == name
+
+
+def test_filter_has_a_short_text(episode: Episode) -> None:
+    """A session prints what ``load_filter`` returns; the fields of a trained checkpoint are not available."""
+
+    def still(*, observations: dict[str, Any], controls: Any) -> Any:
+        return controls[..., :3]
+
+    external = as_external(still, "still", episode.task)
+    assert repr(external) == f"<ExternalFilter: still of task door, {external.hash[:12]}>"
+
+
+def test_named_tasks_are_not_the_default(tmp_path: Path) -> None:
+    own = replace(DOOR, name="own")
+    path = tmp_path / "own_filter.py"
+    path.write_text(FILE.format(value=0).replace("'push'", "'own'").replace('"push"', '"own"'))
+    assert load_external(f"{path}:other", given=[DOOR], named=[own]).task.name == "own"
+    assert load_external(f"{path}:build", given=[DOOR], named=[own]).task.name == "door"
+    with pytest.raises(BadInput, match=r"does not name its task"):
+        load_external(f"{path}:build", named=[own])

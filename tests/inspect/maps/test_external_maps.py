@@ -16,7 +16,8 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.likelihood import log_likelihood
-from beliefscope.filters.external.load import ExternalFilter, UnavailableFilter
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.likelihood import MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, trace
 
