@@ -8,6 +8,9 @@ from pathlib import Path
 LONG_LIST = 12
 """Names that a reader compares at a glance."""
 
+MAX_LISTED = 60
+"""Names of an error. Tables can have thousands of columns."""
+
 
 class BadInput(ValueError):
     """An error the user can fix: an invalid name, file, shape or value.
@@ -29,12 +32,14 @@ def check_name(kind: str, name: str, available: Container[str]) -> None:
 def unknown_name(kind: str, name: str, available: object) -> BadInput:
     """Return the error for an unknown name: ``filter 'crosmodal-pf' does not exist. Available: ...``.
 
-    A long list is preceded by the most similar names.
+    A long list is preceded by the most similar names, and ends after ``MAX_LISTED``.
     """
     names = [str(a) for a in available]  # type: ignore[attr-defined]
     similar = get_close_matches(name, names, n=2) if len(names) > LONG_LIST else []
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
-    return BadInput(f"{kind} {name!r} does not exist.{hint} Available: {', '.join(names) or 'none'}.")
+    more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+    listed = ", ".join(names[:MAX_LISTED]) or "none"
+    return BadInput(f"{kind} {name!r} does not exist.{hint} Available: {listed}{more}.")
 
 
 def type_name(value: object) -> str:

@@ -15,6 +15,7 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.recordings.log_readers.arrays import Columns, check_downloaded
 from beliefscope.recordings.log_readers.column_map import ELEMENTS, ColumnMap, base_name
 from beliefscope.recordings.log_readers.messages import Preview, on_clock, preview
+from beliefscope.recordings.log_readers.table_folder import TABLES, table_files
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
@@ -76,7 +77,12 @@ def _reader(path: Path) -> str:
         for name, reader in FOLDERS.items():
             if (path / name).is_file():
                 return reader
-        raise BadInput(f"folder {path.name} has none of {', '.join(FOLDERS)}: not a ROS 2 bag, LeRobot or Zarr data")
+        if table_files(path):
+            return "table_folder"
+        raise BadInput(
+            f"folder {path.name} has none of {', '.join(FOLDERS)}, and no files {', '.join(TABLES)}: not a ROS 2 bag, "
+            "LeRobot or Zarr data, or one table per episode"
+        )
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         other = "; HDF5 files are read by `beliefscope convert`" if suffix in HDF5 else ""

@@ -54,8 +54,11 @@ def _table(columns: Columns) -> list[str]:
     mean = [n for n in _named(ESTIMATE, flat) if n not in std] or [
         n for n in _named(ESTIMATE, [*rows]) if rows[n].ndim == 2
     ][:1]
-    covariance = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]][:1]
     ensemble = _named(r"ensemble|particle|sample", [n for n in rows if rows[n].ndim == 3])[:1]
+    square = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]]
+    covariance = [n for n in square if rows[n].dtype.kind == "f"][:1]
+    if not mean and not ensemble:  # of an estimate: without it, they are sensors
+        std, covariance = [], []
     control = _named(r"^(action|control|u)$", [*columns])[:1]
     used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control}
     used |= {n.partition("[")[0] for n in state.values()}

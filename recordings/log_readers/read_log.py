@@ -31,6 +31,7 @@ from beliefscope.recordings.log_readers.column_map import (
 )
 from beliefscope.recordings.log_readers.columns import column, joined
 from beliefscope.recordings.log_readers.messages import CLOCK, NEW
+from beliefscope.recordings.log_readers.table_folder import FILE
 
 Array = NDArray[np.float64]
 
@@ -234,7 +235,10 @@ def _states(columns: Columns, mapping: ColumnMap) -> Array:
     for name, part in states.items():
         if part.shape != (expected := (count, mapping.state[name].size)):
             reference = mapping.state[name].column
-            raise BadInput(f"state {name!r} has column {reference!r} of shape {part.shape}, expected {expected}")
+            raise BadInput(
+                f"state {name!r} has column {reference!r} of shape {part.shape}, expected {expected}: a row is a step, "
+                "NAME[0] the first number of a row, and `episode` a column that numbers the episodes"
+            )
     parts = [states.get(name, np.full((count, entry.size), np.nan)) for name, entry in mapping.state.items()]
     return np.concatenate(parts, axis=1) * mapping.factors
 
@@ -278,15 +282,16 @@ def _float32(values: Array, name: str) -> NDArray[np.float32]:
 
 def _episodes(columns: Columns, mapping: ColumnMap, count: int) -> dict[str, NDArray[np.intp]]:
     """Name of each episode -> its rows."""
-    if not mapping.episode:
+    name = mapping.episode or (FILE if FILE in columns else "")
+    if not name:
         return {"0": np.arange(count)}
-    if mapping.episode not in columns:
-        column(columns, mapping.episode, "episode")  # raises the error with similar names
-    numbers = columns[mapping.episode]
-    _check_rows(numbers, f"the episode, column {mapping.episode!r},", count)
+    if name not in columns:
+        column(columns, name, "episode")  # raises the error with similar names
+    numbers = columns[name]
+    _check_rows(numbers, f"the episode, column {name!r},", count)
     if numbers.dtype.kind == "f" and len(unknown := np.flatnonzero(np.isnan(numbers))):
-        raise BadInput(f"the episode, column {mapping.episode!r}, has no value in row {unknown[0]}")
-    names, first, inverse = np.unique(columns[mapping.episode], return_index=True, return_inverse=True)
+        raise BadInput(f"the episode, column {name!r}, has no value in row {unknown[0]}")
+    names, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
     return {str(names[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
 
 

@@ -41,8 +41,9 @@ def import_(
     run that the page displays. Filters are trained and fine-tuned on the episodes of --split train and evaluated on
     those of val and test.
 
-    Formats of logs: NumPy (.npz), CSV, Parquet, MCAP, ROS 2 bags (folder or .db3), Zarr replay buffers (folder or
-    .zip), LeRobot data sets (folder, version 3), and Rerun recordings of other programs (.rrd with --map or --guess).
+    Formats of logs: NumPy (.npz), CSV and Parquet, also folders of them with one file per episode; MCAP, ROS 2 bags
+    (folder or .db3), Zarr replay buffers (folder or .zip), LeRobot data sets (folder, version 3), and Rerun recordings
+    of other programs (.rrd with --map or --guess).
 
     \b
     Examples:

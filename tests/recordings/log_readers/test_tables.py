@@ -280,3 +280,86 @@ def test_archives_that_are_no_replay_buffers(tmp_path: Path) -> None:
             target.writestr(f"folder/{name}", source.read(name))
     with pytest.raises(BadInput, match=r"no array 'meta/episode_ends'.* in the folder 'folder', expected at the top"):
         read_columns(copy)
+
+
+TABLE = """
+time = "t"
+[state]
+x = "x"
+[sensors]
+camera = "image"
+"""
+
+
+def write_tables(folder: Path, starts: dict[str, float]) -> None:
+    """A file of three steps per name, whose state begins at the value."""
+    folder.mkdir()
+    for name, start in starts.items():
+        rows = {"t": 7.0 + 0.1 * np.arange(3), "x": start + np.arange(3), "image": np.full((3, 4, 4), start, np.uint8)}
+        np.savez(folder / name, **rows)
+
+
+def test_files_of_a_folder_are_episodes(tmp_path: Path) -> None:
+    write_tables(tmp_path / "runs", {"run_10.npz": 10.0, "run_9.npz": 9.0})
+    mapping = read_map(map_file(tmp_path, TABLE))
+    episodes = read_log(read_columns(tmp_path / "runs", mapping), mapping, "runs")
+    assert [e.provenance["episode"] for e in episodes] == ["run_9", "run_10"]
+    assert [e.states[:, 0].tolist() for e in episodes] == [[9.0, 10.0, 11.0], [10.0, 11.0, 12.0]]
+    assert [e.observations["camera"].shape for e in episodes] == [(3, 4, 4)] * 2
+    assert 'time = "t"' in guess_map(preview_columns(tmp_path / "runs"), "runs")
+
+
+def test_csv_files_of_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    for name in "ab":
+        (tmp_path / "runs" / f"{name}.csv").write_text("t,x\n0,1\n0.1,2\n")
+    mapping = read_map(map_file(tmp_path, 'time = "t"\n[state]\nx = "x"\n[sensors]\npose = "x"\n'))
+    assert len(read_log(read_columns(tmp_path / "runs", mapping), mapping, "runs")) == 2
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ({"t": [0.0, 0.1]}, r"run_2\.npz has no column 'x', which other files of runs have"),
+        ({"t": [0.0, 0.1], "x": [1.0]}, r"run_2\.npz has 1 rows of 'x' and 2 of 't', expected as many"),
+        ({"t": [0.0], "x": [["1"]]}, r"column 'x' has rows of shape \(1,\) in run_2\.npz and \(\) in run_1\.npz"),
+        ({"t": [0.0], "x": ["a"]}, r"column 'x' has text in run_2\.npz and numbers in run_1\.npz"),
+    ],
+)
+def test_different_files_of_a_folder(tmp_path: Path, rows: dict[str, Any], message: str) -> None:
+    write_tables(tmp_path / "runs", {"run_1.npz": 1.0})
+    np.savez(tmp_path / "runs" / "run_2.npz", **rows)
+    mapping = read_map(map_file(tmp_path, TABLE.replace("image", "x")))
+    with pytest.raises(BadInput, match=message):
+        read_columns(tmp_path / "runs", mapping)
+
+
+def test_formats_of_a_folder_are_not_mixed(tmp_path: Path) -> None:
+    write_tables(tmp_path / "runs", {"run_1.npz": 1.0})
+    (tmp_path / "runs" / "run_2.csv").write_text("t,x\n0,1\n")
+    with pytest.raises(BadInput, match=r"folder runs has files \.csv and \.npz, expected one format"):
+        read_columns(tmp_path / "runs")
+
+
+def test_guessed_map_has_square_images(tmp_path: Path) -> None:
+    """They have the shape of covariances, of which there are none without an estimate."""
+    arrays = {"t": np.arange(3.0), "camera": np.zeros((3, 4, 4), np.uint8), "depth": np.zeros((3, 4, 4))}
+    np.savez(tmp_path / "log.npz", **arrays, sigma_x=np.zeros(3))
+    text = guess_map(preview_columns(tmp_path / "log.npz"), "log")
+    assert tomllib.loads(text)["sensors"].keys() == {"camera", "depth", "sigma_x"}
+    np.savez(tmp_path / "log.npz", **arrays, est_x=np.zeros(3))
+    assert tomllib.loads(guess_map(preview_columns(tmp_path / "log.npz"), "log"))["sensors"].keys() == {"camera"}
+
+
+def test_stacked_episodes_are_explained(tmp_path: Path) -> None:
+    np.savez(tmp_path / "log.npz", x=np.zeros((5, 30)), t=np.zeros((5, 30)))
+    mapping = read_map(map_file(tmp_path, TABLE.replace("image", "x")))
+    with pytest.raises(BadInput, match=r"shape \(5, 30\), expected \(5, 1\): a row is a step.* numbers the episodes"):
+        read_log(read_columns(tmp_path / "log.npz", mapping), mapping, "log.npz")
+
+
+def test_errors_list_few_of_many_columns(tmp_path: Path) -> None:
+    np.savez(tmp_path / "log.npz", **{f"pixel_{i}": np.zeros(2) for i in range(500)})
+    mapping = read_map(map_file(tmp_path, 'dt = 0.1\n[state]\nx = "pixel"\n[sensors]\npose = "pixel_1"\n'))
+    with pytest.raises(BadInput, match=r"'pixel' does not exist.*Available: pixel_0, .*pixel_59 and 440 more\.$"):
+        read_log(read_columns(tmp_path / "log.npz", mapping), mapping, "log.npz")
