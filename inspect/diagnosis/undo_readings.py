@@ -64,21 +64,35 @@ def _with_labels(setting: Setting, change: Callable[[NDArray[Any]], NDArray[Any]
 
 
 def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
-    """A delayed image, the delayed haptics, controls or labels, advanced by their delay."""
-    lag = deviations.get(f"lag/{key if key in ('control', 'labels') else 'image'}/all")
-    steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
+    """A delayed image, the delayed haptics, controls or labels, advanced by their delay.
 
-    def ahead(values: NDArray[Any]) -> NDArray[Any]:
-        return values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
-
-    if key == "labels":
-        return _with_labels(setting, ahead) if steps else None
-    keys = setting.checkpoint.task.modalities.get(key, (key,))
+    Of a sensor with a delay behind the labelled contact: each such sensor by its own delay.
+    """
+    behind = {
+        name: round(d.value - d.healthy)
+        for name in setting.checkpoint.task.observations
+        if (d := deviations.get(f"contact lag/{name}/all")) is not None
+    }
+    if behind.get(key, 0) > 0:
+        steps_of = {name: steps for name, steps in behind.items() if steps > 0}
+    else:
+        lag = deviations.get(f"lag/{key if key in ('control', 'labels') else 'image'}/all")
+        steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
+        if not steps:
+            return None
+        if key == "labels":
+            return _with_labels(setting, lambda values: _ahead(values, steps))
+        steps_of = dict.fromkeys(setting.checkpoint.task.modalities.get(key, (key,)), steps)
     result: Setting | None = setting
-    for name in keys:
+    for name, count in steps_of.items():
         if result is not None:
-            result = _with_readings(result, name, lambda values, episode: ahead(values))
-    return result if steps else None
+            result = _with_readings(result, name, lambda values, episode, count=count: _ahead(values, count))  # type: ignore[misc]
+    return result
+
+
+def _ahead(values: NDArray[Any], steps: int) -> NDArray[Any]:
+    """Values (T, ...) that many steps earlier; the last ones are repeated."""
+    return values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
 
 
 def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:

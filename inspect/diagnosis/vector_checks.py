@@ -7,6 +7,7 @@ from itertools import permutations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.contact_distance import contact_residual
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND, Reference, displacements_in_contact
 from beliefscope.inspect.statistics.signals import (
@@ -38,6 +39,9 @@ LAWFUL = 0.005
 
 CALMER = 0.2
 """Relative variation of the force with the contact flag below which the flag is inverted."""
+
+MIN_CONTACT = 3
+"""Smallest number of steps in contact that show a delay."""
 
 MIN_MOTION = 1e-3
 """m per step: the hand moves."""
@@ -132,6 +136,22 @@ def _force(episode: Episode) -> Array | None:
 def _size(values: Array) -> float:
     """Root mean square distance of vectors (T, 3) from their mean."""
     return float(np.sqrt(np.square(values - values.mean(0)).sum(1).mean()))
+
+
+def labelled_contact_statistics(episode: Episode, key: str) -> dict[str, float]:
+    """``contact lag``: steps by which a vector sensor follows the labelled contact.
+
+    Of a task without a contact sensor. NaN for readings that do not depend on contact.
+    """
+    if not has_labels_only(episode.task):
+        return {}
+    touched, free, present = in_contact(episode), free_motion(episode), episode.present(key)
+    if touched.sum() < MIN_CONTACT or (free & present).sum() < MIN_STEPS:
+        return {f"contact lag/{key}/all": np.nan}
+    readings = episode.observations[key].astype(np.float64)
+    size = np.linalg.norm(readings - np.median(readings[free & present], axis=0), axis=1)
+    spread = np.log(size + 1e-2 * max(size.max(), 1e-9))
+    return {f"contact lag/{key}/all": lag(spread[:, None], touched[:, None].astype(np.float64), present)[0]}
 
 
 def wrench_statistics(episode: Episode) -> dict[str, float]:
@@ -247,10 +267,21 @@ def contact_distance_statistics(episode: Episode, reference: Reference | None) -
 
 
 def in_contact(episode: Episode) -> Mask:
-    """(T,): steps with the contact flag; all without such a sensor."""
-    if CONTACT not in episode.observations:
-        return np.ones(len(episode), dtype=bool)
-    return np.asarray(episode.observations[CONTACT][:, 0] > 0.5)
+    """(T,): steps with the contact flag or, without such a sensor, with labelled contact; all without either."""
+    flag = contact_flag(episode)
+    return np.ones(len(episode), dtype=bool) if flag is None else flag
+
+
+def contact_flag(episode: Episode) -> Mask | None:
+    """(T,): the contact flag or, without such a sensor, the labelled contact; None without either."""
+    if CONTACT in episode.observations:
+        return np.asarray(episode.observations[CONTACT][:, 0] > 0.5)
+    return np.asarray(episode.contact, dtype=bool) if CONTACT in episode.task.covariates else None
+
+
+def has_labels_only(task: Task) -> bool:
+    """Whether contact is labelled, and no sensor measures it."""
+    return CONTACT in task.covariates and CONTACT not in task.observations
 
 
 def contact_changes(episode: Episode) -> int:
@@ -259,8 +290,9 @@ def contact_changes(episode: Episode) -> int:
 
 
 def free_motion(episode: Episode) -> Mask:
-    """(T,): steps without the contact flag, and their neighbours without it, since readings are means over a step."""
-    touched = in_contact(episode) if CONTACT in episode.observations else np.zeros(len(episode), dtype=bool)
+    """(T,): steps without ``contact_flag``, and their neighbours without it, since readings are means over a step."""
+    flag = contact_flag(episode)
+    touched = np.zeros(len(episode), dtype=bool) if flag is None else flag
     return np.convolve(touched, np.ones(3), mode="same") == 0
 
 
@@ -281,7 +313,11 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
 
 def law_statistics(episode: Episode) -> dict[str, float]:
     """Statistics of an episode about laws between sensors and controls: of contact, and of the controller."""
-    return wrench_statistics(episode) | control_statistics(episode) | impedance_statistics(episode)
+    values = wrench_statistics(episode) | control_statistics(episode) | impedance_statistics(episode)
+    for key, readings in episode.observations.items():
+        if readings.ndim == 2 and key not in (CONTACT, HAND):
+            values |= labelled_contact_statistics(episode, key)
+    return values
 
 
 def _moving(episode: Episode) -> Mask:

@@ -93,7 +93,14 @@ def _part(episode: Episode, first: int) -> Episode:
     steps = slice(first, first + LENGTH)
     observations = {key: values[steps] for key, values in episode.observations.items()}
     covariates = {name: values[steps] for name, values in episode.covariates.items()}
-    return Episode(episode.task, episode.states[steps], observations=observations, dt=episode.dt, covariates=covariates)
+    return Episode(
+        episode.task,
+        episode.states[steps],
+        observations=observations,
+        contact=episode.contact[steps],
+        dt=episode.dt,
+        covariates=covariates,
+    )
 
 
 def _statistics(part: Episode, reference: Reference | None) -> dict[str, float]:

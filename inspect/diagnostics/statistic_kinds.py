@@ -47,6 +47,7 @@ KINDS = {
     "occlusion": ("share of occluded pixels", False, 0.01),
     "shift": ("shift", False, 0.2),
     "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
+    "contact lag": ("delay{of} in steps behind the labelled contact", False, 0.5),
     "hand offset": ("distance of the hand in the image from its measured position{axis}", False, 0.1),
     "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
     "object offset": ("distance of the object in the image from its labelled position{axis}", False, 0.1),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, has_labels_only
+from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")
 """Observations that have their own causes."""
@@ -35,4 +37,24 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"{name[0].upper()}{name[1:]} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
+    return (*result, *_delays(task))
+
+
+def _delays(task: Task) -> tuple[Cause, ...]:
+    """Delays of vector sensors behind the labelled contact, of tasks without a contact sensor.
+
+    Force and torque are of one sensor: a delay of the force explains that of the torque, and the laws of both.
+    """
+    result = []
+    for modality, keys in task.modalities.items() if has_labels_only(task) else ():
+        for key in (key for key in keys if len(task.observations[key]) == 1 and key != HAND):
+            name = display_name(key)
+            changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
+            if key in (FORCE, TORQUE):
+                changed += f"|lever/{FORCE}*|axes/{FORCE}/*|size/*/contact"
+            if key == FORCE and TORQUE in task.observations:
+                changed += f"|*/{TORQUE}/*|*/{TORQUE} */*"
+            title, action = f"{name[0].upper()}{name[1:]} delayed", "Synchronise the clocks of the sensors."
+            symptoms = (Symptom(f"contact lag/{key}/*"),)
+            result.append(Cause(f"{key}.delay", title, symptoms, changed, action, f"advance {key}"))
     return tuple(result)
