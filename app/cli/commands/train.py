@@ -54,6 +54,7 @@ def train(
     check_trainable(target, task, filter)
     from beliefscope.filters.catalog import architecture
     from beliefscope.filters.checkpoint import save_checkpoint
+    from beliefscope.filters.training.angles import wrapping_warning
     from beliefscope.filters.training.plan import BLACKOUTS, PLANS, parse_blackouts
     from beliefscope.filters.training.train import train as train_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -78,6 +79,8 @@ def train(
         episodes = list(dataset)
         if data is None:
             _check_sample(target, episodes)
+        if warning := wrapping_warning(episodes):
+            console.note(f"Warning: {warning}")
         trained = train_filter(
             settings,
             episodes + (faulty_copies(injected, episodes, seed) if injected else []),
