@@ -59,6 +59,13 @@ class SliceInfo:
         return cls(**slice_.to_json(), text=str(slice_))
 
 
+EXTERNAL = (
+    "The torch module of an external filter is fine-tuned on the command line, on a loss of its own file "
+    "(docs/finetune.md): beliefscope finetune {task} --filter FILE.py:NAME --data DATA -o tuned.safetensors"
+)
+"""Why an external filter has no choices."""
+
+
 @dataclass(frozen=True)
 class Choices:
     """Options for fine-tuning a filter.
@@ -79,7 +86,7 @@ class Choices:
 def choices(checkpoint: Checkpoint) -> Choices:
     """The options for fine-tuning a filter."""
     if isinstance(checkpoint, ExternalFilter):
-        return Choices("External filters cannot be fine-tuned here.", [], [], [], [], FineTune().to_json(), "")
+        return Choices(EXTERNAL.format(task=checkpoint.task.name), [], [], [], [], FineTune().to_json(), "")
     filter_ = checkpoint.filter
     changes = checkpoint.record.get("parts", {})  # of the fine-tuning that wrote this checkpoint
     modules = []

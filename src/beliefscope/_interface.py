@@ -302,7 +302,7 @@ def compare(
 
 def sweep(
     folder: str | Path,
-    filters: Sequence[str | Path],
+    filters: Sequence[Filter],
     data: Sequence[str | Path] = (),
     *,
     faults: Sequence[str] = ("",),
@@ -315,12 +315,13 @@ def sweep(
 
     Args:
         folder: of the sweep; created if missing.
-        filters: checkpoint files, or ``TASK/NAME`` of pretrained filters.
+        filters: checkpoints or their files, or ``TASK/NAME`` of pretrained filters; external filters have none.
         data: files of episodes; default: the sample data set of each filter's task.
         faults: each is run; an empty text is clean data. seeds: number of seeds, from 0.
         all_episodes: whether to run over training episodes as well. workers: processes.
     """
-    files = tuple(Path(f) if str(f).endswith(".safetensors") else _shipped(str(f)) for f in filters)
+    sources = [str((f.path or f.name) if isinstance(f, Checkpoint) else f) for f in filters]
+    files = tuple(Path(f) if f.endswith(".safetensors") else _shipped(f) for f in sources)
     sets = tuple(store.sample_path(str(d)) if str(d) in TASKS else Path(d).resolve() for d in data)
     inputs = Inputs(files, sets, tuple(faults), tuple(range(seeds)), particles, all_episodes)
     target = Path(folder)
@@ -375,7 +376,7 @@ def serve(
 def _shipped(text: str) -> Path:
     """File of a pretrained filter, ``TASK/NAME``."""
     task, _, name = text.partition("/")
-    if not name:
+    if not name or is_code(text):
         raise BadInput(f"filter {text!r} is neither TASK/NAME, such as door/crossmodal-pf, nor a .safetensors file")
     return shipped(task, name)
 

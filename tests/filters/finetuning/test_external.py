@@ -14,6 +14,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.filters.external.weights import save_weights
+from beliefscope.filters.finetuning.choices import choices
 from beliefscope.filters.finetuning.external import finetune_external, loss_of
 from beliefscope.filters.finetuning.finetune import Callbacks
 from beliefscope.filters.finetuning.settings import FineTune
@@ -124,3 +125,8 @@ def test_invalid_losses_modules_and_weights_are_refused(
     (tmp_path / "plain.py").write_text(FILE.replace("def loss", "def cost"))
     with pytest.raises(BadInput, match=r"has no function loss\(module, windows\)"):
         loss_of(f"{tmp_path / 'plain.py'}:build")
+
+
+def test_page_names_the_command() -> None:
+    external = load_external("examples/04_own_filter.py:build")
+    assert "beliefscope finetune door --filter FILE.py:NAME" in (choices(external).why_not or "")
