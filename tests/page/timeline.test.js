@@ -278,3 +278,17 @@ test('injected faults are labelled, below the labels of outages', () => {
   );
   assert.ok(both[1][2] > both[0][2], 'in a row of its own');
 });
+
+test('estimates of an angle do not differ from the truth by whole turns', () => {
+  const [, { series }] = tracks(trace, { ...state, component: 'angle' });
+  const [truth, fused] = ['truth', 'fused'].map(
+    (name) => series.find((item) => item.name === name)?.values ?? [],
+  );
+  const degrees = 180 / Math.PI;
+  assert.ok(Math.abs(truth[1] - 3.1 * degrees) < 1e-3);
+  assert.ok(Math.abs(fused[1] - (2 * Math.PI - 3.1) * degrees) < 1e-3, 'recorded as -3.1 rad');
+  const unknown = makeTrace({ ...FUSION, truth: { shape: [2, 3], values: Array(6).fill(NaN) } });
+  const [, { series: alone }] = tracks(unknown, { ...state, component: 'angle' });
+  const own = alone.find((item) => item.name === 'fused')?.values ?? [];
+  assert.ok(Math.abs(own[1] + 3.1 * degrees) < 1e-3, 'without truth as recorded');
+});

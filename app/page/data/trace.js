@@ -337,6 +337,21 @@ export class Trace {
   }
 
   /**
+   * Returns the mean of an estimate for a chart with the true values. Of an angle, the whole turns that differ from the
+   * truth are left out, so that it jumps by a turn where the truth does; undefined if the filter has no such estimate.
+   * @param {string} source
+   * @param {number} component
+   */
+  nearTruth(source, component) {
+    return this.#cached(`near truth ${source} ${component}`, () => {
+      const [mean, truth] = [this.mean(source, component), this.truth(component)];
+      const offset = this.offset(source, component);
+      if (!offset || this.unitOf(component).unit !== '°') return mean;
+      return mean?.map((v, t) => (Number.isFinite(offset[t]) ? truth[t] + offset[t] : v));
+    });
+  }
+
+  /**
    * Returns the absolute error of an estimate, such as the distance of the position.
    * @param {string} source
    * @param {number | 'main'} quantity a state component or the main error

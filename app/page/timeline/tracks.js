@@ -191,7 +191,7 @@ function estimateTrack(trace, component) {
   const { name } = trace.components[component];
   const estimates = availableSeries(
     trace.sources,
-    (source) => trace.mean(source, component),
+    (source) => trace.nearTruth(source, component),
     (source) => trace.sigma(source, component),
   );
   const truth = { name: 'truth', values: trace.truth(component) };
