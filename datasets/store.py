@@ -46,7 +46,7 @@ def sample_path(task: str | Task) -> Path:
     if not has_sample(task):
         can_simulate = task.simulate is not None
         raise BadInput(
-            f"Task {task.name!r} has no sample dataset. Give its data with --data"
+            f"Task {task.name!r} has no sample set. Give its data with --data"
             + (f": beliefscope collect {task.name} simulates some." if can_simulate else ".")
         )
     return _sample_file(task.name)

@@ -109,8 +109,8 @@ TRACE_FILTER = option(
 
 TASK_OF_FILES = option(
     "NAME|FILE.py:NAME",
-    "Task of the files. They contain its definition; needed for files of earlier versions that only name a task of "
-    "your own, and for its functions (replay, outline).",
+    "Task of the files. They contain its definition, so this option is needed only for the functions of your own task "
+    "(replay, outline), and for files of earlier versions without a definition.",
     "",
     "--task",
 )
@@ -129,10 +129,10 @@ OPTIONS: dict[str, Any] = {
     "data": option(
         "FILE.h5|DIR",
         "Episodes: a Beliefscope HDF5 file or a supported external format (docs/data.md). "
-        "Default: the built-in sample dataset.",
+        "Default: the sample set of the task.",
     ),
     "skip_bad": flag("Skip unusable trajectories and report the reasons.", "--skip-bad", default=...),
-    "episode": option("I", "Index of the episode in the dataset. Default: the first held-out one.", parser=integer(0)),
+    "episode": option("I", "Index of the episode in the data set. Default: the first held-out one.", parser=integer(0)),
     "faults": option(
         "FAULTS",
         "Sensor faults to inject, such as blackout=0.4,force_bias:x=5:from=20; also JSON or a .json file. "
@@ -347,7 +347,7 @@ def check_workspace(workspace: Path) -> None:
 
 
 def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Dataset:
-    """Open a dataset (default: the sample dataset) and print skipped trajectories. Raises BadInput for another task."""
+    """Open a data set (default: the sample set) and print skipped trajectories. Raises BadInput for another task."""
     from beliefscope.datasets.store import open_dataset, sample_path
     from beliefscope.datasets.task_json import difference
 

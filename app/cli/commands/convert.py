@@ -19,7 +19,7 @@ def convert(
     """Convert external data to a Beliefscope HDF5 file.
 
     Every command also reads the external files directly; a converted file opens faster and has the same hash.
-    Supported are the MIT Push dataset and the files published with the paper.
+    Supported are the MIT Push data set and the files published with the paper.
 
     \b
     Examples:

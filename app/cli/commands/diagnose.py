@@ -32,9 +32,10 @@ def diagnose(
 ) -> console.Result:
     """Name the probable cause of a filter's fault.
 
-    Compares sensors, labels, modules and the filter with its healthy record, ranks the causes that explain all
-    deviations, and confirms them by undoing them. --repair drops sensors, and with --faults restores them, over the
-    shortest interval that removes the episode's largest failure. Details: docs/diagnose.md.
+    Compares statistics of sensors, labels, modules and the filter with the filter's healthy record (the same statistics
+    on clean episodes), ranks the causes that explain all deviations, and confirms them by undoing them. --repair finds
+    the shortest interval in which to drop sensors, or with --faults to restore them, so that the episode's largest
+    failure disappears. Details: docs/diagnose.md.
 
     \b
     Examples:

@@ -21,8 +21,8 @@ def evaluate(
     before and after the first contact; nll, the negative log-likelihood of the truth in nats; nees, the normalised
     estimation error squared per dimension, 1 for a calibrated covariance; coverage95, the fraction of steps with the
     truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its estimate;
-    dynamics is the filter with all observations masked. Two errors of each modality: its update, the fused filter's
-    prior of each step updated with this modality only; and standalone, the same filter and random numbers with the
+    dynamics is the filter with all observations masked. Each modality has two errors: of its update, the fused filter's
+    prior of each step updated with this modality only; and standalone, of the same filter and random numbers with the
     observations of all other modalities masked in every step. Warns if the data differ from the training data.
 
     \b

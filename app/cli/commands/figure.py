@@ -22,8 +22,8 @@ def figure(
 ) -> console.Result:
     """Draw a figure of the paper from a filter run.
 
-    maps: likelihood or posterior of each modality around the true position, in free motion and in contact; of tasks
-    without contact at one step, and of a state with one map component as curves.
+    maps: likelihood or posterior of each modality around the true position, in free motion and in contact. For a task
+    without contact, the maps are at one step; for a state with one map component, they are curves.
     weights: estimates of each modality and of the fused filter over time, with the fusion weights below and contact
     shaded.
 

@@ -34,7 +34,7 @@ class Learning:
     )
     clean_weight: float | None = opt.option(
         "SHARE",
-        "Weight of clean data in the loss (default 0.5; without options for modules and data 0.97 with images).",
+        "Weight of clean data in the loss (default 0.5; in the default run of a filter with images 0.97).",
         None,
     )
     events: list[str] | None = opt.option(
@@ -42,7 +42,9 @@ class Learning:
     )
     data: Path | None = None
     skip_bad: bool = False
-    steps: int | None = opt.option("N", "Maximum number of optimiser steps (default 300).", None, parser=opt.integer(1))
+    steps: int | None = opt.option(
+        "N", "Maximum number of optimiser steps (default 300; in the default run 150).", None, parser=opt.integer(1)
+    )
     length: int = opt.option("T", "Window length in steps.", 32, parser=opt.integer(1))
     rates: list[str] | None = opt.option(
         "R|PATTERN=R",
@@ -50,7 +52,7 @@ class Learning:
         None,
         "--rate",
     )
-    l2_sp: float = opt.option("X", "L2-SP strength (decay to the base weights).", 1.0)
+    l2_sp: float = opt.option("X", "L2-SP strength (decay towards the base weights).", 1.0)
     calibrate: bool = opt.flag(
         "Then scale process and measurement noise such that NEES is 1 on the validation episodes."
     )
@@ -95,11 +97,11 @@ def finetune(
     combines the given slices and clean data. Validates every 25 steps and keeps the best weights. The base checkpoint
     is not changed. The same command resumes an interrupted run from CHECKPOINT.partial. Tutorial: docs/finetune.md.
 
-    Without --train, --freeze, --slice, --faults and --event, the filter learns a sensor fault that its training data
-    lack, for 150 steps: reliability-only learns occluded images; without images, haptics-only learns noisy haptics.
+    The default run, without --train, --freeze, --slice, --faults and --event, trains for 150 steps on a sensor fault
+    that the training data lack: occluded or noisy images or, for a filter without images, noisy haptics.
 
-    Beside the build function of an external filter, its file defines loss(module, windows); CHECKPOINT then has the
-    weights of its torch module, and FILE.py:NAME@CHECKPOINT is the fine-tuned filter.
+    To fine-tune an external filter, define loss(module, windows) in the file of its build function. CHECKPOINT then has
+    the weights of the torch module, and FILE.py:NAME@CHECKPOINT is the fine-tuned filter.
 
     \b
     Examples:

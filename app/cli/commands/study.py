@@ -15,7 +15,7 @@ def study(
     output: Path = opt.option("DIR", "Study folder; created if missing.", ..., "-o", "--output"),
     preset: str = opt.option("NAME", "Training schedule: smoke, cpu or full.", "cpu"),
     tasks: list[str] | None = opt.option(
-        "TASK", "Repeatable. Default: all built-in tasks and those with --data.", None, "--task"
+        "TASK", "Repeatable. Default: door, push and the tasks with --data.", None, "--task"
     ),
     filters: list[str] | None = opt.option(
         "NAME|FILE",
@@ -26,7 +26,7 @@ def study(
     ),
     seeds: int = opt.option("K", "Train each filter with seeds 0 to K - 1.", 3, parser=opt.integer(1)),
     data: list[str] | None = opt.option(
-        "TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset.", None
+        "TASK=FILE", "Data of a task. Repeatable. Default: the sample set of the task.", None
     ),
     skip_bad: bool = False,
     engine: opt.Engine = "local",
@@ -34,10 +34,11 @@ def study(
 ) -> console.Result:
     """Train and compare filters over many conditions.
 
-    Trains each filter once per seed and evaluates it with 0, 40 and 80 % image blackout on the test episodes. Writes
-    checkpoints and metrics to DIR/cells, and updates DIR/table.md, table.csv, results.svg and results.png after each
-    run. Completed runs are skipped, so the same command resumes an interrupted study, and several processes can share
-    one DIR. Given checkpoints and external filters are rows beside them, with one seed.
+    Trains each filter once per seed and evaluates it with 0, 40, 80 and 95 % image blackout on the test episodes, from
+    starts at the truth and from offset starts. Writes checkpoints and metrics to DIR/cells, and updates DIR/table.md,
+    table.csv, results.svg and results.png after each run. Completed runs are skipped, so the same command resumes an
+    interrupted study, and several processes can share one DIR. Checkpoints and external filters given with --filter are
+    evaluated only; each is a row with one seed.
 
     \b
     Examples:

@@ -10,7 +10,7 @@ def sweep(
     output: Path = opt.option("DIR", "Folder of the sweep; created if missing.", ..., "-o", "--output"),
     data: list[Path] | None = opt.option(
         "FILE.h5|DIR",
-        "Episodes; each checkpoint runs over those of its task. Repeatable. Default: the sample dataset.",
+        "Episodes; each checkpoint runs over those of its task. Repeatable. Default: the sample set.",
         None,
     ),
     faults: list[str] | None = opt.option(
@@ -25,11 +25,11 @@ def sweep(
 ) -> console.Result:
     """Run many checkpoints over many episodes; store a table.
 
-    One row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES, coverage, fusion weights and
-    the provenance of the episode, in DIR/results.parquet; one for each checkpoint in DIR/checkpoints.parquet, with the
-    provenance in a JSON file beside it (runs/a.json for runs/a.safetensors). Finished cells are stored: the same
-    command resumes an interrupted sweep. The table has the same bits with any engine and number of workers. Read it
-    with beliefscope experiments, DuckDB, pandas or Polars (docs/sweep.md).
+    DIR/results.parquet has one row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES,
+    coverage, fusion weights and the provenance of the episode. DIR/checkpoints.parquet has one row for each checkpoint,
+    with the provenance from the JSON file beside it (runs/a.json for runs/a.safetensors). Finished cells are stored, so
+    the same command resumes an interrupted sweep. The tables have the same bits with any engine and number of workers.
+    Read them with beliefscope experiments, DuckDB, pandas or Polars (docs/sweep.md).
 
     \b
     Examples:

@@ -13,9 +13,9 @@ def trace(
 
     A trace contains, for every step, the beliefs before and after the observation, each modality's own update, fusion
     weights as output by the network and effective weights, particles and their ancestors. Estimates are bit-identical
-    to those of a run without tracing. Memory does not grow with particles times steps: of more than --particles-kept
-    particles, that many are stored in each step. Episodes of more than 4096 steps are read and written in parts, unless
-    with --faults, --align or an external filter. Read it in Python with beliefscope.inspect.trace.load_trace.
+    to those of a run without tracing. To limit memory, at most --particles-kept particles are stored in each step, and
+    episodes of more than 4096 steps are read and written in parts (but not with --faults, --align or an external
+    filter). Read a trace in Python with beliefscope.inspect.trace.load_trace.
 
     \b
     Examples:
