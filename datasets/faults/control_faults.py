@@ -34,7 +34,7 @@ class ControlDelayed(ControlFault):
 
 @dataclass(frozen=True)
 class ControlScaled(ControlFault):
-    """The change of the hand position in the controls is scaled; all channels of controls without a position are."""
+    """The change of the hand position in the controls is scaled; of controls without a position, all channels."""
 
     name = "control_scale"
     factor: float = number_field(0.5, "factor", "scale")
