@@ -79,7 +79,7 @@ def reason(filter_: Filter) -> str:
     ((slice_, _),) = settings.mix
     modules = settings.train[0].replace("-", " ")
     return (
-        f"Shipped filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which multiplies their "
+        f"Included filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which multiplies their "
         f"error; by default, the modules of \u201c{modules}\u201d learn from data with this fault. If this "
         "brings no change, try other modules or faults."
     )
