@@ -27,7 +27,7 @@ def test_paths_are_documented() -> None:
     rows |= {f"| `{name}` | {meaning} |" for name, meaning in PROPERTIES.items()}
     tables = {line for line in DOCS.split("## Paths")[1].splitlines() if line.startswith("| ") and "---" not in line}
     headings = {
-        "| path | archetype | shape | unit | there | meaning |",
+        "| path | archetype | shape | unit | exists for | meaning |",
         "| property | meaning |",
     }
     assert tables - headings == rows
