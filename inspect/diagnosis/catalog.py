@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.causes import (
@@ -15,6 +18,7 @@ from beliefscope.inspect.diagnosis.causes import (
     own_sensors,
     particles,
 )
+from beliefscope.inspect.statistics.reference_images import HAND
 
 CAUSES: tuple[Cause, ...] = (
     *image.CAUSES,
@@ -29,6 +33,26 @@ CAUSES: tuple[Cause, ...] = (
 """All causes, by component."""
 
 
+SENSORS = {"image": "image", "force": "force", "torque": "torque", "contact": "contact", "effector": HAND}
+"""Component of a cause -> observation key of its sensor."""
+
+MODALITIES = {"image": "image"}
+"""Component -> modality that the catalog writes for its sensor; ``haptics`` for all others."""
+
+
 def causes_of(task: Task) -> tuple[Cause, ...]:
     """All causes, and those in sensors that only this task has."""
-    return (*CAUSES, *own_sensors.own_causes(task))
+    modalities = {key: modality for modality, keys in task.modalities.items() for key in keys}
+    return (*(_of_modality(cause, modalities) for cause in CAUSES), *own_sensors.own_causes(task))
+
+
+def _of_modality(cause: Cause, modalities: Mapping[str, str]) -> Cause:
+    """A cause in a sensor, with the modality that has the sensor in a task. modalities: by observation key."""
+    component = cause.name.partition(".")[0]
+    written = MODALITIES.get(component, "haptics")
+    modality = modalities.get(SENSORS.get(component, ""), written)
+    if modality == written:
+        return cause
+    undo = "|".join(f"drop {modality}" if name == f"drop {written}" else name for name in cause.undo.split("|"))
+    consequences = cause.consequences.replace(f"module */*{written}*", f"module */*{modality}*")
+    return replace(cause, undo=undo, consequences=consequences)

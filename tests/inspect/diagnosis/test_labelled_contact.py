@@ -10,8 +10,10 @@ import pytest
 from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.load import as_external
+from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.causes.own_sensors import own_causes
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
 from beliefscope.inspect.diagnosis.setting import Setting
@@ -73,6 +75,14 @@ def test_causes_of_delays_need_labels_without_a_sensor() -> None:
     assert "force.delay" not in {cause.name for cause in own_causes(replace(TASK, covariates={}))}
     observed = {"observations": TASK.observations | {"contact": (1,)}}
     assert "force.delay" not in {cause.name for cause in own_causes(replace(TASK, **observed))}
+
+
+def test_noisy_sensors_are_dropped_with_their_modality() -> None:
+    undo = {cause.name: cause.undo for cause in causes_of(TASK)}
+    assert undo["force.noise"] == "drop bumper"
+    assert undo["torque.bias"] == "tare torque|drop bumper"
+    assert undo["image.frozen"] == "drop image", "the task has no image"
+    assert {cause.name: cause for cause in causes_of(DOOR)}["force.noise"] in CAUSES
 
 
 def test_delayed_sensors_are_advanced_by_their_own_delay(episode: Episode) -> None:
