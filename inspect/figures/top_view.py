@@ -193,11 +193,16 @@ def _draw_positions(axes: Axes, trace: Trace, task: Task, step: int, size: float
         axes.plot(*100.0 * truth, marker="+", ms=1.6 * size, mew=1.4, color=COLOURS["truth"], label="truth", **style)
 
 
+def draws_force(trace: Trace, step: int) -> bool:
+    """Whether ``draw_step`` has an arrow: in contact, of a hand whose force and position are measured."""
+    return bool(trace.episode.contact[step]) and {"effector_position", "force"} <= trace.episode.observations.keys()
+
+
 def _draw_force(axes: Axes, trace: Trace, step: int) -> None:
     """Draw the horizontal part of the contact force, labelled with its norm in newtons."""
-    observations = trace.episode.observations
-    if not trace.episode.contact[step] or not {"effector_position", "force"} <= observations.keys():
+    if not draws_force(trace, step):
         return
+    observations = trace.episode.observations
     start, force = 100.0 * observations["effector_position"][step][:2], observations["force"][step]
     end = start + FORCE_SCALE * force[:2]
     arrow = {"arrowstyle": "-|>", "color": COLOURS["contact"], "lw": 1.4, "shrinkA": 0, "shrinkB": 0}

@@ -33,7 +33,7 @@ from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
 from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
-from beliefscope.inspect.figures.top_view import draw_step
+from beliefscope.inspect.figures.top_view import draw_step, draws_force
 from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs
@@ -55,11 +55,6 @@ from beliefscope.recordings.report.sections import (
     worst_events,
 )
 
-SCENE_CAPTION = (
-    "The scene from above with the object at its true state (solid) and at its estimated state (dashed). Arrow: force "
-    "on the end effector, 4 cm per 10 N. Right: the belief over the fused map; 2 sigma contours, and particles "
-    "coloured by weight"
-)
 MAP_CAPTION = (
     "Inputs of the filter, and maps over offsets from the true position, each relative to its maximum. "
     "Cross hairs: true position. Rings: estimate of each layer, which also depends on the prediction."
@@ -266,7 +261,7 @@ class Writer:
             caption = f"Inputs of the filter, and estimates as offsets from the true position. No maps: {self.no_maps}."
         scene = [] if trace.task.floor is None else [draw_step(trace, step, zoomed)]
         items = (
-            *(self.figure(f"{name}-scene", SCENE_CAPTION, figure) for figure in scene),
+            *(self.figure(f"{name}-scene", scene_caption(trace, step), figure) for figure in scene),
             self.figure(name, caption, event_figure(trace, step, zoomed, zoom), *data),
             self.table(name, event_table(trace, step, map_)),
         )
@@ -352,3 +347,14 @@ def manifest(report: Report, folder: Path) -> dict[str, Any]:
 
 def _json(document: Mapping[str, Any]) -> bytes:
     return json.dumps(as_json(document), indent=1, allow_nan=False, ensure_ascii=False).encode()
+
+
+def scene_caption(trace: Trace, step: int) -> str:
+    """Caption of the scene from above, with the parts that its figure has."""
+    has_outline = trace.task.outline is not None
+    objects = "the object at its true state (solid) and at its estimated state (dashed)"
+    parts = [f"The scene from above with {objects if has_outline else 'the true and the estimated position'}."]
+    if draws_force(trace, step):
+        parts.append("Arrow: force on the end effector, 4 cm per 10 N.")
+    parts.append("Right: the belief over the fused map; 2 sigma contours, and particles coloured by weight")
+    return " ".join(parts)

@@ -95,7 +95,7 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     episodes = ", ".join(str(trace.episode_index) for trace in report.traces)
     steps = sum(map(len, report.traces))
     facts = {
-        "Filter": f"{first.filter} ({first.kind.upper()})",
+        "Filter": f"{first.filter} ({first.kind if first.kind == 'external' else first.kind.upper()})",
         "Task": first.task.name,
         "Modalities": ", ".join(first.modalities) or "not distinguished",
         "Episodes": f"{episodes} ({steps} steps in total, {first.episode.dt:g} s each)",

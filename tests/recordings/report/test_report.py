@@ -29,7 +29,7 @@ from beliefscope.inspect.slices.report import slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.inspect.traces.batch import trace_all
-from beliefscope.recordings.report.compose import compose, write_report
+from beliefscope.recordings.report.compose import compose, scene_caption, write_report
 from beliefscope.recordings.report.diagnosis import report_diagnosis
 from beliefscope.recordings.report.figures import zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
@@ -243,6 +243,17 @@ def test_information_filters_are_described(new_trace: Callable[..., Trace], kind
 
 
 @pytest.mark.long
+def test_captions_of_scenes_name_what_is_drawn(run_: Trace) -> None:
+    contact = run_.episode.contact.astype(bool)
+    touching, free = int(contact.argmax()), int(contact.argmin())
+    assert contact[touching] and not contact[free]  # noqa: PT018
+    assert "Arrow: force on the end effector" in scene_caption(run_, touching)
+    assert "Arrow" not in scene_caption(run_, free)
+    assert "object at its true state (solid)" in scene_caption(run_, free)
+    plain = replace(run_, episode=replace(run_.episode, task=replace(run_.task, outline=None)))
+    assert "the true and the estimated position. Right" in scene_caption(plain, free)
+
+
 def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     content = compose([new_trace("ekf", steps=80)], None, steps=[(0, 50)])
     document = write_report(content, tmp_path / "report")
