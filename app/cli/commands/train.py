@@ -54,7 +54,6 @@ def train(
     check_trainable(target, task, filter)
     from beliefscope.filters.catalog import architecture
     from beliefscope.filters.checkpoint import save_checkpoint
-    from beliefscope.filters.training.angles import wrapping_warning
     from beliefscope.filters.training.plan import BLACKOUTS, PLANS, parse_blackouts
     from beliefscope.filters.training.train import train as train_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -77,10 +76,7 @@ def train(
             write("training", stage, step, loss)
 
         episodes = list(dataset)
-        if data is None:
-            _check_sample(target, episodes)
-        if warning := wrapping_warning(episodes):
-            console.note(f"Warning: {warning}")
+        _check_training(target, episodes, sample=data is None)
         trained = train_filter(
             settings,
             episodes + (faulty_copies(injected, episodes, seed) if injected else []),
@@ -103,10 +99,14 @@ def train(
     return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, lines)
 
 
-def _check_sample(task: Task, episodes: Sequence[Episode]) -> None:
-    """Raise BadInput for a sample set without training episodes, if some can be simulated."""
-    if task.simulate is not None and all(episode.split != "train" for episode in episodes):
+def _check_training(task: Task, episodes: Sequence[Episode], sample: bool) -> None:
+    """Raise BadInput for a sample set without training episodes; warn of angles that wrap around."""
+    from beliefscope.filters.training.angles import wrapping_warning
+
+    if sample and task.simulate is not None and all(episode.split != "train" for episode in episodes):
         raise BadInput(
             f"the sample set of {task.name} has no training episodes; collect some, beliefscope collect "
             f"{task.name} -o {task.name}.h5, and train with --data {task.name}.h5"
         )
+    if warning := wrapping_warning(episodes):
+        console.note(f"Warning: {warning}")
