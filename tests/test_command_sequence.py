@@ -114,7 +114,7 @@ def test_counterfactual_outputs_agree(run: Run, folder: Path) -> None:
     code, out, _ = run(f"{line} --faults blackout --weights image=0.9")
     title, *tables = out.split("\n\n")
     assert (code, title) == (0, document["verdict"])
-    assert "Blackout, beta of image 0.9 over steps 40 to 59 moved the estimate by up to " in title
+    assert "With blackout, beta of image 0.9 over steps 40 to 59, the estimate moved by up to " in title
     assert [table.splitlines()[0] for table in tables] == [
         "Mean over steps",
         "Largest difference of the estimates",

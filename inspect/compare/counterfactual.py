@@ -94,14 +94,14 @@ class Counterfactual(Diagnostic):
     @property
     def verdict(self) -> str:
         if not self.distance.any() and not self.sigmas.any():
-            return f"{_sentence(self.edit)} changed nothing."
+            return f"With {self.edit}, nothing changed."
         peak = int(self.distance.argmax())
         largest = self.task.main_error.text(self.distance[peak])
-        text = f"{self.edit} moved the estimate by up to {largest} ({self._at(peak)})"
+        text = f"With {self.edit}, the estimate moved by up to {largest} ({self._at(peak)})"
         others = {name: peak for name, peak in self._peaks().items() if name not in self._main()}
         for name, (change, step, unit) in others.items() if len(others) <= MAX_OTHERS else ():
             text += f" and the {name} by up to {change:.3g} {unit} ({self._at(step)})"
-        text = f"{_sentence(text)}: {self._recovery()}. "
+        text = f"{text}: {self._recovery()}. "
         main = self.task.main_error
         before, after = (main.factor * float(error[self.during].mean()) for error in (self.error, self.edited_error))
         text += f"Mean {main.name} error over the edited steps: {before:.2f} -> {after:.2f} {main.unit}".rstrip()
@@ -289,10 +289,6 @@ def _recovery_step(sigmas: Array, to: int) -> int | None:
     exceeded = np.flatnonzero(sigmas[to:] > RECOVERED)
     step = to + (int(exceeded[-1]) + 1 if len(exceeded) else 0)
     return step if step < len(sigmas) else None
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _number(value: float) -> float | None:

@@ -34,7 +34,7 @@ def test_empty_edit_is_bit_identical(replay: Replay, first: int) -> None:
     edit = Edit(first, 100)
     again = replay.edited(edit)
     assert not different(replay.original, again)
-    assert compare(replay.original, again, edit).verdict.endswith("changed nothing.")
+    assert compare(replay.original, again, edit).verdict.endswith(", nothing changed.")
 
 
 def test_edit_equals_faults_over_its_steps(replay: Replay) -> None:
@@ -48,6 +48,12 @@ def test_edit_equals_faults_over_its_steps(replay: Replay) -> None:
     assert not result.distance[:40].any()
     assert result.distance[40:60].all()
     assert result.carrier == "haptics"
+
+
+def test_the_sentence_has_the_name_of_a_fault_as_it_is(replay: Replay) -> None:
+    edit = Edit(40, 60, Faults.parse("force_bias=5"))
+    verdict = compare(replay.original, replay.edited(edit), edit).verdict
+    assert verdict.startswith("With force_bias=5 over steps 40 to 59, the estimate moved by up to ")
 
 
 def test_edited_beta(replay: Replay) -> None:

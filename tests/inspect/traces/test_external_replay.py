@@ -54,7 +54,7 @@ def test_counterfactual_changes_only_later_steps_and_its_own_sensors(door: list[
     np.testing.assert_array_equal(before[:20], after[:20])
     assert np.abs(before[20:] - after[20:]).max() > 1e-3
     verdict = compare(replay.original, edited, Edit(20, 40, Faults.parse("effector_offset=5"))).verdict
-    assert "moved the estimate by up to" in verdict
+    assert "the estimate moved by up to" in verdict
     blind = replay.edited(Edit(20, 40, Faults.parse("blackout")))  # the filter uses no image
     np.testing.assert_array_equal(before, blind.estimate_mean)
     assert open_replay(filter_, edited).exact  # of an edited run
