@@ -23,7 +23,7 @@ from served import serving
 RUNS = ("push-field/information-ekf:image_noise=40", "door-field/information-ekf:image_noise=40")
 CLICKS, SECONDS = 5, 180.0  # bars
 TIMEOUT = 900_000  # ms
-STAGES = {"simulation": "simulating", "training": "step", "profile": "healthy profile", "comparison": "comparing"}
+STAGES = {"simulation": "simulating", "training": "step", "profile": "healthy record", "comparison": "comparing"}
 """Stage of a run -> part of its message."""
 SIZE = {"width": 1280, "height": 720}
 

@@ -68,7 +68,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             )
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
-        report(share("profile", 0.0), "measuring the healthy profile")
+        report(share("profile", 0.0), "measuring the healthy record")
         images = included_reference(base.task) if is_sample else None  # of the same camera
         profile = measure_profile(result.filter, base.name, episodes, f"held-out episodes of {data_name}", images)
         save_checkpoint(result.filter, base.name, result.record, path, profile)

@@ -151,7 +151,7 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
     """The next action of a cause; none for the filter if the cause is in a sensor that it does not use."""
     if is_unused(cause, checkpoint):
         sensor = display_name(cause.component)
-        return f"This filter does not use the {sensor} sensor, so it is unaffected; repair it for filters that do."
+        return f"This filter does not use the {sensor} sensor and is unaffected; repair the sensor for other filters."
     if isinstance(checkpoint, ExternalFilter) and cause.name == "particles.few":
         return "Use more particles in the filter's own code."
     return cause.next.format(task=checkpoint.task.name, filter=checkpoint.name)

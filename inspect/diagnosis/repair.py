@@ -265,5 +265,5 @@ def _elsewhere(search: Candidates, candidate: Candidate, bound: float, max_repla
 def healthy_bound(statistics: Mapping[str, Array]) -> float:
     """m: twice the 95 % quantile of the RMS position error of healthy episodes; raises BadInput if it is unknown."""
     if (errors := statistics.get("error//all")) is None:
-        raise BadInput("the healthy profile has no position errors; give a bound")
+        raise BadInput("the healthy record has no position errors; give a bound")
     return 2.0 * float(np.nanquantile(errors, 0.95))

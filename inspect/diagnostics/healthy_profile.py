@@ -68,7 +68,7 @@ class HealthyProfile:
         """Inverse of ``to_json``. Raises BadInput for another format or malformed values."""
         try:
             if document["format"] not in (1, FORMAT):
-                raise BadInput(f"healthy profile of format {document['format']!r}; this version reads 1 and {FORMAT}")
+                raise BadInput(f"healthy record of format {document['format']!r}; this version reads 1 and {FORMAT}")
             count, particles = int(document["episodes"]), document["particles"]
             rows = {
                 str(name): np.array([np.nan if value is None else value for value in values], dtype=np.float64)
@@ -77,10 +77,10 @@ class HealthyProfile:
             data, images = str(document["data"]), document.get("reference")
             reference = None if images is None else Reference.from_json(images)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise BadInput(f"the healthy profile is malformed: {error!r}") from None
+            raise BadInput(f"the healthy record is malformed: {error!r}") from None
         for name, values in rows.items():
             if values.shape != (count,) or name.count("/") != 2:
-                raise BadInput(f"the healthy profile is malformed: {name!r} has {len(values)} values of {count}")
+                raise BadInput(f"the healthy record is malformed: {name!r} has {len(values)} values of {count}")
         return cls(data, count, None if particles is None else int(particles), rows, reference)
 
 

@@ -350,7 +350,7 @@ def _summarise(phase: str, count: int, steps: dict[str, Array]) -> PhaseParticle
 ENTRY = Entry(
     name="particles",
     title="Particle health",
-    question="Do enough particles carry the belief, and do they cover the true state?",
+    question="Do enough particles represent the belief, and do they cover the true state?",
     run=particle_health,
     why_not=why_not,
     statistics=trajectory_statistics,

@@ -28,7 +28,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     page.until("() => !document.querySelector('#compare').hidden")
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
     form.get_by_role("button", name="Compare").click()
-    assert "Nothing is changed yet" in form.locator(".error").text_content()
+    assert "The intervention is empty" in form.locator(".error").text_content()
     form.locator("[name=edit_faults]").select_option("blackout=0.8")
     form.get_by_role("button", name="Compare").click()
     page.until(READY)

@@ -111,7 +111,7 @@ export function mapMenu(menu, button, store, maps) {
   pin.addEventListener('click', () => maps.togglePin());
   maps.changed = () => {
     pin.textContent = maps.pinned
-      ? `Release step ${maps.pinned.maps.step}`
+      ? `Unpin step ${maps.pinned.maps.step}`
       : 'Show change from this step';
   };
   const setLayers = bindExport(html('.export', menu), () => maps.displayed);

@@ -215,7 +215,7 @@ export class ComparisonForm {
     if (weights) pairs.push(['weights', weights]);
     return pairs.length > 2
       ? joined(pairs)
-      : this.#setError('Nothing is changed yet: choose sensor faults, or move a weight.');
+      : this.#setError('The intervention is empty: choose sensor faults, or move a weight slider.');
   }
 
   /** @param {string} message */
@@ -244,7 +244,7 @@ export class ComparisonForm {
     for (const part of parts) part.hidden = part.dataset.kind !== this.#kind;
     const isExternal = this.#trace?.header.kind === 'external';
     html('[data-kind="edit"] > .why-not', this.#form).textContent = isExternal
-      ? 'Interventions are not possible: an external filter cannot be resumed at a step.'
+      ? 'Interventions on the page need a built-in filter. For an external filter, use beliefscope counterfactual.'
       : '';
     const noInputs = !this.#only.options.length;
     this.#only.disabled = noInputs;

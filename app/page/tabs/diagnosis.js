@@ -238,7 +238,7 @@ export class Diagnosis {
     const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them.`;
     const state = this.#starts
       ? stateOf(entry) || about
-      : 'A server that is not read-only can measure it.';
+      : 'Read-only server: the record cannot be measured here.';
     html('.status', this.#host).textContent = isReady ? '' : state;
     showJobButton(html('.doing', this.#host), entry, {
       action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
@@ -261,7 +261,7 @@ export class Diagnosis {
     host.hidden = !this.#starts || !isShown;
     if (host.hidden || !trace) return;
     const { data } = trace.selection;
-    const about = `The record was measured in this workspace; another measurement replaces it by the held-out episodes of ${data}, which must be healthy.`;
+    const about = `The record was measured in this workspace. Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
     html('.verdict', host).textContent = isInUse ? about : stateOf(entry);
     showJobButton(html('.doing', host), entry, {
       action: entry.state === 'active' ? 'Cancel' : 'Measure again',
@@ -359,7 +359,8 @@ export const isTrainable = ({ next }) => next.includes('`beliefscope finetune ')
  */
 function stateOf(entry) {
   if (entry.state === 'error') return sentence(entry.error);
-  if (entry.state === 'live') return 'A live run has no diagnosis: its trace holds no data set.';
+  if (entry.state === 'live')
+    return 'A live run has no diagnosis, because it belongs to no data set.';
   if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
   if (entry.state === 'loading') return 'Loading …';
   return '';
@@ -374,7 +375,7 @@ function aboutOf({
   statistics,
   unmeasured,
 }) {
-  const text = `${episodes} ${episodes === 1 ? 'episode' : 'episodes'} against ${healthy} healthy ones`;
+  const text = `${episodes} ${episodes === 1 ? 'episode' : 'episodes'} compared with ${healthy} healthy ones`;
   const numbers = Object.entries(statistics).map(
     ([name, count]) => `${displayName(name)} ${count}`,
   );

@@ -222,7 +222,7 @@ export class Diagnostics {
     const names = this.#entries.map(({ name }) => name).join(', ');
     html('.top h3', this.#host).textContent =
       diagnostic && !selected
-        ? `The link asks for diagnostic “${diagnostic}”, which does not exist. Available: ${names}.`
+        ? `The link names diagnostic “${diagnostic}”, which does not exist. Available: ${names}.`
         : (selected?.title ?? 'Diagnostics of this run');
     this.#list.hidden = Boolean(selected);
     this.#article.hidden = this.#backButton.hidden = !selected;

@@ -194,7 +194,7 @@ function eventColumns({ layers, scores }, score, events) {
         return fixed(value === null ? null : main.scale * value, 2);
       },
       number,
-      help: 'Main error of the task, such as that of the position',
+      help: 'Main error of the task, such as the position error',
     });
   });
   if (score.name !== 'nees' && events[0]?.nees !== null)
@@ -202,7 +202,7 @@ function eventColumns({ layers, scores }, score, events) {
       title: 'NEES',
       content: ({ nees }) => fixed(nees),
       number,
-      help: 'Normalized estimation error squared: mean 1 if the covariance is consistent',
+      help: 'Normalised estimation error squared: mean 1 if the covariance is consistent',
     });
   if (fuses && events[0]?.effective_weights)
     columns.push({

@@ -47,7 +47,7 @@ const BODY = `
   <section class="part weakness" aria-labelledby="weakness-title">
     <h4 id="weakness-title"><b>1</b> Weakness</h4>
     <div class="list" role="radiogroup" aria-labelledby="weakness-title"></div>
-    <p class="none">No weakness is known. The diagnosis of a run and a search for failures find some.</p>
+    <p class="none">No known weakness. Diagnose a run or search for failures to find one.</p>
   </section>
   <section class="part modules" aria-labelledby="modules-title">
     <h4 id="modules-title"><b>2</b> What to train</h4>

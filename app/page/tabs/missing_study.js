@@ -9,7 +9,7 @@ import { firstRun } from '../widgets/pickers.js';
 
 const SINGLE = ['image', 'haptics']; // modalities with a filter of their own
 const ABOUT =
-  'A study trains several filters with several seeds and compares their errors, so that differences between filters are not those of one training.';
+  'A study trains several filters with several seeds and compares their errors, so that differences between filters are not due to a single training.';
 
 /**
  * Returns the elements of the note.

@@ -14,7 +14,7 @@ export const STEPS = [
   {
     part: '#timeline',
     title: 'Timeline',
-    text: 'How much each modality weighs at each step, the estimates and their errors. Coloured bands: contact; hatched: no image. Click or drag to move the cursor.',
+    text: 'The weight of each modality, the estimates and their errors over time. Coloured bands are steps in contact, hatched bands steps without an image. Click or drag to move the cursor.',
   },
   {
     part: '#maps',
@@ -29,7 +29,7 @@ export const STEPS = [
   {
     part: '#views',
     title: 'Tabs',
-    text: 'Diagnosis names the probable cause of a fault; Failures ranks the worst steps; Compare changes one thing; Fine-tune trains selected modules.',
+    text: 'Diagnosis names the probable cause of a fault; Failures ranks the worst steps; Compare repeats the run with one change; Fine-tune trains selected modules.',
   },
   {
     part: 'header',

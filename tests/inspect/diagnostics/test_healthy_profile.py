@@ -162,7 +162,7 @@ def test_a_measured_profile_is_that_of_new_episodes() -> None:
 )
 def test_malformed_profiles_are_refused(change: dict[str, Any]) -> None:
     document = profile(trajectories(12, np.random.default_rng(6))).to_json()
-    with pytest.raises(BadInput, match="healthy profile"):
+    with pytest.raises(BadInput, match="healthy record"):
         HealthyProfile.from_json(document | change)
 
 
