@@ -152,7 +152,11 @@ OPTIONS: dict[str, Any] = {
         ...,
         "--map",
     ),
-    "particles_kept": option("M", "Particles of each step that are stored; moments are of all.", parser=integer(1)),
+    "particles_kept": option(
+        "M",
+        "Maximum number of particles stored in each step; means and covariances are those of all particles.",
+        parser=integer(1),
+    ),
     "particles": option("M", "Number of particles (particle filters).", parser=integer(1)),
     "seed": option("S", "Random seed.", parser=integer(0)),
     "train": option(
@@ -170,7 +174,7 @@ OPTIONS: dict[str, Any] = {
         "modalities) or regret (of the fusion weights).",
     ),
     "engine": option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]')."),
-    "workers": option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1)),
+    "workers": option("N", "Number of processes on this machine; the results do not depend on it.", parser=integer(1)),
     "align": flag(
         "Move data of another frame by the constant offset that explains the difference.", "--align", default=...
     ),

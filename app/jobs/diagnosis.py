@@ -1,4 +1,4 @@
-"""Jobs that diagnose a filter over episodes, search the smallest repair of a run, and measure a healthy record."""
+"""Jobs that diagnose a filter over episodes, find the smallest repair of a run, and measure a healthy record."""
 
 from collections.abc import Mapping
 from contextlib import closing
@@ -33,7 +33,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> Any:
 
 
 def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
-    """Search the smallest repair of the largest failure of a run; its stored trace is reused."""
+    """Find the smallest repair of the largest failure of a run; its stored trace is reused."""
     selection = Selection.from_json(arguments["selection"])
     with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
         report(0.0, "running the filter")

@@ -135,7 +135,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
 
 
 def _print_url(url: str) -> None:
-    print(f"Beliefscope is running at {url} (press Ctrl+C to stop)", flush=True)
+    print(f"Beliefscope is running at {url} (press Ctrl-C to stop)", flush=True)
 
 
 def serve(

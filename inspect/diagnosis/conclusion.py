@@ -209,8 +209,8 @@ def _search(case: Case, count: int) -> str:
     external = isinstance(checkpoint, ExternalFilter)
     source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
     return (
-        f"{f'{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search' if external else 'Search'} the data slices with "
-        f"large errors, in the tab Failures or by `beliefscope slices {checkpoint.task.name} --filter {source}`."
+        f"{f'{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search' if external else 'Search'} for data slices with "
+        f"large errors, in the tab Failures or with `beliefscope slices {checkpoint.task.name} --filter {source}`."
     )
 
 

@@ -48,7 +48,7 @@ def test_the_smallest_repair_is_drawn_in_the_timeline(open_page: Any) -> None:
     assert key.is_hidden()
     pixels = "() => [...document.querySelectorAll('#tracks canvas')].map((c) => c.toDataURL()).join()"
     before = page.page.evaluate(pixels)
-    page.page.get_by_role("button", name="Search the smallest repair").click()
+    page.page.get_by_role("button", name="Find the smallest repair").click()
     page.until("() => document.querySelector('#diagnosis .repair .verdict').textContent.includes('restoring')")
     assert key.is_visible()
     assert page.page.evaluate(pixels) != before

@@ -7,17 +7,24 @@ def collect(
     task: str,
     output: Path = opt.DATASET,
     episodes: int | None = opt.option(
-        "N", "Episodes. Default as in the paper: door 600, push 1000; others 100.", None, parser=opt.integer(1)
+        "N",
+        "Number of episodes. Default as in the paper: door 600, push 1000; others 100.",
+        None,
+        parser=opt.integer(1),
     ),
     steps: int | None = opt.option(
         "T",
-        "Steps of 0.1 s per episode. Default as in the paper: door 800, push 250; others 200.",
+        "Number of steps of 0.1 s per episode. Default as in the paper: door 800, push 250; others 200.",
         None,
         parser=opt.integer(2),
     ),
-    workers: int | None = opt.option("W", "Processes. Default: one per CPU core.", None, parser=opt.integer(1)),
+    workers: int | None = opt.option(
+        "W", "Number of processes. Default: one per CPU core.", None, parser=opt.integer(1)
+    ),
     seed: int = 0,
-    split: str | None = opt.option("NAME", "train, val or test: split of all episodes. Default: by number.", None),
+    split: str | None = opt.option(
+        "NAME", "Split of all episodes: train, val or test. Default: by episode number.", None
+    ),
     without: list[str] | None = opt.option(
         "INGREDIENT", "Ingredient of a field task to switch off (docs/field_tasks.md). Repeatable.", None
     ),

@@ -19,13 +19,13 @@ def diagnose(
     base: Path | None = opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None),
     alarm_rate: float = opt.option("P", "Probability that a healthy filter raises an alarm.", 0.02),
     profile_from: Path | None = opt.option(
-        "DATA", "Clean episodes whose held-out ones become the healthy record.", None
+        "DATA", "Clean data; the healthy record is measured on their held-out episodes.", None
     ),
     profile_filter: str | None = opt.option(
         "NAME|CHECKPOINT|MODULE:BUILD", "Filter that runs over --profile-from. Default: --filter.", None
     ),
     repair: int | None = opt.option(
-        "I", "Also search the smallest repair of this episode's failure.", None, parser=opt.integer(0)
+        "I", "Also find the smallest repair of the largest failure of this episode.", None, parser=opt.integer(0)
     ),
     workers: int = 1,
     engine: opt.Engine = "local",

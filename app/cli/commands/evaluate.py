@@ -4,7 +4,7 @@ from beliefscope.app.cli import console, options as opt
 def evaluate(
     runs: opt.Runs,
     only: str | None = opt.option(
-        "MODALITY", "Run the standalone filter of this modality: all others are masked.", None
+        "MODALITY", "Run the standalone filter of this modality: the observations of all others are masked.", None
     ),
     start_offset: str = opt.option(
         "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg.", ""

@@ -5,7 +5,7 @@ from beliefscope.datasets.errors import BadInput
 
 
 def lineage(
-    paths: list[Path] = opt.argument("FOLDER...", "Folders with checkpoints, or checkpoints."),
+    paths: list[Path] = opt.argument("FOLDER...", "Checkpoints, or folders with checkpoints."),
     export: str | None = opt.option("CHECKPOINT", "Copy this checkpoint (path or hash) and its ancestors to -o.", None),
     output: Path | None = opt.option("DIR", "New folder for --export.", None, "-o"),
 ) -> console.Result:

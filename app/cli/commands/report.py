@@ -24,7 +24,7 @@ def report(
     title: str = opt.option("TEXT", "Title of the report.", ""),
     events: list[str] | None = opt.option(
         "[EPISODE:]STEP",
-        "Step to show in detail, with images, maps and values. Repeatable. Default: the 3 with largest error.",
+        "Step to show in detail, with images, maps and values. Repeatable. Default: the 3 with the largest error.",
         None,
         "--event",
     ),

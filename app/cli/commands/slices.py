@@ -5,7 +5,7 @@ from beliefscope.datasets.errors import BadInput
 def slices(
     runs: opt.Runs,
     by: str = "error",
-    alpha: float = opt.option("P", "Probability of reporting any slice if errors depend on nothing.", 0.05),
+    alpha: float = opt.option("P", "Probability of reporting any slice if the errors depend on no condition.", 0.05),
     every: bool = False,
 ) -> console.Result:
     """Find data slices in which a filter is worse.

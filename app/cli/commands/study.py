@@ -15,7 +15,7 @@ def study(
     output: Path = opt.option("DIR", "Study folder; created if missing.", ..., "-o", "--output"),
     preset: str = opt.option("NAME", "Training schedule: smoke, cpu or full.", "cpu"),
     tasks: list[str] | None = opt.option(
-        "TASK", "Repeatable. Default: door, push and the tasks with --data.", None, "--task"
+        "TASK", "Task to study. Repeatable. Default: door, push and the tasks with --data.", None, "--task"
     ),
     filters: list[str] | None = opt.option(
         "NAME|FILE",
@@ -30,7 +30,9 @@ def study(
     ),
     skip_bad: bool = False,
     engine: opt.Engine = "local",
-    workers: int = opt.option("N", "Processes of this machine, each with one thread.", 1, parser=opt.integer(1)),
+    workers: int = opt.option(
+        "N", "Number of processes on this machine, each with one thread.", 1, parser=opt.integer(1)
+    ),
 ) -> console.Result:
     """Train and compare filters over many conditions.
 

@@ -19,7 +19,9 @@ def sweep(
     seeds: int = opt.option("K", "Run with seeds 0 to K - 1.", 1, parser=opt.integer(1)),
     particles: int = 300,
     every: bool = False,
-    block: int = opt.option("N", "Episodes of a cell, the unit of work that is stored.", 64, parser=opt.integer(1)),
+    block: int = opt.option(
+        "N", "Number of episodes in a cell, the unit of work that is stored.", 64, parser=opt.integer(1)
+    ),
     engine: opt.Engine = "local",
     workers: int = 1,
 ) -> console.Result:

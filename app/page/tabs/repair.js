@@ -70,7 +70,7 @@ export class Repair {
     html('.verdict', this.#host).textContent = textOf(entry);
     showJobButton(html('.doing', this.#host), entry, {
       action: ACTIONS[entry.state] ?? '',
-      label: entry.state === 'absent' ? 'Search the smallest repair' : '',
+      label: entry.state === 'absent' ? 'Find the smallest repair' : '',
       progress: 'Progress of the search for the smallest repair',
       press: () => this.#results.startOrCancel(this.#key, () => api.startRepair(trace.selection)),
     });
