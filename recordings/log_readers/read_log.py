@@ -315,7 +315,7 @@ def _times(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp
     for episode, time in zip(rows, times, strict=True):
         if error := time_error(time):
             raise BadInput(f"time {name!r} of episode {episode} {error}, counted from its first row")
-    dt = float(np.median(np.concatenate([np.diff(time) for time in times])))
+    dt = float(f"{np.median(np.concatenate([np.diff(time) for time in times])):.9g}")  # rounding errors
     regular = [np.abs(time - dt * np.arange(len(time))).max() <= IRREGULAR * dt for time in times]
     return dt, [None if same else time for same, time in zip(regular, times, strict=True)]
 

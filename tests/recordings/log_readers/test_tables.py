@@ -306,6 +306,7 @@ def test_files_of_a_folder_are_episodes(tmp_path: Path) -> None:
     assert [e.provenance["episode"] for e in episodes] == ["run_9", "run_10"]
     assert [e.states[:, 0].tolist() for e in episodes] == [[9.0, 10.0, 11.0], [10.0, 11.0, 12.0]]
     assert [e.observations["camera"].shape for e in episodes] == [(3, 4, 4)] * 2
+    assert {e.dt for e in episodes} == {0.1}, "not 0.0999999999999996, the difference of two times"
     assert 'time = "t"' in guess_map(preview_columns(tmp_path / "runs"), "runs")
 
 
