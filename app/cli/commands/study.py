@@ -30,9 +30,7 @@ def study(
     ),
     skip_bad: bool = False,
     engine: opt.Engine = "local",
-    workers: int = opt.option(
-        "N", "Number of processes on this machine, each with one thread.", 1, parser=opt.integer(1)
-    ),
+    workers: int = opt.option("N", "Number of processes, each with one thread.", 1, parser=opt.integer(1)),
 ) -> console.Result:
     """Train and compare filters over many conditions.
 
