@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,6 +87,20 @@ def profile_of(
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     return HealthyProfile(data, len(rows), particles, columns, sensors.reference)
+
+
+def overlap_warning(record: Sequence[Episode], diagnosed: Set[str]) -> str | None:
+    """One line about episodes of a healthy record that are themselves diagnosed, or None.
+
+    diagnosed: digests of the diagnosed episodes.
+    """
+    shared = sum(episode.digest() in diagnosed for episode in record)
+    if not shared:
+        return None
+    return (
+        f"the healthy record contains {shared} of the {len(diagnosed)} diagnosed episodes, so that a fault in them "
+        "does not show; measure it from other episodes, which are known to be clean"
+    )
 
 
 def measure_profile(

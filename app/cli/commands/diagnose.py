@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Set
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,8 +63,9 @@ def diagnose(
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
         episodes = faults.apply_all(data, indices, runs.seed)
+        digests = set() if faults else {data[index].digest() for index in indices}
         failed = None if repair is None else data[repair]
-    profile = _profile(correct, profile_from, len(episodes), alarm_rate)
+    profile = _profile(correct, profile_from, len(episodes), alarm_rate, digests)
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
@@ -86,14 +88,17 @@ def diagnose(
     return console.Result(document, "\n\n".join(parts))
 
 
-def _profile(checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float) -> HealthyProfile:
+def _profile(
+    checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float, diagnosed: Set[str]
+) -> HealthyProfile:
     """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``.
 
-    Raises BadInput, before the runs, if these are too few for the diagnosis of ``count`` episodes.
+    Raises BadInput, before the runs, if these are too few for the diagnosis of ``count`` episodes. Warns if some are
+    ``diagnosed``, given by their digests: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
     from beliefscope.inspect.diagnosis.diagnose import check_size, required_profile
-    from beliefscope.inspect.healthy import profile_of
+    from beliefscope.inspect.healthy import overlap_warning, profile_of
 
     if clean is None:
         return required_profile(checkpoint)
@@ -101,4 +106,6 @@ def _profile(checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate:
         indices = data.held_out()
         check_size(len(indices), count, alarm_rate)
         episodes = [data[index] for index in indices]
+        if warning := overlap_warning(episodes, diagnosed):
+            console.note(f"Warning: {warning}")
         return profile_of(checkpoint, episodes, str(clean), progress=advance, indices=indices)
