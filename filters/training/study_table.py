@@ -244,7 +244,7 @@ def _baseline_table(rows: Sequence[Row]) -> str:
             lines.append(f"| {row.filter} | {row.blackout:.0%} | {label(key)} | {' | '.join(values)} |")
     if not lines:
         return ""
-    head = ["\nRMSE beside that from step 0 and beside the baselines, from the same starts.\n"]
+    head = ["\nThe RMSE, the RMSE from step 0 and the baselines, all from the same starts.\n"]
     head.append(f"| filter | image blackout | quantity | filter | from step 0 | {' | '.join(BASELINES)} |")
     head.append("| --- | ---: | --- |" + " ---: |" * (2 + len(BASELINES)))
     return "\n".join(head + lines) + "\n"
