@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from beliefscope.app.cli import checks
 from beliefscope.app.cli.checks import CHECKS, Finding, Place, report, run_checks
@@ -36,6 +37,7 @@ def test_no_check_fails(run: Run, tmp_path: Path) -> None:
     assert (code, failed, err) == (0, {}, "")
     assert list(document["checks"]) == [check.__name__ for check in CHECKS]
     assert document["packages"]["torch"]
+    assert f", {torch.get_num_threads()} threads, " in document["checks"]["torch"]["message"]
     assert not list(tmp_path.iterdir()), "temporary files remain"
 
 
