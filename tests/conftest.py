@@ -7,11 +7,15 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from beliefscope.datasets.episode import Episode
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -80,6 +84,25 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def short_episodes() -> Callable[[str, Sequence[int], int], list[Episode]]:
+    """(task, indices, steps) -> the first steps of these episodes of the sample data set."""
+    from dataclasses import replace
+
+    from beliefscope.datasets.store import open_dataset, sample_path
+
+    def shorten(episode: Episode, steps: int) -> Episode:
+        arrays = {key: getattr(episode, key)[:steps] for key in ("states", "controls", "contact", "qpos")}
+        observations = {key: value[:steps] for key, value in episode.observations.items()}
+        return replace(episode, **arrays, observations=observations)
+
+    def short_episodes(task: str, indices: Sequence[int], steps: int) -> list[Episode]:
+        with open_dataset(sample_path(task)) as dataset:
+            return [shorten(dataset[index], steps) for index in indices]
+
+    return short_episodes
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,12 @@
-"""Fixtures of the filter tests: windows of random data, and short episodes of the sample data sets."""
+"""Fixture of the filter tests: windows of random data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 
 import pytest
 import torch
 
-from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch
 
 
@@ -29,19 +26,3 @@ def _window(steps: int, trajectories: int, seed: int = 0) -> Batch:
 @pytest.fixture
 def window() -> Callable[..., Batch]:
     return _window
-
-
-def _short_episodes(task: str, indices: Sequence[int], steps: int) -> list[Episode]:
-    def shorten(episode: Episode) -> Episode:
-        arrays = {key: getattr(episode, key)[:steps] for key in ("states", "controls", "contact", "qpos")}
-        observations = {key: value[:steps] for key, value in episode.observations.items()}
-        return replace(episode, **arrays, observations=observations)
-
-    with open_dataset(sample_path(task)) as dataset:
-        return [shorten(dataset[index]) for index in indices]
-
-
-@pytest.fixture(scope="session")
-def short_episodes() -> Callable[[str, Sequence[int], int], list[Episode]]:
-    """(task, indices, steps) -> the first steps of these episodes of the sample data set."""
-    return _short_episodes

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.filters.finetuning import training_data
@@ -32,10 +33,13 @@ def test_training_episodes_of_a_field_task_are_simulated(
     assert load_checkpoint(output).healthy_profile is not None
 
 
-def test_events_of_other_data_need_no_training_episodes(run: Run, tmp_path: Path) -> None:
+def test_events_of_other_data_need_no_training_episodes(
+    run: Run, tmp_path: Path, short_episodes: Callable[..., list[Episode]]
+) -> None:
     """Episodes with events are trained on, whatever their split; nothing is simulated for the user's own data."""
     with open_dataset(sample_path("push-field")) as sample:
-        write_dataset(tmp_path / "own.h5", sample.task, [sample[i] for i in sample.held_out()[:3]])
+        task, indices = sample.task, sample.held_out()[:3]
+    write_dataset(tmp_path / "own.h5", task, short_episodes(task.name, indices, 65))
     output, data = tmp_path / "tuned.safetensors", tmp_path / "own.h5"
     line = "finetune push-field --filter information-ekf --event 0:10-60 --steps 1 --length 8 --data"
     code, _, error = run(line, data, "-o", output)
