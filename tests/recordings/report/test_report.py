@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import re
+import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,6 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from beliefscope.app.cli.main import main
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
@@ -40,6 +44,7 @@ from beliefscope.recordings.report.text import definitions, methods
 pytestmark = pytest.mark.slow
 
 EPISODE = 9
+URL = "http://localhost:9000"
 TITLE = 'Doors <script>alert("1")</script> & 40 %'
 
 
@@ -54,13 +59,29 @@ def run_(checkpoint: Checkpoint) -> Trace:
         return trace(checkpoint, data[EPISODE], EPISODE)
 
 
+def write_by_command(folder: Path, run_: Trace) -> Any:
+    """Writes a report of one event with a title that must be escaped; returns the printed document."""
+    save_trace(run_, folder / "run.trace")
+    words = ["report", "run.trace", "--event", f"{EPISODE}:40", "--title", TITLE, "--url", URL, "--json", "-"]
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["beliefscope", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+    assert not end.value.code
+    return json.loads(out.getvalue())
+
+
 @pytest.fixture(scope="module")
-def report(run_: Trace, checkpoint: Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report of one event with a title that must be escaped."""
-    folder = tmp_path_factory.mktemp("reports") / "report"
-    link = lambda index, step: f"http://127.0.0.1:8000/?episode={EPISODE}&step={step}"  # noqa: E731
-    write_report(compose([run_], checkpoint, title=TITLE, steps=[(0, 40)], link=link), folder)
-    return folder
+def printed(run_: Trace, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    """The folder in which the command wrote a report, and the printed document."""
+    folder = tmp_path_factory.mktemp("reports")
+    return folder, write_by_command(folder, run_)
+
+
+@pytest.fixture(scope="module")
+def report(printed: tuple[Path, Any]) -> Path:
+    return printed[0] / "report"
 
 
 class PageParser(HTMLParser):
@@ -92,7 +113,8 @@ def test_page_is_self_contained(report: Path) -> None:
     assert len(page.ids) == len(set(page.ids))
     external = [reference for reference in page.references if not reference[1].startswith(("#", "data:"))]
     assert [tag for tag, _ in external] == ["a"], "the only external reference is the permalink"
-    assert parse_qs(urlsplit(external[0][1]).query) == {"episode": [str(EPISODE)], "step": ["40"]}
+    query = parse_qs(urlsplit(external[0][1]).query)
+    assert (query["episode"], query["step"]) == ([str(EPISODE)], ["40"])
     assert not {target[1:] for _, target in page.references if target.startswith("#")} - set(page.ids)
     assert "svg" in page.tags
     assert "math" in page.tags
@@ -118,11 +140,10 @@ def test_manifest_has_the_hash_of_every_file(report: Path, run_: Trace) -> None:
 
 
 @pytest.mark.long
-def test_same_traces_give_the_same_bytes(report: Path, run_: Trace, checkpoint: Checkpoint, tmp_path: Path) -> None:
-    link = lambda index, step: f"http://127.0.0.1:8000/?episode={EPISODE}&step={step}"  # noqa: E731
-    content = compose([run_], checkpoint, title=TITLE, steps=[(0, 40)], link=link)
-    document = write_report(content, tmp_path / "again")
-    assert document["files"] == json.loads((report / "manifest.json").read_text())["files"]
+def test_same_traces_give_the_same_bytes(report: Path, run_: Trace, tmp_path: Path) -> None:
+    write_by_command(tmp_path, run_)
+    again, first = (json.loads((folder / "manifest.json").read_text()) for folder in (tmp_path / "report", report))
+    assert again["files"] == first["files"]
 
 
 def test_folder_is_written_atomically(tmp_path: Path) -> None:
@@ -293,19 +314,15 @@ def test_commands_are_code() -> None:
     assert _code("Train: `a <b>`.") == "Train: <code>a &lt;b&gt;</code>."
 
 
-def test_command_adds_permalinks(run: Any, run_: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    save_trace(run_, tmp_path / "run.trace")
-    code, out, _ = run("report run.trace --event 9:40 --url http://localhost:9000 --json -")
-    assert code == 0
-    document = json.loads(out)
+def test_command_adds_permalinks(printed: tuple[Path, Any]) -> None:
+    folder, document = printed
     links = [parse_qs(urlsplit(event["link"]).query) for event in document["events"]]
     assert [link["step"] for link in links] == [["40"]]
     assert {link["data"][0] for link in links} == {"sample"}
-    assert document["events"][0]["link"].startswith("http://localhost:9000/?task=door&filter=crossmodal-ekf")
-    assert document["traces"][0]["sha256"] == hashlib.sha256((tmp_path / "run.trace").read_bytes()).hexdigest()
+    assert document["events"][0]["link"].startswith(f"{URL}/?task=door&filter=crossmodal-ekf")
+    assert document["traces"][0]["sha256"] == hashlib.sha256((folder / "run.trace").read_bytes()).hexdigest()
     assert "beliefscope trace door --filter crossmodal-ekf --episode 9 --seed 0 -o run.trace" in document["commands"]
-    assert (tmp_path / "report" / "report.html").is_file()
+    assert (folder / "report" / "report.html").is_file()
 
 
 @pytest.mark.long
