@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 STATE = "document.querySelector('#finetune article')?.dataset.state"
@@ -15,12 +16,12 @@ FILTERS = "() => [...document.querySelector('#filter').options].map((option) => 
 
 
 def test_filter_is_finetuned_promoted_and_discarded(
-    open_page: Any, start_server: Callable[..., Any], tmp_path: Path
+    open_page: Any, start_server: Callable[..., Any], short_episodes: Callable[..., list[Episode]], tmp_path: Path
 ) -> None:
     with open_dataset(sample_path("door")) as data:
         held_out = data.held_out()
         indices = [index for index in range(0, len(data), 11) if index not in held_out] + held_out[:2]
-        write_dataset(tmp_path / "few.h5", find_task("door"), [data[index] for index in indices])
+    write_dataset(tmp_path / "few.h5", find_task("door"), short_episodes("door", indices, 60))
     # A separate server, as the test changes the default filter.
     server = start_server("--data", str(tmp_path / "few.h5"))
     page = open_page("?tab=finetune&filter=crossmodal-ekf&data=few", server.url)
