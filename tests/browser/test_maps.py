@@ -39,7 +39,7 @@ def numbers(text: str) -> list[float]:
     return [float(n.replace("\N{MINUS SIGN}", "-")) for n in re.findall("[+\N{MINUS SIGN}]?\\d+(?:\\.\\d+)?", text)]
 
 
-def test_values_and_exports_match_the_engine(
+def test_values_and_exports_match_the_engine_and_the_quantity_is_a_switch(
     open_page: Any, engine: MapEngine, expected: LikelihoodMap, tmp_path: Path
 ) -> None:
     page = open_page(LINK)
@@ -73,6 +73,8 @@ def test_values_and_exports_match_the_engine(
     texts = [text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")]
     assert {*(f"{layer} likelihood" for layer in expected.layers), "Δ hinge x (cm)"} <= {*texts}
     assert files["png"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    page.page.keyboard.press("Escape")
+    check_quantity(page)
 
 
 def check_numbers(page: Any, expected: LikelihoodMap, run: Trace) -> None:
@@ -183,8 +185,8 @@ def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
     assert page.maps() == plain
 
 
-def test_quantity_is_a_switch_with_a_key_in_the_permalink_and_can_be_undone(open_page: Any) -> None:
-    page = open_page(LINK)
+def check_quantity(page: Any) -> None:
+    """The quantity of the maps is a switch, has a key, is in the permalink and can be undone."""
     rule, kind = page.page.locator("#maps-rule"), page.page.locator("#maps-kind")
     assert kind.text_content() == "Likelihood"
     assert rule.text_content() == ". Fused: beta-weighted sum of normalised likelihoods (crossmodal)"
