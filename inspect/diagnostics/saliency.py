@@ -341,7 +341,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
 ENTRY = Entry(
     name="saliency",
     title="Saliency",
-    question="Which pixels and which haptics channels determined the result of a step?",
+    question="Which pixels and which channels of the other sensors determined the result of a step?",
     run=saliency,
     why_not=why_not,
     needs="checkpoint",
