@@ -126,7 +126,7 @@ class EpisodeFile(Dataset):
         format_ = self._file.attrs.get("format")
         if format_ != FORMAT:
             raise BadInput(
-                f"{self.path} is an HDF5 file, but not a dataset: its attribute 'format' is {format_!r}, "
+                f"{self.path} is an HDF5 file, but not a data set: its attribute 'format' is {format_!r}, "
                 f"expected {FORMAT!r}."
             )
         version = self._file.attrs.get("version")

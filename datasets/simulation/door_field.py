@@ -122,7 +122,7 @@ DOOR_FIELD = replace(
             {"hinge": "m", "angle": "rad"},
         ),
         "nudges": Ingredient(
-            "external torques on the door: number per s, mean rotation in rad",
+            "external torques on the door: number per s, mean rotation (rad)",
             {"per_second": (0.05, 0.12), "angle": (0.1, 0.25)},
             {"per_second": "1/s", "angle": "rad"},
         ),

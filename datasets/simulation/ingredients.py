@@ -58,7 +58,9 @@ def camera_pose(shift: float, turn: float) -> Ingredient:
     """Pose error of the camera: up to ``shift`` m along and ``turn`` rad about each axis."""
     turns = _symmetric(turn, "turn_x", "turn_y", "turn_z")
     units = dict.fromkeys(XYZ, "m") | dict.fromkeys(turns, "rad")
-    return Ingredient("pose error of the camera: m along, rad about each axis", _symmetric(shift, *XYZ) | turns, units)
+    return Ingredient(
+        "pose error of the camera: along (m) and about (rad) each axis", _symmetric(shift, *XYZ) | turns, units
+    )
 
 
 def wrist(force: float) -> Ingredient:
@@ -77,7 +79,7 @@ def wrist(force: float) -> Ingredient:
 
 SENSOR_INGREDIENTS = {
     "sleeve": Ingredient(
-        "sleeve around the hand, hides the object: m",
+        "sleeve around the hand, which hides the object (m)",
         {"radius": (0.05, 0.1), "end": (0.03, 0.07)},
         {"radius": "m", "end": "m"},
     ),
@@ -87,12 +89,12 @@ SENSOR_INGREDIENTS = {
         {"blur": "pixels", "noise": "gray levels"},
     ),
     "outages": Ingredient(
-        "stretches without images: share of all steps, mean duration in s",
+        "stretches without images: share of all steps, mean duration (s)",
         {"fraction": (0.3, 0.5), "seconds": (1.0, 3.0)},
         {"seconds": "s"},
     ),
     "hand-pose": Ingredient(
-        "bias and noise of the measured hand position, m",
+        "bias and noise of the measured hand position (m)",
         _symmetric(0.003, *XYZ) | {"noise": (0.0005, 0.002)},
         dict.fromkeys((*XYZ, "noise"), "m"),
     ),
@@ -163,7 +165,7 @@ def start_ingredient(distances: Mapping[str, tuple[float, float]]) -> Ingredient
     """Distance of the first belief's mean from the true state: unit -> range."""
     units = " and ".join(distances)
     return Ingredient(
-        f"distance of the first belief from the true state, {units}",
+        f"distance of the first belief from the true state ({units})",
         dict(distances),
         {unit: unit for unit in distances},
     )

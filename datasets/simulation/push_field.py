@@ -186,12 +186,12 @@ PUSH_FIELD = replace(
         "wrist": wrist(0.5),
         **SENSOR_INGREDIENTS,
         "aim": Ingredient(
-            "error of the position at which the policy aims, standard deviation in m",
+            "error of the position at which the policy aims, standard deviation (m)",
             {"std": (0.01, 0.02)},
             {"std": "m"},
         ),
         "nudges": Ingredient(
-            "external impulses on the puck: number per s, mean distance in m",
+            "external impulses on the puck: number per s, mean distance (m)",
             {"per_second": (0.05, 0.12), "distance": (0.02, 0.04)},
             {"per_second": "1/s", "distance": "m"},
         ),

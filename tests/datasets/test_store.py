@@ -224,8 +224,8 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (no_attribute("/", "format"), r"not a dataset: its attribute 'format' is None, expected 'beliefscope-"),
-        (attribute("/", "format", 3), "not a dataset"),
+        (no_attribute("/", "format"), r"not a data set: its attribute 'format' is None, expected 'beliefscope-"),
+        (attribute("/", "format", 3), "not a data set"),
         (attribute("/", "version", 9), "version 9 of the layout; this release reads version 1"),
         (attribute("/", "definition", "{"), "attribute 'definition' is not the JSON of a task: Expecting property"),
         (attribute("/", "definition", "{}"), "incomplete definition of a task: KeyError: 'name'"),
@@ -301,7 +301,7 @@ def test_external_hdf5_file_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "external.h5"
     with h5py.File(path, "w") as file:
         file["trajectory0/object-state"] = np.zeros((5, 5), np.float32)
-    check_rejected(path, "is an HDF5 file, but not a dataset")
+    check_rejected(path, "is an HDF5 file, but not a data set")
 
 
 @pytest.mark.parametrize("index", [-1, 2])
