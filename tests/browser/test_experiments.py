@@ -85,3 +85,35 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path:
         assert page.state.items() >= {**selection, "step": episode["worst_step"]}.items()
     finally:
         shutil.rmtree(folder)
+
+
+def test_a_slow_or_failed_load_is_reported(open_page: Any, server: Any) -> None:
+    """Before the modules of the tabs arrive, while the sweeps load, and after an error."""
+    waiting: list[Any] = []
+    page = open_page()
+
+    def answer(address: str) -> None:
+        for _ in range(400):
+            if waiting:
+                break
+            page.page.wait_for_timeout(50)
+        waiting.pop().continue_()
+        page.page.unroute(address)
+
+    page.page.route("**/tabs/tabs.js", lambda route: waiting.append(route))
+    page.page.goto(f"{server.url}?tab=experiments")
+    note = page.page.locator("#experiments .note")
+    page.until("() => document.querySelector('#experiments').dataset.state === 'loading'")
+    note.filter(has_text="Loading …").wait_for()
+    failure = {"status": 500, "json": {"error": "The table is on a broken disk"}}
+    page.page.route("**/api/experiments", lambda route: route.fulfill(**failure))
+    answer("**/tabs/tabs.js")
+    page.until("() => document.querySelector('#experiments').dataset.state === 'error'")
+    assert "The table is on a broken disk." in note.text_content()
+    page.page.route("**/api/experiments", lambda route: waiting.append(route))
+    note.get_by_role("button", name="Try again").click()
+    page.until("() => document.querySelector('#experiments').dataset.state === 'loading'")
+    assert note.text_content() == "Loading …"
+    answer("**/api/experiments")
+    page.until("() => document.querySelector('#experiments').dataset.state === 'empty'")
+    page.errors = [error for error in page.errors if "500" not in error]

@@ -9,7 +9,7 @@ import { create, element, html, messageOf } from '../core/dom.js';
 import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
-import { setPanelState } from '../widgets/panel_state.js';
+import { setPanelError, setPanelState } from '../widgets/panel_state.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
 import { columnsOf, entryColumns } from './experiment_columns.js';
@@ -42,6 +42,7 @@ const EMPTY = {
     'beliefscope serve --sweep sweep',
   ],
 };
+const LOADING_DELAY = 150; // ms until a panel with contents shows that it loads
 const ROWS_AT_ONCE = 200; // drawn before the table is scrolled
 
 const BODY = `
@@ -80,7 +81,7 @@ export class Experiments {
   #open = false;
   /** @type {SweepInfo[] | null} */
   #sweeps = null;
-  /** Rows of the sweep and steps in `#loaded`. @type {ExperimentRow[]} */
+  /** Rows of the displayed sweep and steps. @type {ExperimentRow[]} */
   #rows = [];
   /** Names of the columns with numbers. @type {string[]} */
   #numbers = [];
@@ -91,7 +92,9 @@ export class Experiments {
   #count = 0;
   /** Sweeps that cannot be read, one sentence each. @type {string[]} */
   #problems = [];
-  #loaded = '';
+  /** Number of requested loads; the answers to all but the last one are ignored. */
+  #loads = 0;
+  #loadingTimer = 0;
   #episodes;
   #groupMenu;
   #body;
@@ -168,22 +171,28 @@ export class Experiments {
   }
 
   async #load() {
-    if (!this.#sweeps) setPanelState(this.#host, 'loading', 'Loading …');
+    const load = ++this.#loads;
+    clearTimeout(this.#loadingTimer);
+    const showLoading = () => setPanelState(this.#host, 'loading', 'Loading …');
+    if (!this.#sweeps || this.#host.dataset.state === 'error') showLoading();
+    else this.#loadingTimer = setTimeout(showLoading, LOADING_DELAY);
     try {
       const { sweeps, problems } = await api.sweeps();
+      if (load !== this.#loads) return; // another choice was made
       this.#sweeps = sweeps;
       this.#problems = problems.map(sentence);
       this.#report(this.#problems.join(' '));
       const sweep = this.#sweep;
       if (!sweep) {
+        clearTimeout(this.#loadingTimer);
         setPanelState(this.#host, 'empty');
         html('.note', this.#host).replaceChildren(...emptyNote(EMPTY));
         return;
       }
-      const wanted = `${sweep.name} ${this.#steps}`;
       const { rows, count } = await api.experiments(sweep.name, this.#steps);
-      if (wanted !== `${this.#sweep?.name} ${this.#steps}`) return; // another choice was made meanwhile
-      [this.#rows, this.#count, this.#loaded] = [rows, count, wanted];
+      if (load !== this.#loads) return;
+      clearTimeout(this.#loadingTimer);
+      [this.#rows, this.#count] = [rows, count];
       const { entries } = entryColumns(rows, []);
       this.#numbers = [...NUMBER_KEYS, ...entries.filter((name) => isNumeric(rows, name))];
       setPanelState(this.#host, 'ready');
@@ -191,7 +200,9 @@ export class Experiments {
       this.#draw();
       this.#showSelected();
     } catch (error) {
-      setPanelState(this.#host, 'error', messageOf(error));
+      if (load !== this.#loads) return;
+      clearTimeout(this.#loadingTimer);
+      setPanelError(this.#host, messageOf(error), () => this.#load());
     }
   }
 

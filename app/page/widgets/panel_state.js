@@ -19,6 +19,19 @@ export function setPanelState(body, state, text = '', share = null) {
   note.classList.toggle('measured', state === 'loading' && share !== null);
 }
 
+/**
+ * Shows why a panel could not be loaded, and a button that loads it again.
+ * @param {HTMLElement} body contains a `.note`
+ * @param {string} text
+ * @param {() => void} retry
+ */
+export function setPanelError(body, text, retry) {
+  setPanelState(body, 'error', text);
+  const button = create('button', { type: 'button', className: 'text', textContent: 'Try again' });
+  button.addEventListener('click', retry);
+  html('.note', body).append(button);
+}
+
 /** Messages at the top of the page, one per key; each stays until it is replaced, cleared or dismissed. */
 export class Messages {
   #host;
