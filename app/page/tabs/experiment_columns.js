@@ -2,8 +2,11 @@
 
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
+/** @typedef {{rows: string, groups: string, pinned: string}} TableState of the page's state */
+/** @typedef {{columns: Column[], entries: string[], count: number, grouping: string[], pinned: string[]}} TableLayout */
 
 import { displayName } from '../core/units.js';
+import { groupEntries, namesIn } from './experiment_group_menu.js';
 import { differingEntries, entryText, isNumeric } from './experiment_provenance.js';
 import { NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
 
@@ -85,4 +88,30 @@ export function columnsOf(rows, areGroups, entries, pinned) {
   ];
   const at = (/** @type {Column} */ { key }) => pinned.indexOf(key) >>> 0; // those not pinned last, in their order
   return [first, ...others.sort((a, b) => at(a) - at(b))];
+}
+
+/**
+ * Returns a function from the rows and the state to the columns, the entries of the provenance that are columns, the
+ * number of differing entries, and the entries that distinguish groups. For the same rows and choices, such as while
+ * the filter of the rows is typed, its last result is returned again.
+ * @returns {(rows: ExperimentRow[], state: TableState) => TableLayout}
+ */
+export function tableLayout() {
+  /** @type {ExperimentRow[] | null} */
+  let lastRows = null;
+  let lastChoices = '';
+  /** @type {TableLayout} */
+  let layout;
+  return (rows, { rows: mode, groups, pinned: names }) => {
+    const choices = JSON.stringify([mode, groups, names]);
+    if (rows === lastRows && choices === lastChoices) return layout;
+    const pinned = namesIn(names);
+    const grouping = groupEntries(rows, groups);
+    const { entries, count } = entryColumns(rows, pinned);
+    const areGroups = mode === 'seeds';
+    const columns = columnsOf(rows, areGroups, areGroups ? grouping : entries, pinned);
+    layout = { columns, entries, count, grouping, pinned };
+    [lastRows, lastChoices] = [rows, choices];
+    return layout;
+  };
 }

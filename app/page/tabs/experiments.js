@@ -12,10 +12,10 @@ import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelError, setPanelState } from '../widgets/panel_state.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
-import { columnsOf, entryColumns } from './experiment_columns.js';
+import { entryColumns, tableLayout } from './experiment_columns.js';
 import { EpisodePanel } from './experiment_episodes.js';
 import { matching } from './experiment_filter.js';
-import { GroupMenu, groupEntries, namesIn, namesText } from './experiment_group_menu.js';
+import { GroupMenu, namesIn, namesText } from './experiment_group_menu.js';
 import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
 import { isAddress, isNumeric } from './experiment_provenance.js';
 import {
@@ -89,6 +89,7 @@ export class Experiments {
   #columns = [];
   /** Matching rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
   #matching = [];
+  #layout = tableLayout();
   #count = 0;
   /** Sweeps that cannot be read, one sentence each. @type {string[]} */
   #problems = [];
@@ -242,10 +243,7 @@ export class Experiments {
   #draw() {
     const { state } = this.#store;
     const areGroups = state.rows === 'seeds';
-    const pinned = namesIn(state.pinned);
-    const grouping = groupEntries(this.#rows, state.groups);
-    const { entries, count } = entryColumns(this.#rows, pinned);
-    const columns = columnsOf(this.#rows, areGroups, areGroups ? grouping : entries, pinned);
+    const { columns, entries, count, grouping, pinned } = this.#layout(this.#rows, state);
     const sort = parseSort(state.sort);
     const matched = matching(this.#rows, state.match);
     const groups = areGroups ? seedGroups(matched.rows, grouping) : matched.rows;
