@@ -249,5 +249,5 @@ def test_a_fault_of_an_unused_sensor_has_no_action_for_the_filter() -> None:
     assert unused["image"] == {f"{sensor}.{mechanism}" for sensor in sensors for mechanism in REQUIRED[sensor]}
     assert not unused["crossmodal"]
     frozen = next(cause for cause in CAUSES if cause.name == "image.frozen")
-    assert next_action(frozen, checkpoints["haptics"]).startswith("This filter does not use the image sensor, so")
+    assert next_action(frozen, checkpoints["haptics"]).startswith("This filter does not use the image sensor and")
     assert next_action(frozen, checkpoints["image"]) == frozen.next
