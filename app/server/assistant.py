@@ -58,7 +58,7 @@ class Assistant:
         }
 
     def explain_run(self, task: str, filter: str, episode: int, data: str = "", faults: str = "") -> dict[str, Any]:
-        """Why a filter succeeds or fails in one episode: diagnosis, errors and weights by phase, and worst moments.
+        """Why a filter succeeds or fails in one episode: diagnosis, errors and weights by phase, and worst steps.
 
         faults: sensor faults to inject first, such as ``blackout=0.4``; usually empty.
         """
@@ -70,13 +70,11 @@ class Assistant:
             diagnosis = {"state": "unknown", "headline": str(reason)}
         main, error = run.task.main_error, measures.main_error(run)
         worst = np.argsort(-np.nan_to_num(error[:, -1]))[:3].tolist()
-        moments = [
+        steps = [
             {"step": step, main.key: main.factor * error[step, -1], "link": self._link(run, filter, data, step)}
             for step in worst
         ]
-        return as_json(
-            {"run": repr(run), "diagnosis": diagnosis, "phases": phase_summaries(run), "worst_moments": moments}
-        )
+        return as_json({"run": repr(run), "diagnosis": diagnosis, "phases": phase_summaries(run), "worst_steps": steps})
 
     def values(
         self, task: str, filter: str, episode: int, step: int, data: str = "", faults: str = ""
@@ -100,7 +98,7 @@ class Assistant:
     def failures(
         self, task: str, filter: str, data: str = "", faults: str = "", by: str = "error", top: int = 10
     ) -> dict[str, Any]:
-        """The worst moments of a filter over the held-out episodes, and the phases in which they are more frequent.
+        """The worst events of a filter over the held-out episodes, and the phases in which they are more frequent.
 
         by: score that ranks them: error, nees, ess, disagreement or regret.
         """

@@ -221,7 +221,7 @@ export class FinetuneForm {
     if (episode !== null) {
       const textContent = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;
       const link = create('button', { type: 'button', className: 'text quiet', textContent });
-      link.title = 'Show this moment';
+      link.title = 'Show this step';
       link.addEventListener('click', () =>
         this.#store.set({ episode, step: step ?? 0, tab: 'diagnosis', playing: false }),
       );

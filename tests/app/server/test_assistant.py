@@ -38,8 +38,8 @@ def test_answers_agree_with_the_trace(assistant: Assistant) -> None:
     counted = measures.counted(run)
     rmse = answer["phases"]["all"]["rmse_position_cm"]
     assert rmse["fused"] == pytest.approx(np.sqrt(np.mean(error[counted, -1] ** 2)))
-    assert answer["worst_moments"][0]["step"] == int(error[:, -1].argmax())
-    assert "task=door" in answer["worst_moments"][0]["link"]
+    assert answer["worst_steps"][0]["step"] == int(error[:, -1].argmax())
+    assert "task=door" in answer["worst_steps"][0]["link"]
     assert sum(answer["phases"]["contact"]["effective_weights"].values()) == pytest.approx(1.0)
     assert answer["diagnosis"]["headline"]
     values = assistant.values(**RUN, step=50)
