@@ -52,7 +52,7 @@ KINDS = {
     "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
     "object offset": ("distance of the object in the image from its labelled position{axis}", False, 0.1),
     "object match": ("similarity of the object in the image to healthy images{axis}", True, 0.05),
-    "contact distance": ("distance of the hand from the labelled object beyond healthy ones{axis}", False, 5e-4),
+    "contact distance": ("distance of the hand from the labelled object minus the healthy distance{axis}", False, 5e-4),
     "contact distance error": ("deviation of the hand from the labelled object{axis}", False, 5e-4),
     "contact distance scatter": ("variation of the hand's deviation between episodes{axis}", False, 5e-4),
     "offset": ("offset{of} from the measured hand or the estimates", False, 0.002),
