@@ -1,23 +1,22 @@
-/** The Experiments tab: checkpoints of a sweep as a sortable, filterable table and a scatter plot, and their episodes. */
+/** The Experiments tab: its choices, and the loading of results for the table, the scatter plot and the list of episodes. */
 
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Catalog, ExperimentRow, SweepInfo } from '../types/server.js' */
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
-import { create, element, html, messageOf } from '../core/dom.js';
+import { element, html, messageOf } from '../core/dom.js';
 import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelError, setPanelState } from '../widgets/panel_state.js';
-import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
-import { sortHeading, sortRows } from '../widgets/sorting.js';
+import { sortRows } from '../widgets/sorting.js';
 import { entryColumns, tableLayout } from './experiment_columns.js';
 import { EpisodePanel } from './experiment_episodes.js';
 import { matching } from './experiment_filter.js';
-import { GroupMenu, namesIn, namesText } from './experiment_group_menu.js';
+import { GroupMenu, namesText } from './experiment_group_menu.js';
 import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
-import { isAddress, isNumeric } from './experiment_provenance.js';
+import { isNumeric } from './experiment_provenance.js';
 import {
   NUMBER_KEYS,
   NUMBERS,
@@ -27,7 +26,8 @@ import {
   sortValue,
   unknownChoice,
 } from './experiment_rows.js';
-import { coloured, drawScatter, levelName, markPoint } from './scatter.js';
+import { ExperimentTable } from './experiment_table.js';
+import { drawScatter, levelName, markPoint } from './scatter.js';
 
 const EMPTY = {
   title: 'No sweep yet',
@@ -43,7 +43,6 @@ const EMPTY = {
   ],
 };
 const LOADING_DELAY = 150; // ms until a panel with contents shows that it loads
-const ROWS_AT_ONCE = 200; // drawn before the table is scrolled
 
 const BODY = `
   <div class="top">
@@ -85,8 +84,6 @@ export class Experiments {
   #rows = [];
   /** Names of the columns with numbers. @type {string[]} */
   #numbers = [];
-  /** Columns of the table. @type {Column[]} */
-  #columns = [];
   /** Matching rows, in order. @type {(ExperimentRow | SeedGroup)[]} */
   #matching = [];
   #layout = tableLayout();
@@ -98,7 +95,7 @@ export class Experiments {
   #loadingTimer = 0;
   #episodes;
   #groupMenu;
-  #body;
+  #table;
 
   /**
    * @param {HTMLElement} host
@@ -109,12 +106,10 @@ export class Experiments {
     this.#host = host;
     this.#store = store;
     host.innerHTML = BODY;
-    this.#body = element('.checkpoints tbody', HTMLTableSectionElement, host);
-    navigateRows(this.#body);
-    const scroll = html('.scroll', host);
-    scroll.addEventListener('scroll', () => {
-      const below = scroll.scrollHeight - scroll.scrollTop - scroll.clientHeight;
-      if (below < scroll.clientHeight) this.#addRows(ROWS_AT_ONCE);
+    this.#table = new ExperimentTable(html('.scroll', host), {
+      select: (row) => this.#select(row),
+      sort: (next) => store.set({ sort: sortText(next) }),
+      pin: (names) => store.set({ pinned: namesText(names) }),
     });
     new ResizeObserver(() => this.#drawChart()).observe(html('.chart', host));
     this.#listenToPickers();
@@ -261,40 +256,10 @@ export class Experiments {
       `${matched.rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.${areGroups ? '' : cut}`;
     this.#report([...this.#problems, ...this.#unknownChoices(columns)].join(' '));
     this.#groupMenu.show(this.#rows, state.groups, areGroups);
-    const heads = columns.map(({ key, title, help, number }, i) => {
-      const head = sortHeading(
-        { name: key, title, help, number },
-        sort,
-        (next) => this.#store.set({ sort: sortText(next) }),
-        number,
-      );
-      // beside the title, at the side away from the values' edge
-      if (i > 0) head[number ? 'prepend' : 'append'](this.#pinButton(key, title, pinned));
-      return head;
-    });
-    element('.checkpoints thead', HTMLTableSectionElement, this.#host).replaceChildren(
-      create('tr', {}, ...heads),
-    );
-    this.#body.replaceChildren();
     this.#matching = rows;
-    this.#columns = columns;
-    this.#addRows(ROWS_AT_ONCE);
+    this.#table.draw({ rows, columns, pinned, sort, filters: this.#filters });
     this.#drawChart();
-    this.#mark();
-  }
-
-  /**
-   * Adds the next rows to the table, which has the first ones until it is scrolled.
-   * @param {number} count
-   */
-  #addRows(count) {
-    const drawn = this.#body.rows.length;
-    const filters = this.#filters;
-    const lines = this.#matching
-      .slice(drawn, drawn + count)
-      .map((row) => this.#tableRow(row, filters));
-    this.#body.append(...lines);
-    if (lines.length) this.#stick();
+    this.#table.mark(state.cell);
   }
 
   /**
@@ -329,64 +294,9 @@ export class Experiments {
     markPoint(html('.chart', this.#host), cell);
   }
 
-  /**
-   * @param {string} key
-   * @param {string} title
-   * @param {string[]} pinned
-   */
-  #pinButton(key, title, pinned) {
-    const isPinned = pinned.includes(key);
-    const button = create('button', { type: 'button', className: 'quiet pin', textContent: '⇤' });
-    button.title = isPinned ? 'Release this column' : 'Keep this column at the left';
-    button.ariaLabel = `Pin ${title}`;
-    button.ariaPressed = String(isPinned);
-    button.addEventListener('click', () => {
-      const others = pinned.filter((name) => name !== key);
-      const names = isPinned ? others : [...others, key];
-      this.#store.set({ pinned: namesText(names) });
-    });
-    return button;
-  }
-
-  /** Keeps the first column and those pinned at the left of the table when it scrolls. */
-  #stick() {
-    const pinned = namesIn(this.#store.state.pinned);
-    const count = this.#columns.filter(({ key }) => pinned.includes(key)).length;
-    const lines = [...element('.checkpoints', HTMLTableElement, this.#host).rows];
-    const widths = [...lines[0].cells].slice(0, count).map((cell) => cell.offsetWidth);
-    for (const line of lines)
-      widths.reduce((left, width, i) => {
-        const cell = line.cells[i + 1];
-        cell.classList.add('pinned');
-        cell.style.left = `${left + width}px`;
-        return left + width;
-      }, 0);
-  }
-
   /** Names of all filters; their order sets the colours. */
   get #filters() {
     return [...new Set(this.#rows.map(({ filter }) => filter))];
-  }
-
-  /**
-   * @param {ExperimentRow | SeedGroup} row
-   * @param {string[]} filters their order sets the colours
-   */
-  #tableRow(row, filters) {
-    const button = create('button', { type: 'button', className: 'quiet', textContent: row.name });
-    button.title = `${row.name}: its worst episodes`;
-    const dot = coloured(create('span', { className: 'dot' }), row, filters);
-    const line = create('tr', {}, create('th', { scope: 'row' }, dot, button));
-    line.dataset.cell = cellOf(row);
-    line.addEventListener('click', () => this.#select(row)); // also clicks on the button, which serves the keyboard
-    for (const { content, number } of this.#columns.slice(1)) {
-      const cell = line.insertCell();
-      cell.className = number ? 'number' : '';
-      const text = content(row);
-      if (isAddress(text)) cell.append(externalLink(text));
-      else cell.textContent = text;
-    }
-    return line;
   }
 
   /** @param {ExperimentRow | SeedGroup} row */
@@ -395,22 +305,11 @@ export class Experiments {
     this.#store.set({ cell: cell === this.#store.state.cell ? '' : cell });
   }
 
-  #mark() {
-    const { cell } = this.#store.state;
-    const missing = this.#matching.findIndex((row) => cellOf(row) === cell) + 1;
-    this.#addRows(Math.max(0, missing - this.#body.rows.length));
-    for (const line of this.#body.rows) {
-      const here = line.dataset.cell === cell;
-      line.classList.toggle('here', here);
-      if (here) setTabStop(line, false);
-    }
-    markPoint(html('.chart', this.#host), cell);
-  }
-
   /** Lists the episodes of the selected checkpoint, or the checkpoints of the selected group. */
   #showSelected() {
-    this.#mark();
     const { cell } = this.#store.state;
+    this.#table.mark(cell);
+    markPoint(html('.chart', this.#host), cell);
     const group = this.#matching.find((row) => cellOf(row) === cell && 'members' in row);
     const row = this.#rows.find((other) => rowKey(other) === cell);
     this.#episodes.show(this.#sweep?.name ?? '', this.#steps, group ?? row);
@@ -420,12 +319,4 @@ export class Experiments {
   #report(problem) {
     html('.problems', this.#host).textContent = problem;
   }
-}
-
-/** @param {string} address */
-function externalLink(address) {
-  const textContent = address.replace(/^https?:\/\//, '');
-  const link = create('a', { href: address, target: '_blank', rel: 'noopener', textContent });
-  link.addEventListener('click', (event) => event.stopPropagation()); // does not select the row
-  return link;
 }
