@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -12,6 +13,20 @@ VISIBLE = """(selectors) => selectors.filter((selector) => {
   const { left, top, right, bottom } = document.querySelector(selector).getBoundingClientRect();
   return !(right > left && bottom > top && left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight);
 })"""
+
+
+TAB_SPACE = """() => {
+  const bar = document.querySelector('#views .tabs');
+  const spaces = [...bar.children].map((tab) => {
+    const range = document.createRange();
+    range.selectNodeContents(tab);
+    const [outer, inner] = [tab.getBoundingClientRect(), range.getBoundingClientRect()];
+    return [Math.min(inner.left - outer.left, outer.right - inner.right), range.getClientRects().length];
+  });
+  const [least, lines] = [Math.min(...spaces.map(([s]) => s)), Math.max(...spaces.map(([, n]) => n))];
+  return [least, lines, bar.scrollWidth - bar.clientWidth];
+}"""
+"""px beside the name of a tab, number of its lines, and px of the bar that are scrolled out of view."""
 
 
 def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: Any) -> None:
@@ -129,3 +144,15 @@ def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
     page.page.locator("#layout").click()
     page.page.get_by_role("button", name="Explore").click()
     assert size("#maps") == default
+
+
+@pytest.mark.parametrize("options", [(), ("--read-only",)])
+def test_names_of_tabs_have_space_beside_their_dividers(
+    start_server: Callable[..., Any], open_page: Any, options: tuple[str, ...]
+) -> None:
+    """In the narrow panel, with the widest selected name, and without wrapping or scrolling."""
+    page = open_page("?task=door&tab=diagnostics", url=start_server(*options).url, size=(1024, 768))
+    space, lines, hidden = page.page.evaluate(TAB_SPACE)
+    assert space >= 4.0
+    assert lines == 1
+    assert hidden == 0
