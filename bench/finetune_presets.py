@@ -41,7 +41,7 @@ Result = dict[str, Any]
 def squares(filter_: Filter, result: Metrics) -> np.ndarray:
     """(R,) sums of squared standardised errors of each episode."""
     _, std = filter_.statistics.mean_std("state")
-    factors = np.array([c.shown[1] for c in filter_.task.components])
+    factors = np.array([c.conversion[1] for c in filter_.task.components])
     components = result.squares[:, 1 : 1 + len(factors)]
     return np.asarray((components / np.square(factors * std.numpy())).sum(1))
 

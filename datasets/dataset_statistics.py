@@ -113,7 +113,7 @@ def statistics(task: Task, episodes: Iterable[Episode]) -> Statistics:
     joined = {key: np.concatenate(values).astype(np.float64) for key, values in columns.items()}
     result: dict[str, float | list[float]] = {"contact_fraction": float(joined["contact"].mean())}
     for component, spread in zip(task.components, joined["states"].std(axis=0), strict=True):
-        unit, factor = component.shown
+        unit, factor = component.conversion
         result[f"{component.name}_std_{unit}"] = float(factor * spread)
     if "displacement" in joined:
         position = joined["effector_position"]

@@ -64,14 +64,14 @@ class Component:
     rotation: str = ""
 
     @property
-    def shown(self) -> tuple[str, float]:
+    def conversion(self) -> tuple[str, float]:
         """Unit for display, and the factor from ``unit``."""
         return self.display or display_unit(self.unit)
 
     @property
     def key(self) -> str:
         """Name with the unit for display, such as ``hinge_x_cm``."""
-        return f"{self.name}_{self.shown[0]}".rstrip("_")
+        return f"{self.name}_{self.conversion[0]}".rstrip("_")
 
     @property
     def label(self) -> str:
@@ -80,8 +80,8 @@ class Component:
 
     def to_json(self) -> dict[str, Any]:
         """Name, unit, and unit for display with its factor, for displays."""
-        shown, scale = self.shown
-        return {"name": self.name, "unit": self.unit, "shown": shown, "scale": scale}
+        unit, scale = self.conversion
+        return {"name": self.name, "unit": self.unit, "display_unit": unit, "scale": scale}
 
 
 def rotation(name: str) -> tuple[Component, Component, Component]:
@@ -125,7 +125,7 @@ class MainError:
         return np.asarray(np.linalg.norm(difference[..., list(self.indices)], axis=-1))
 
     @property
-    def shown(self) -> tuple[str, float]:
+    def conversion(self) -> tuple[str, float]:
         """Unit for display, and its factor."""
         return self.unit, self.factor
 
@@ -359,12 +359,12 @@ class Task:
         for where in self.rotations:
             if where.start <= self.map_indices[0] < where.stop:
                 indices = tuple(range(where.start, where.stop))
-                return MainError(display_name(parts[0].rotation), *parts[0].shown, indices)
-        if any((c.unit, c.shown) != (parts[0].unit, parts[0].shown) for c in parts):
+                return MainError(display_name(parts[0].rotation), *parts[0].conversion, indices)
+        if any((c.unit, c.conversion) != (parts[0].unit, parts[0].conversion) for c in parts):
             parts = parts[:1]
         is_position = len(parts) == 2 and parts[0].unit in LENGTHS
         name = "position" if is_position else " and ".join(c.label for c in parts)
-        return MainError(name, *parts[0].shown, self.map_indices[: len(parts)])
+        return MainError(name, *parts[0].conversion, self.map_indices[: len(parts)])
 
     @property
     def floor(self) -> tuple[int, int] | None:

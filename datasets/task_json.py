@@ -137,7 +137,7 @@ def check_definition(task: Task, where: str = "") -> None:
             raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
         if not isinstance(component.unit, str) or len(component.unit) > 40:
             raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
-        unit, factor = component.shown
+        unit, factor = component.conversion
         if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
             raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")
     for name in dict.fromkeys(component.rotation for component in task.components):

@@ -338,7 +338,7 @@ def _wrapped(task: Task, error: Tensor) -> Tensor:
 def squares(task: Task, error: Tensor) -> dict[str, Tensor]:
     """Squares (S,) of errors (S, n) in SI units, by key of ``Metrics.rmse`` and in its units."""
     error = error.double()
-    by_component = {c.key: (c.shown[1] * error[:, i]).square() for i, c in enumerate(task.components)}
+    by_component = {c.key: (c.conversion[1] * error[:, i]).square() for i, c in enumerate(task.components)}
     main = task.main_error
     return by_component | {main.key: (main.factor * error[:, list(main.indices)]).square().sum(-1)}
 

@@ -11,6 +11,9 @@ SETTINGS = {"nominal": "clean_weight", "pull": "l2_sp", "moments": "events"}
 PLAN = {"pictures": "images", "alone": "single"}
 """Fields of a training schedule."""
 
+SCORE = {"shown": "display_unit"}
+"""Fields of a failure score."""
+
 SLICES = {"nominal": "clean", "no contact": "free motion"}
 """Data slices. In addition, ``MODALITY alone`` is now ``MODALITY only``."""
 

@@ -38,7 +38,7 @@ class StartOffset:
     @classmethod
     def parse(cls, text: str, task: Task) -> StartOffset:
         """From text such as ``3cm,20deg``. Raises BadInput for other text and for units that the task does not have."""
-        units = {c.shown[0]: (c.unit, c.shown[1]) for c in task.components}
+        units = {c.conversion[0]: (c.unit, c.conversion[1]) for c in task.components}
         units |= {c.unit: (c.unit, 1.0) for c in task.components if c.unit not in units and c.unit not in DISPLAY_UNITS}
         lengths: dict[str, float] = {}
         for part in filter(None, (part.strip() for part in text.split(","))):

@@ -130,7 +130,7 @@ def calibrate(fitted: Sequence[Trace], tested: Sequence[Trace], level: float, da
     coverage = _coverage(calibration, tested, [_scores(trace, layers) for trace in tested])
     indices, others = (tuple(trace.episode_index for trace in traces) for traces in (fitted, tested))
     task = first.task
-    units = {c.name: c.shown for c in task.components} | {task.main_error.name: task.main_error.shown}
+    units = {c.name: c.conversion for c in task.components} | {task.main_error.name: task.main_error.conversion}
     return CalibrationReport(calibration, indices, others, coverage, units)
 
 

@@ -81,10 +81,10 @@ def test_figures_of_the_paper(run: Run, folder: Path) -> None:
     """Output is deterministic, and --step changes only the map of its own phase."""
     line = f"figure maps {EKF} --json - -o"
     first, again = (json.loads(run(f"{line} {name}.svg")[1]) for name in ("first", "again"))
-    assert first["shown"] == again["shown"] == {"free motion": 66, "contact": 31}
+    assert first["map_steps"] == again["map_steps"] == {"free motion": 66, "contact": 31}
     assert (folder / "first.svg").read_bytes() == (folder / "again.svg").read_bytes()
     moved = json.loads(run(f"{line} moved.pdf --step 20")[1])
-    assert moved["shown"] == {"free motion": 66, "contact": 20}
+    assert moved["map_steps"] == {"free motion": 66, "contact": 20}
     assert (folder / "moved.pdf").read_bytes().startswith(b"%PDF")
     code, out, _ = run(f"figure weights {EKF} -o weights.png")
     assert (code, out) == (0, "weights.png (0.2 MB): crossmodal-ekf over 100 steps of door episode 9\n")

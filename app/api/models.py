@@ -126,11 +126,11 @@ class DataInfo(Reply):
 
 
 class Component(Reply):
-    """A state component. Values times ``scale`` are in the unit ``shown``."""
+    """A state component. Values times ``scale`` are in ``display_unit``."""
 
     name: str
     unit: str
-    shown: str
+    display_unit: str
     scale: float
 
 

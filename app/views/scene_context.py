@@ -247,7 +247,7 @@ def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:
     floor = grid(task, trace)
     for path, lines, thickness in (("/plane", floor.lines, 1.0), ("/plane/axes", floor.axes, 3.0)):
         server.scene.add_line_segments(path, lines, GRAY, thickness=thickness, thickness_units="screen")
-    unit, factor = task.main_error.shown
+    unit, factor = task.main_error.conversion
     for name, axis, edge in zip(task.map_components, floor.axes, floor.high, strict=True):
         text = f"{display_name(name)} {factor * edge:.0f} {unit}"
         server.scene.add_label(f"/plane/{name}", text, position=axis[1], **SMALL_LABEL)

@@ -90,7 +90,7 @@ class CheckpointComparison(Diagnostic):
     differences: tuple[Difference, ...]
     levels: Array
     calibration: Array
-    error_shown: tuple[str, float]
+    conversion: tuple[str, float]
     events: tuple[Regression, ...]
     modules: tuple[ModuleChange, ...]
 
@@ -173,7 +173,7 @@ class CheckpointComparison(Diagnostic):
         timed = any(m.time is not None for m in self.events)
         time = ("time s",) if timed else ()
         columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", "contact")
-        unit, factor = self.error_shown
+        unit, factor = self.conversion
         columns += tuple(f"{name} {unit}".rstrip() for name in ("before", "after", "increase"))
         rows = tuple(
             (
@@ -201,7 +201,7 @@ class CheckpointComparison(Diagnostic):
         before, after = (np.array(values) for values in zip(*(d.display[:2] for d in position), strict=True))
         bars = (Line("before", x, before), Line("after", x, after, "fused"))
         plots = [
-            Plot(f"{main.capitalize()} by slice", "", with_unit("RMSE", self.error_shown[0]), bars, "bars", names=names)
+            Plot(f"{main.capitalize()} by slice", "", with_unit("RMSE", self.conversion[0]), bars, "bars", names=names)
         ]
         if np.isnan(self.calibration).all():
             return plots
@@ -284,7 +284,7 @@ def compare_checkpoints(
         differences=differences(sums.sums, [slice_.name for slice_ in selected], measures_of(task)),
         levels=LEVELS,
         calibration=calibration(sums.sums.sum(0)).swapaxes(0, 1),
-        error_shown=task.main_error.shown,
+        conversion=task.main_error.conversion,
         events=find_regressions(sums, selected, indices, members, task),
         modules=()
         if any(isinstance(filter_, ExternalFilter) for filter_ in pair)

@@ -64,7 +64,7 @@ class MapSurvey(Diagnostic):
     @property
     def _length(self) -> tuple[str, float]:
         """Unit for display of distances on the map, and its factor."""
-        return self.task.components[self.components[0]].shown
+        return self.task.components[self.components[0]].conversion
 
     @property
     def quantity(self) -> str:

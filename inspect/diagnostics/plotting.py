@@ -77,7 +77,7 @@ class StepAxis:
     label: str
 
     @classmethod
-    def of(cls, steps: int, time: NDArray[np.float64] | None) -> StepAxis:
+    def from_times(cls, steps: int, time: NDArray[np.float64] | None) -> StepAxis:
         """The times (T,) in s where the data have timestamps, else the indices of the steps."""
         positions = np.arange(steps, dtype=np.float64) if time is None else time
         middles = 0.5 * (positions[1:] + positions[:-1])
@@ -166,7 +166,7 @@ def draw_chart(
     axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Views, time: NDArray[np.float64] | None
 ) -> None:
     """Draw curves over steps or their times with shaded bands and dashed bounds."""
-    axis = StepAxis.of(len(curves[0].values), time)
+    axis = StepAxis.from_times(len(curves[0].values), time)
     draw_bands(axes, diagnostic.bands(), axis)
     layers = [curve.layer for curve in curves]
     for i, curve in enumerate(curves):

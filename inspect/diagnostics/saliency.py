@@ -281,7 +281,7 @@ def _of_external(external: ExternalFilter, trace: Trace, target: str | None, ste
     sides = [side for values in single_step.inputs if values.ndim == 3 for side in values.shape[1:]]
     _check_window(window, sides)
     index = task.index(name)
-    unit, factor = task.components[index].shown
+    unit, factor = task.components[index].conversion
     return Saliency(
         task=task,
         filter=trace.filter,

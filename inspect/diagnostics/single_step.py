@@ -143,7 +143,7 @@ class SingleStep:
 
     def _targets(self) -> Iterable[Target]:
         for i, component in enumerate(self.filter.task.components):
-            yield Target(component.name, *component.shown, self._component(i), self)
+            yield Target(component.name, *component.conversion, self._component(i), self)
         if isinstance(self.filter, SequenceModel):
             return
         for k, name in enumerate(self.filter.names):

@@ -147,10 +147,10 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
     """Unit for display of a statistic, and its factor from the statistic's own; empty and 1 for one without a unit."""
     kind, subject, _ = statistic.split("/")
     if kind == "error":
-        return task.main_error.shown
+        return task.main_error.conversion
     if kind in OF_COMPONENTS:
         name = subject.rpartition(" ")[2]
-        return next((c.shown for c in task.components if c.name == name), display_unit("m"))
+        return next((c.conversion for c in task.components if c.name == name), display_unit("m"))
     if kind in OF_READINGS and (unit := UNITS.get(subject.partition(" ")[0])):
         return f"{unit}{OF_READINGS[kind]}", 1.0
     return OF_KINDS.get(kind, ("", 1.0))

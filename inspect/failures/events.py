@@ -107,7 +107,7 @@ class Failures(Diagnostic):
         task, filter, checkpoint_hash, faults, seed, particles: of the runs.
         by: name of the score.
         title, unit: display name and unit of the score: of a component, sigma, x (ratio) or none.
-        shown, error_shown: units for display of the score and of the main error, and their factors.
+        conversion, error_conversion: units for display of the score and of the main error, and their factors.
         threshold: minimum score of an event.
         episodes, steps: numbers of episodes and steps.
         timed: whether steps have times.
@@ -127,8 +127,8 @@ class Failures(Diagnostic):
     by: str
     title: str
     unit: str
-    shown: tuple[str, float]
-    error_shown: tuple[str, float]
+    conversion: tuple[str, float]
+    error_conversion: tuple[str, float]
     threshold: float
     episodes: int
     steps: int
@@ -172,7 +172,7 @@ class Failures(Diagnostic):
 
     def format(self, value: float) -> str:
         """A score in its display unit."""
-        unit, factor = self.shown
+        unit, factor = self.conversion
         return f"{value * factor:.3g} {unit}".rstrip()
 
     def tables(self) -> list[Table]:
@@ -180,7 +180,7 @@ class Failures(Diagnostic):
 
     def phase_table(self) -> Table:
         """One row per phase."""
-        factor = self.shown[1]
+        factor = self.conversion[1]
         columns = ("phase", "steps %", "events", "events %", "lift x", "p-value", "mean inside", "mean outside")
         rows = [
             (
@@ -202,7 +202,7 @@ class Failures(Diagnostic):
         columns: tuple[str, ...] = ("episode", "step", "from", "to")
         columns += ("time s", "from s", "to s") if self.timed else ()
         columns += (self._label, "phase")
-        columns += tuple(f"{layer_label(layer)} {self.error_shown[0]}".rstrip() for layer in self.layers)
+        columns += tuple(f"{layer_label(layer)} {self.error_conversion[0]}".rstrip() for layer in self.layers)
         columns += tuple(f"{display_name(name)} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         if any(event.effective_weights is not None for event in events):
@@ -210,17 +210,17 @@ class Failures(Diagnostic):
         return Table("Worst events", columns, tuple(map(self._row, events)))
 
     def _row(self, event: Event) -> tuple[Value, ...]:
-        numbers = [*(self.error_shown[1] * event.error), *np.degrees(event.angle_error[-1]), event.nees[-1]]
+        numbers = [*(self.error_conversion[1] * event.error), *np.degrees(event.angle_error[-1]), event.nees[-1]]
         numbers += [event.ess] if self.particles else []
         numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
         values = (float(value) if np.isfinite(value) else None for value in numbers)
-        score = self.shown[1] * event.score
+        score = self.conversion[1] * event.score
         times = (event.time, event.first_time, event.last_time) if self.timed else ()
         return (event.episode, event.step, event.first, event.last, *times, score, event.phase, *values)
 
     @property
     def _label(self) -> str:
-        return with_unit(self.title, self.shown[0])
+        return with_unit(self.title, self.conversion[0])
 
     def plots(self) -> list[Plot]:
         """Distribution of the score over all steps and over the phases with the highest lift."""
@@ -229,7 +229,7 @@ class Failures(Diagnostic):
         lines = tuple(
             Line(
                 name,
-                self.shown[1] * self.quantiles[key],
+                self.conversion[1] * self.quantiles[key],
                 100.0 * (1.0 - PROBABILITIES),
                 "fused" if key == "all" else key,
             )
@@ -305,8 +305,8 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
         by=by,
         title=definition.title,
         unit=definition.unit,
-        shown=definition.display,
-        error_shown=survey.task.main_error.shown,
+        conversion=definition.display,
+        error_conversion=survey.task.main_error.conversion,
         threshold=threshold,
         episodes=len(np.unique(survey.episode)),
         steps=len(score),

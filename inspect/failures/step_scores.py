@@ -185,7 +185,7 @@ class EpisodeScores:
 def scores_of(task: Task) -> dict[str, Score]:
     """Scores of a task by name, including one for each angle."""
     main = task.main_error
-    unit, display = task.components[main.indices[0]].unit, main.shown
+    unit, display = task.components[main.indices[0]].unit, main.conversion
     angles = {c.name: _angle(i, c) for i, c in enumerate(task.components) if c.unit == "rad" and (i,) != main.indices}
     return {
         "error": Score(f"{main.name} error", unit, display, lambda trace: measures.main_error(trace)[:, -1]),
@@ -210,7 +210,7 @@ def disagreement(trace: Trace) -> Array:
 
 
 def _angle(index: int, component: Component) -> Score:
-    title, display = f"{component.label} error", component.shown
+    title, display = f"{component.label} error", component.conversion
     return Score(title, "rad", display, lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
 
 

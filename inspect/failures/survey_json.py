@@ -28,7 +28,7 @@ def survey_document(survey: Survey, link: Callable[[Event, str], str]) -> dict[s
             "name": name,
             "title": score.title,
             "unit": score.unit,
-            "shown": score.display[0],
+            "display_unit": score.display[0],
             "scale": score.display[1],
         }
         info |= {"why_not": survey.refused.get(name)}

@@ -243,7 +243,7 @@ def weights_figure(trace: Trace) -> Figure:
         charts = figure.subplots(len(task.map_indices) + len(columns), 1, sharex=True)
         for axes, i in zip(charts, task.map_indices, strict=False):
             _draw_estimates(axes, trace, i)
-            axes.set_ylabel(with_unit(task.components[i].label, task.components[i].shown[0]))
+            axes.set_ylabel(with_unit(task.components[i].label, task.components[i].conversion[0]))
         for axes, i in zip(charts[len(task.map_indices) :], columns, strict=True):
             _draw_weights(axes, trace, i)
             axes.set_ylabel(f"weight, {task.components[i].label}" if component_wise else "weight")
@@ -260,7 +260,7 @@ def weights_figure(trace: Trace) -> Figure:
 
 def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
     steps = _step_axis(trace).positions
-    factor = trace.task.components[component].shown[1]
+    factor = trace.task.components[component].conversion[1]
     *unimodal, fused = factor * measures.means(trace)[..., component].T
     axes.plot(
         steps, fused, label="fused", color=COLOURS["fused"], lw=2.4
@@ -297,4 +297,4 @@ def _shade_phases(axes: Axes, trace: Trace) -> None:
 
 
 def _step_axis(trace: Trace) -> StepAxis:
-    return StepAxis.of(len(trace), trace.episode.time)
+    return StepAxis.from_times(len(trace), trace.episode.time)

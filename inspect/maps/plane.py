@@ -70,12 +70,12 @@ def plane_of(trace: Trace, components: tuple[str, ...] = ()) -> Plane:
 def axis_titles(task: Task, components: Sequence[int]) -> list[tuple[str, float]]:
     """Title of each axis of a map, such as ``hinge x offset (cm)``, and the factor of its values."""
     parts = [task.components[i] for i in components]
-    return [(with_unit(f"{c.label} offset", c.shown[0]), c.shown[1]) for c in parts]
+    return [(with_unit(f"{c.label} offset", c.conversion[0]), c.conversion[1]) for c in parts]
 
 
 def area_unit(task: Task, components: Sequence[int]) -> tuple[str, float]:
     """Unit for display of areas on a map, or of lengths on a curve, and its factor: ``cm²``, ``m·deg``."""
-    units = [task.components[i].shown for i in components]
+    units = [task.components[i].conversion for i in components]
     factor = float(np.prod([factor for _, factor in units]))
     if len(units) == 2 and units[0] == units[1] and units[0][0]:
         return f"{units[0][0]}²", factor
@@ -102,7 +102,7 @@ def _half_width(trace: Trace, index: int) -> float:
     error = np.abs(task.difference(trace.estimate_mean, trace.anchors)[:, index])
     deviation = np.sqrt(np.maximum(trace.estimate_covariance[:, index, index].astype(np.float64), 0.0))
     reach = MARGIN * float(np.quantile(error + DEVIATIONS * np.nan_to_num(deviation), 0.95))
-    _, factor = task.components[index].shown
+    _, factor = task.components[index].conversion
     width = round_up(max(factor * reach, 1e-6)) / factor
     return min(width, np.pi) if task.components[index].unit == "rad" else width
 

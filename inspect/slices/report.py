@@ -65,7 +65,7 @@ class ErrorSlices(Diagnostic):
 
     Attributes:
         task, filter, checkpoint_hash, faults, seed, particles: of the runs.
-        by, title, unit: name of the score, its display name and unit. shown: unit for display, and its factor.
+        by, title, unit: name of the score, its display name and unit. conversion: unit for display, and its factor.
         alpha: probability of any slice if no covariate is related to the score.
         episodes, steps: numbers of episodes, and of steps with a score.
         covariates: names of the covariates that were searched.
@@ -81,7 +81,7 @@ class ErrorSlices(Diagnostic):
     by: str
     title: str
     unit: str
-    shown: tuple[str, float]
+    conversion: tuple[str, float]
     alpha: float
     episodes: int
     steps: int
@@ -114,7 +114,7 @@ class ErrorSlices(Diagnostic):
 
     def tables(self) -> list[Table]:
         """One row per slice; scores in display units."""
-        unit, factor = self.shown
+        unit, factor = self.conversion
         label = f" {unit}".rstrip()
         columns: tuple[str, ...] = ("slice", "ratio x", "from", "to", f"inside{label}", f"outside{label}")
         columns += ("episodes", "steps", "steps %", "p-value")
@@ -234,7 +234,7 @@ def slices_of_survey(
         by=by,
         title=definition.title,
         unit=definition.unit,
-        shown=definition.display,
+        conversion=definition.display,
         alpha=alpha,
         episodes=len(ordered),
         steps=len(score),

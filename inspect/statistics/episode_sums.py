@@ -94,7 +94,9 @@ def measures_of(task: Task) -> tuple[Measure, ...]:
 
     main = task.main_error
     components = [
-        Measure(c.name, *c.shown, root(1 + i), logarithm) for i, c in enumerate(task.components) if (i,) != main.indices
+        Measure(c.name, *c.conversion, root(1 + i), logarithm)
+        for i, c in enumerate(task.components)
+        if (i,) != main.indices
     ]
     return (
         Measure(main.name, main.unit, main.factor, root(n + 1), logarithm),

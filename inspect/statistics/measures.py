@@ -93,7 +93,7 @@ def quantities(task: Task) -> list[tuple[int, str, float]]:
     others = [(1 + i, c) for i, c in enumerate(task.components) if (i,) != main.indices]
     return [
         (0, main.label, main.factor),
-        *((k, with_unit(c.label, c.shown[0]), c.shown[1]) for k, c in others),
+        *((k, with_unit(c.label, c.conversion[0]), c.conversion[1]) for k, c in others),
     ]
 
 
@@ -226,7 +226,7 @@ def intervals(mask: Mask) -> NDArray[np.int64]:
 
 def display_units(task: Task) -> tuple[tuple[str, ...], Array]:
     """Display units (``cm``, ``deg``) of the n components, and the conversion factors (n,) from SI."""
-    pairs = [component.shown for component in task.components]
+    pairs = [component.conversion for component in task.components]
     return tuple(unit for unit, _ in pairs), np.array([factor for _, factor in pairs])
 
 

@@ -148,10 +148,10 @@ def _components(trace: Trace) -> list[dict[str, Any]]:
     return [
         {
             "label": component.label,
-            "unit": component.shown[0],
-            "truth": _numbers(component.shown[1] * trace.episode.states[:, i]),
-            "mean": _numbers(component.shown[1] * means[..., i].T),
-            "std": _numbers(component.shown[1] * std[..., i].T),
+            "unit": component.conversion[0],
+            "truth": _numbers(component.conversion[1] * trace.episode.states[:, i]),
+            "mean": _numbers(component.conversion[1] * means[..., i].T),
+            "std": _numbers(component.conversion[1] * std[..., i].T),
         }
         for i, component in enumerate(trace.task.components)
     ]
@@ -217,7 +217,7 @@ def _maps(
         centres.append(map_.centre)
         progress(step / len(trace))
     components = [trace.task.components[i] for i in first.components]
-    factors = np.array([component.shown[1] for component in components])
+    factors = np.array([component.conversion[1] for component in components])
     places = factors * measures.means(trace)[..., list(first.components)]
     sides = [first.offsets_x] if first.is_curve else [first.offsets_x, first.offsets_y]
     return {
@@ -225,7 +225,7 @@ def _maps(
         "stride": stride,
         "layers": [_layer(trace, name) for name in first.layers],
         "shape": list(first.log_likelihood.shape),
-        "axes": [f"{c.label} ({c.shown[0]})" for c in components],
+        "axes": [f"{c.label} ({c.conversion[0]})" for c in components],
         "reach": [float(f * 0.5 * (o[-1] - o[0]) * len(o) / (len(o) - 1)) for f, o in zip(factors, sides, strict=True)],
         "centres": _numbers(factors * np.stack(centres)),
         "places": _numbers(places),

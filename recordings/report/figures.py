@@ -57,7 +57,7 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
         FigureCanvasAgg(figure)
         charts = figure.subplots(len(traces), 1, squeeze=False)[:, 0]
         for index, (axes, trace) in enumerate(zip(charts, traces, strict=True)):
-            main, axis = trace.task.main_error, StepAxis.of(len(trace), trace.episode.time)
+            main, axis = trace.task.main_error, StepAxis.from_times(len(trace), trace.episode.time)
             error = main.factor * measures.main_error(trace)
             for layer, values in zip(measures.layers(trace), error.T, strict=True):
                 if layer == "fused" or layer in trace.modalities_with_posterior:

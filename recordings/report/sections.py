@@ -144,7 +144,7 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
         if layer != "fused" and layer not in first.modalities_with_posterior:
             continue
         result = metrics(task, error[:, i], covariance[:, i])
-        titles = {c.key: with_unit(c.label, c.shown[0]) for c in task.components}
+        titles = {c.key: with_unit(c.label, c.conversion[0]) for c in task.components}
         titles[task.main_error.key] = task.main_error.label
         values: dict[str, Value] = {titles[key]: value for key, value in result.rmse.items()}
         if first.has_covariance:

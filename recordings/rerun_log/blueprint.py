@@ -170,7 +170,7 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
 
 
 def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> rrb.TimeSeriesView:
-    i, scale = task.index(component.name), component.shown[1]
+    i, scale = task.index(component.name), component.conversion[1]
     limits = None
     if not growing:
         # Limits fit the true state and the fused 2 sigma band; diverging modalities may exceed them.
@@ -180,7 +180,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
         margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
-    name = with_unit(component.label, component.shown[0])
+    name = with_unit(component.label, component.conversion[0])
     if i == 0:  # without a legend, as above
         name += ": truth green, fused red"
     return _plot(f"states/{component.name}", name, limits, legend=False)

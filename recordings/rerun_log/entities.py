@@ -202,7 +202,7 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
 
 def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
     for i, component in enumerate(task.components):
-        scale = component.shown[1]
+        scale = component.conversion[1]
         yield f"states/{component.name}/truth", series(trace.episode.states[steps, i] * scale)
         for source, raw, covariance in _estimates(trace, steps):
             mean = task.near(raw, trace.episode.states[steps])
@@ -220,7 +220,7 @@ def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
         yield f"errors/position/{source}", series(main.norm(error) * main.factor)
         for component in angles(task):
             angle = np.abs(error[:, task.index(component.name)])
-            yield f"errors/{component.name}/{source}", series(angle * component.shown[1])
+            yield f"errors/{component.name}/{source}", series(angle * component.conversion[1])
 
 
 def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]:
@@ -299,7 +299,7 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     main = task.main_error
     mapped = [task.components[i] for i in task.map_indices]
     extent = " and ".join(f"{c.label} {main.text(2 * task.map_half_width, 0)}" for c in mapped[: len(main.indices)])
-    units = ", ".join(with_unit(c.label, c.shown[0]) for c in task.components)
+    units = ", ".join(with_unit(c.label, c.conversion[0]) for c in task.components)
     contours_of = " and ".join(c.label for c in mapped)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)

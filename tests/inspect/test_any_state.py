@@ -92,8 +92,8 @@ def test_recording_report_and_page(runs: list[Trace], tmp_path: Path) -> None:
     write_report(compose([run], None, files=[tmp_path / "run.rrd"]), tmp_path / "report")
     assert "speed (km/h)" in (tmp_path / "report" / "report.html").read_text()
     components = header(run, columns(run)[0], TASK, None, {})["components"]
-    assert components[3] == {"name": "speed", "unit": "m/s", "shown": "km/h", "scale": 3.6}
-    assert components[5] == {"name": "drag", "unit": "", "shown": "", "scale": 1.0}
+    assert components[3] == {"name": "speed", "unit": "m/s", "display_unit": "km/h", "scale": 3.6}
+    assert components[5] == {"name": "drag", "unit": "", "display_unit": "", "scale": 1.0}
 
 
 @pytest.mark.parametrize(

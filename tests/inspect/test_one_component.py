@@ -238,7 +238,7 @@ def test_rows_of_sweeps_have_the_error_of_the_main_component() -> None:
 
 def test_failures_are_in_the_unit_of_the_component(runs: list[Trace]) -> None:
     failures = find_failures(checkpoint(task()), [run.episode for run in runs])
-    assert (failures.title, failures.unit, failures.shown) == ("temperature error", "K", ("K", 1.0))
+    assert (failures.title, failures.unit, failures.conversion) == ("temperature error", "K", ("K", 1.0))
     assert "K at step" in failures.verdict
 
 
@@ -272,7 +272,7 @@ def test_recording_report_export_and_page(runs: list[Trace], tmp_path: Path) -> 
     for suffix in ("parquet", "mcap", "npz"):
         export_trace(run, tmp_path / f"run.{suffix}")
     assert scene_layers(run.task, run, None) == []
-    assert header(run, columns(run)[0], run.task, None, {})["components"][0]["shown"] == "K"
+    assert header(run, columns(run)[0], run.task, None, {})["components"][0]["display_unit"] == "K"
 
 
 def test_the_definition_is_stored_with_one_map_component() -> None:

@@ -6,9 +6,9 @@ import { Trace } from '../../app/page/data/trace.js';
 export const TASK = {
   name: 'door',
   components: [
-    { name: 'hinge_x', unit: 'm', shown: 'cm', scale: 100 },
-    { name: 'hinge_y', unit: 'm', shown: 'cm', scale: 100 },
-    { name: 'angle', unit: 'rad', shown: 'deg', scale: 180 / Math.PI },
+    { name: 'hinge_x', unit: 'm', display_unit: 'cm', scale: 100 },
+    { name: 'hinge_y', unit: 'm', display_unit: 'cm', scale: 100 },
+    { name: 'angle', unit: 'rad', display_unit: 'deg', scale: 180 / Math.PI },
   ],
   modalities: ['image', 'haptics'],
   dt: 0.1,

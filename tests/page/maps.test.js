@@ -46,8 +46,8 @@ const HEADER = {
   shape: ['round', 'ridge', 'ring'],
   layers: ['image', 'haptics', 'fused'],
   axes: [
-    { name: 'hinge_x', index: 0, unit: 'm', shown: 'cm', scale: 100, half_width: 0.3 },
-    { name: 'hinge_y', index: 1, unit: 'm', shown: 'cm', scale: 100, half_width: 0.3 },
+    { name: 'hinge_x', index: 0, unit: 'm', display_unit: 'cm', scale: 100, half_width: 0.3 },
+    { name: 'hinge_y', index: 1, unit: 'm', display_unit: 'cm', scale: 100, half_width: 0.3 },
   ],
   others: 'fixed',
   note: '',
@@ -124,7 +124,9 @@ test('maps are decoded', () => {
 });
 
 test('a map over one component is a curve with lengths instead of areas', () => {
-  const axes = [{ name: 'level', index: 0, unit: 'K', shown: 'mK', scale: 1000, half_width: 2 }];
+  const axes = [
+    { name: 'level', index: 0, unit: 'K', display_unit: 'mK', scale: 1000, half_width: 2 },
+  ];
   const layers = ['image', 'haptics', 'fused'];
   const curve = readMaps(
     encodedMaps({ axes, rows: 1, centre: [5], peak: layers.map(() => [0, 0]) }),

@@ -39,7 +39,13 @@ test('a slice without an interval, and with one', () => {
     share: 0.204,
     p_value: 0.01,
   };
-  const score = { name: 'error', title: 'position error', unit: 'm', shown: 'cm', scale: 100 };
+  const score = {
+    name: 'error',
+    title: 'position error',
+    unit: 'm',
+    display_unit: 'cm',
+    scale: 100,
+  };
   const end = 'where blackout: 2 of 9 episodes, 20 % of steps.';
   assert.equal(sliceSentence(slice, score, 9), `Position error is 1.5 × larger ${end}`);
   assert.equal(

@@ -54,7 +54,7 @@ def figure(
         if with_contact and False not in selection:
             console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")
         write_figure(paper.maps_figure(checkpoint, trace, selection, quantity=quantity), output)
-        extra["shown"] = {paper.STATES[state] if with_contact else "all": step for state, step in selection.items()}
+        extra["map_steps"] = {paper.STATES[state] if with_contact else "all": step for state, step in selection.items()}
     else:
         write_figure(paper.weights_figure(trace), output)
     return opt.trace_result(trace, output, figure=kind, **extra)

@@ -8,11 +8,11 @@ import { LARGEST } from './constants.js';
 
 /**
  * Returns the display unit of a state component, with the degree sign for angles.
- * @param {{unit: string, shown: string, scale: number}} component
+ * @param {{unit: string, display_unit: string, scale: number}} component
  * @returns {DisplayUnit}
  */
-export const displayUnit = ({ unit, shown, scale }) => ({
-  unit: unit === 'rad' ? '°' : shown,
+export const displayUnit = ({ unit, display_unit: displayed, scale }) => ({
+  unit: unit === 'rad' ? '°' : displayed,
   scale,
 });
 

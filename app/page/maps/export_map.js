@@ -106,8 +106,8 @@ export function csv(sheets) {
   ];
   const columns = [
     ...(several ? ['step', ...(trace.timestamp(maps.step) === null ? [] : ['time_s'])] : []),
-    ...maps.axes.map(({ name, shown }) => columnName(`${name}_offset`, shown)),
-    ...maps.axes.map(({ name, shown }) => columnName(name, shown)),
+    ...maps.axes.map(({ name, display_unit: unit }) => columnName(`${name}_offset`, unit)),
+    ...maps.axes.map(({ name, display_unit: unit }) => columnName(name, unit)),
     ...layers.map(({ name }) => `${name}_ln_${maps.quantity}_nats`),
   ];
   const rows = sheets.flatMap((sheet) => {

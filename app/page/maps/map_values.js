@@ -54,8 +54,8 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
  * @property {string} name
  * @property {number} index in the state
  * @property {string} unit of values
- * @property {string} shown unit for display
- * @property {number} scale factor from `unit` to `shown`
+ * @property {string} display_unit unit for display
+ * @property {number} scale factor from `unit` to `display_unit`
  * @property {number} half_width half the extent, in `unit`
  *
  * @typedef {'normalised' | 'log'} Scale likelihood relative to the peak, or its logarithm

@@ -29,7 +29,8 @@ export const scoreName = ({ name }) => NAMES[name] ?? name.replaceAll('_', ' ');
  * Returns the unit that the page displays, and its factor.
  * @param {FailureScore} score
  */
-export const scoreUnit = ({ unit, shown, scale }) => UNITS[unit] ?? { unit: shown, scale };
+export const scoreUnit = ({ unit, display_unit: displayed, scale }) =>
+  UNITS[unit] ?? { unit: displayed, scale };
 
 /**
  * Formats a value of a score with its unit.

@@ -43,7 +43,7 @@ export function studyQuantities(rows, task) {
  * Returns the key of a component's RMSE in metrics, such as hinge_x_cm.
  * @param {Task['components'][number]} component
  */
-const keyOf = ({ name, shown }) => (shown ? `${name}_${shown}` : name);
+const keyOf = ({ name, display_unit: unit }) => (unit ? `${name}_${unit}` : name);
 
 /**
  * Returns the changes of the state that list the failures of a filter at a share of image blackout.

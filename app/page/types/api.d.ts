@@ -68,15 +68,15 @@ export interface components {
         };
         /**
          * Component
-         * @description A state component. Values times ``scale`` are in the unit ``shown``.
+         * @description A state component. Values times ``scale`` are in ``display_unit``.
          */
         Component: {
             /** Name */
             name: string;
             /** Unit */
             unit: string;
-            /** Shown */
-            shown: string;
+            /** Display Unit */
+            display_unit: string;
             /** Scale */
             scale: number;
         };
@@ -556,8 +556,8 @@ export interface components {
             title: string;
             /** Unit */
             unit: string;
-            /** Shown */
-            shown: string;
+            /** Display Unit */
+            display_unit: string;
             /** Scale */
             scale: number;
             /** Why Not */

@@ -25,7 +25,7 @@ def test_bands_cover_complete_steps() -> None:
     mask[[0, 59, 7]] = True
     mask[[6, 8]] = False  # step 7 is isolated
     axes = Figure().add_subplot()
-    draw_bands(axes, {"contact": mask, "blackout": np.zeros(60, dtype=bool)}, StepAxis.of(60, None))
+    draw_bands(axes, {"contact": mask, "blackout": np.zeros(60, dtype=bool)}, StepAxis.from_times(60, None))
     (collection,) = axes.collections  # no band for a phase without steps
     spans = [tuple(path.get_extents().intervalx) for path in collection.get_paths()]
     for x in np.arange(-0.45, 59.5, 0.1):
@@ -36,12 +36,12 @@ def test_bands_cover_complete_steps() -> None:
 
 def test_bands_over_irregular_times_end_in_the_middle_between_steps() -> None:
     axes = Figure().add_subplot()
-    axis = StepAxis.of(4, np.array([0.0, 1.0, 11.0, 11.5]))
+    axis = StepAxis.from_times(4, np.array([0.0, 1.0, 11.0, 11.5]))
     draw_bands(axes, {"contact": np.array([False, True, True, False])}, axis)
     (band,) = axes.collections[0].get_paths()
     assert tuple(band.get_extents().intervalx) == (0.5, 11.25)
     assert (axis.edges[0], axis.edges[-1], axis.label) == (-0.5, 11.75, "time (s)")
-    single = StepAxis.of(1, np.array([2.0]))
+    single = StepAxis.from_times(1, np.array([2.0]))
     assert single.edges.tolist() == [1.5, 2.5]
 
 
