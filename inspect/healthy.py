@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,16 +89,14 @@ def profile_of(
     return HealthyProfile(data, len(rows), particles, columns, sensors.reference)
 
 
-def overlap_warning(record: Sequence[Episode], diagnosed: Set[str]) -> str | None:
-    """One line about episodes of a healthy record that are themselves diagnosed, or None.
-
-    diagnosed: digests of the diagnosed episodes.
-    """
-    shared = sum(episode.digest() in diagnosed for episode in record)
+def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> str | None:
+    """One line about episodes of a healthy record that are themselves diagnosed, or None."""
+    digests = {episode.digest() for episode in diagnosed}
+    shared = sum(episode.digest() in digests for episode in record)
     if not shared:
         return None
     return (
-        f"the healthy record contains {shared} of the {len(diagnosed)} diagnosed episodes, so that a fault in them "
+        f"the healthy record contains {shared} of the {len(digests)} diagnosed episodes, so that a fault in them "
         "does not show; measure it from other episodes, which are known to be clean"
     )
 

@@ -296,12 +296,16 @@ def free_motion(episode: Episode) -> Mask:
     return np.convolve(touched, np.ones(3), mode="same") == 0
 
 
+def _vector_keys(episode: Episode) -> list[str]:
+    """Observation keys of vectors (T, d) other than the contact flag and the hand position."""
+    return [key for key, readings in episode.observations.items() if readings.ndim == 2 and key not in (CONTACT, HAND)]
+
+
 def vector_statistics(episode: Episode) -> dict[str, float]:
     """Statistics of all vector sensors in an episode or a window."""
     values: dict[str, float] = {}
-    for key, readings in episode.observations.items():
-        if readings.ndim == 2 and key not in (CONTACT, HAND):
-            values |= axis_statistics(episode, key)
+    for key in _vector_keys(episode):
+        values |= axis_statistics(episode, key)
     if HAND in episode.observations:
         hand, present = episode.observations[HAND], episode.present(HAND)
         noise = noise_level(hand.astype(np.float64), present)
@@ -314,9 +318,8 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
 def law_statistics(episode: Episode) -> dict[str, float]:
     """Statistics of an episode about laws between sensors and controls: of contact, and of the controller."""
     values = wrench_statistics(episode) | control_statistics(episode) | impedance_statistics(episode)
-    for key, readings in episode.observations.items():
-        if readings.ndim == 2 and key not in (CONTACT, HAND):
-            values |= labelled_contact_statistics(episode, key)
+    for key in _vector_keys(episode):
+        values |= labelled_contact_statistics(episode, key)
     return values
 
 

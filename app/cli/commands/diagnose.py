@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +8,7 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
+    from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
@@ -63,9 +64,8 @@ def diagnose(
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
         episodes = faults.apply_all(data, indices, runs.seed)
-        digests = set() if faults else {data[index].digest() for index in indices}
         failed = None if repair is None else data[repair]
-    profile = _profile(correct, profile_from, len(episodes), alarm_rate, digests)
+    profile = _profile(correct, profile_from, len(episodes), alarm_rate, () if faults else episodes.values())
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
@@ -89,12 +89,12 @@ def diagnose(
 
 
 def _profile(
-    checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float, diagnosed: Set[str]
+    checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float, diagnosed: Iterable[Episode]
 ) -> HealthyProfile:
     """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``.
 
     Raises BadInput, before the runs, if these are too few for the diagnosis of ``count`` episodes. Warns if some are
-    ``diagnosed``, given by their digests: a fault that the record has as well does not show.
+    ``diagnosed``: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
     from beliefscope.inspect.diagnosis.diagnose import check_size, required_profile
