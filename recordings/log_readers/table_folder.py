@@ -24,7 +24,7 @@ def table_files(folder: Path) -> list[Path]:
     """The tables of a folder; numbers in their names count as numbers: ``run_2`` before ``run_10``."""
 
     def order(path: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
     files = (f for f in folder.iterdir() if f.suffix.lower() in TABLES and not f.name.startswith(".") and f.is_file())
     return sorted(files, key=order)
