@@ -55,6 +55,8 @@ class Component:
         display: unit for display and its factor, such as ``("km/h", 3.6)``. Default: cm, degrees, else the unit; m
             instead of cm in a task with a map of 10 m or more.
         rotation: name of the rotation whose vector it is a component of; see ``rotation``.
+        wraps: whether an angle's values jump by a turn, such as a heading from -pi to pi. Built-in filters then
+            estimate its sine and cosine; other angles are numbers to them, such as the opening angle of a door.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Component:
     static: bool = False
     display: tuple[str, float] | None = None
     rotation: str = ""
+    wraps: bool = False
 
     @property
     def conversion(self) -> tuple[str, float]:

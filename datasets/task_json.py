@@ -75,6 +75,7 @@ def _component(values: Mapping[str, Any]) -> Component:
         values["static"],
         None if display is None else (display[0], display[1]),
         values.get("rotation", ""),  # definitions of earlier versions lack it
+        values.get("wraps", False),
     )
 
 
@@ -137,6 +138,8 @@ def check_definition(task: Task, where: str = "") -> None:
             raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
         if not isinstance(component.unit, str) or len(component.unit) > 40:
             raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
+        if component.wraps not in (0, 1) or (component.wraps and (component.unit != "rad" or component.rotation)):
+            raise BadInput(f"{about} has wraps {component.wraps!r:.200}, expected true for an angle in rad only.")
         unit, factor = component.conversion
         if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
             raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")

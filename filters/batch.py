@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
+from beliefscope.filters.angles import Angles
 
 MIN_STD = 1e-6
 """A channel with a smaller standard deviation is divided by 1."""
@@ -199,12 +200,14 @@ def _join(arrays: Sequence[np.ndarray], device: torch.device | str) -> Tensor:
 class Statistics(nn.Module):
     """Means and standard deviations of the training set, stored as buffers with the weights.
 
-    Vectors are standardised per channel, images (0..255) with one mean and standard deviation for all pixels.
+    Vectors are standardised per channel, images (0..255) with one mean and standard deviation for all pixels. Angles of
+    the state that wrap stay in rad.
     """
 
     def __init__(self, task: Task) -> None:
         super().__init__()
         self.modalities = tuple(task.modalities)
+        self.angles = Angles.from_task(task)
         sizes = {"state": len(task.components), "control": task.control_size}
         for modality, keys in task.modalities.items():
             shapes = [task.observations[key] for key in keys]
@@ -230,6 +233,8 @@ class Statistics(nn.Module):
                 average, deviation = array.double().mean(0), array.double().std(0)
             mean.copy_(average)
             std.copy_(torch.where(deviation > MIN_STD, deviation, torch.ones_like(deviation)))
+        angles = list(self.angles.indices)
+        self.get_buffer("state_mean")[angles], self.get_buffer("state_std")[angles] = 0.0, 1.0
 
     def standardise(self, name: str, values: Tensor) -> Tensor:
         """(..., d) in SI units (or 0..255) to zero mean and unit standard deviation, float32."""

@@ -12,6 +12,8 @@ from itertools import repeat
 import torch
 from torch import Tensor
 
+from beliefscope.filters.angles import NO_ANGLES, Angles
+
 
 @dataclass(frozen=True)
 class Gaussian:
@@ -28,9 +30,9 @@ class Particles:
     states: Tensor
     log_weights: Tensor
 
-    def moments(self) -> Gaussian:
-        """Weighted mean (N, n) and covariance (N, n, n)."""
-        return moments(self.states, self.log_weights)
+    def moments(self, angles: Angles = NO_ANGLES) -> Gaussian:
+        """Weighted mean (N, n) and covariance (N, n, n); angles: those of the state that wrap."""
+        return moments(self.states, self.log_weights, angles)
 
 
 @dataclass(frozen=True)
@@ -44,19 +46,23 @@ class Recurrent:
 Belief = Gaussian | Particles | Recurrent
 
 
-def moments(states: Tensor, log_weights: Tensor) -> Gaussian:
-    """Mean (..., n) and covariance (..., n, n) of particles (..., M, n) with normalised log-weights (..., M)."""
+def moments(states: Tensor, log_weights: Tensor, angles: Angles = NO_ANGLES) -> Gaussian:
+    """Mean (..., n) and covariance (..., n, n) of particles (..., M, n) with normalised log-weights (..., M).
+
+    angles: components that wrap, whose mean is near their mean direction.
+    """
+    states = angles.centred(states, log_weights)
     weights = log_weights.exp().unsqueeze(-2)
     mean = weights @ states
     deviation = states - mean
     covariance = (weights.transpose(-1, -2) * deviation).transpose(-1, -2) @ deviation
-    return Gaussian(mean.squeeze(-2), covariance)
+    return Gaussian(angles.wrapped(mean.squeeze(-2)), covariance)
 
 
-def reweighted(particles: Particles, log_likelihood: Tensor) -> Gaussian:
+def reweighted(particles: Particles, log_likelihood: Tensor, angles: Angles = NO_ANGLES) -> Gaussian:
     """Moments (N, K, n), (N, K, n, n) of the particles updated with each of K log-likelihoods (N, K, M)."""
     log_weights = torch.log_softmax(particles.log_weights.unsqueeze(1) + log_likelihood, dim=-1)
-    return moments(particles.states.unsqueeze(1), log_weights)
+    return moments(particles.states.unsqueeze(1), log_weights, angles)
 
 
 @dataclass(frozen=True)
@@ -165,15 +171,15 @@ class StepTrace:
     log_likelihood: Tensor | None = None
     ancestors: Tensor | None = None
 
-    @property
-    def updates(self) -> Gaussian | None:
+    def updates(self, angles: Angles = NO_ANGLES) -> Gaussian | None:
         """Single-modality updates, Gaussian (N, K, n): the step's prior after the update with one modality only.
 
         The prior is that of the fused filter, which has used all modalities in earlier steps, so an update is more
         accurate than the standalone filter of its modality (``filters/subsets.py``). The two are equal only in a bank
-        without feedback. PF: the predicted particles weighted by one likelihood. None without measurement models.
+        without feedback. PF: the predicted particles weighted by one likelihood; angles: those of the state that wrap.
+        None without measurement models.
         """
         if self.modality is not None or self.log_likelihood is None:
             return self.modality
         assert isinstance(self.predicted, Particles)
-        return reweighted(self.predicted, self.log_likelihood)
+        return reweighted(self.predicted, self.log_likelihood, angles)

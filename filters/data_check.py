@@ -172,6 +172,8 @@ def _channel_findings(task: Task, statistics: Statistics, values: Sequence[Array
     std = statistics.mean_std("state")[1].cpu().numpy()
     result = []
     for i, channel in enumerate(channels(task)):
+        if i in statistics.angles.indices:
+            continue  # not standardised, and the same place after a turn
         shift, size = abs(means[i]) * root / MEAN_LIMIT, sizes[i] / limit
         spread = np.sqrt(max(sizes[i] ** 2 - means[i] ** 2, 0.0)) / limit
         if shift > 1.0 and spread <= 1.0:

@@ -116,6 +116,7 @@ class Filter(nn.Module, ABC):
         has_covariance: whether its estimates have a covariance; else it is NaN.
         history: number of past steps that the encoding of a step uses.
         dynamics: the dynamics model; sequence models have none.
+        angles: components of the state that wrap.
     """
 
     has_covariance = True
@@ -132,6 +133,7 @@ class Filter(nn.Module, ABC):
         self.task = task
         self.n = len(task.components)
         self.statistics = Statistics(task)
+        self.angles = self.statistics.angles
 
     @property
     def names(self) -> tuple[str, ...]:

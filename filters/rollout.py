@@ -59,7 +59,7 @@ def rollout(
         estimates.append(trace.estimate)
         if keep:
             steps.append(trace)
-        if updates and (update := trace.updates) is not None:
+        if updates and (update := trace.updates(filter_.angles)) is not None:
             single.append(update)
         if progress is not None:
             progress((t + 1) / len(evidence))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import beliefscope as bs
 from beliefscope.app.cli.main import main
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
@@ -132,6 +133,21 @@ def test_user_task_in_the_server(folder: Path, tmp_path: Path) -> None:
         assert run_.map(3, 41).layers == ("image", "sound", "fused")
     finally:
         store.close()
+
+
+def test_a_heading_that_wraps_around(tmp_path: Path) -> None:
+    example, data, trained = EXAMPLE.parent / "mobile_robot.py", tmp_path / "robot.h5", tmp_path / "robot.safetensors"
+    bs.save_dataset([episode := runpy.run_path(str(example))["drive"](0), *([episode] * 2)], data)
+    assert bool((np.abs(np.diff(episode.states[:, 2])) > np.pi).any()), "the heading wraps around"
+    code, _, err = run(
+        "train", f"{example}:TASK", "--filter", "crossmodal-ekf", "--data", data, "--preset", "smoke", "-o", trained
+    )
+    assert (code, "wraps around" in err) == (0, False), err
+    checkpoint = load_checkpoint(trained)
+    mean, std = (value.tolist() for value in checkpoint.filter.statistics.mean_std("state"))
+    assert (mean[2], std[2]) == (0.0, 1.0)
+    estimate = trace(checkpoint, episode).estimate_mean[:, 2]
+    assert bool((np.abs(estimate) <= np.pi + 1e-5).all())
 
 
 def test_filters_of_unknown_tasks_are_rejected(folder: Path) -> None:

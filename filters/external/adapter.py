@@ -287,7 +287,8 @@ def _is_finite(value: Tensor) -> bool:
 
 def _moments(task: Task, particles: Tensor, log_weights: Tensor) -> Gaussian:
     """Mean and covariance as ``moments``; of angles across half a turn and of rotations, those of the differences."""
-    parts = [_turned(task, moments(*block), *block) for block in _blocks(particles, particles, log_weights)]
+    blocks = _blocks(particles, particles, log_weights)
+    parts = [_turned(task, moments(states, weights), states, weights) for states, weights in blocks]
     linear = Gaussian(torch.cat([part.mean for part in parts]), torch.cat([part.covariance for part in parts]))
     if not task.rotations:
         return linear

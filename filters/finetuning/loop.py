@@ -63,7 +63,7 @@ def validate(filter_: Filter, mix: Mix, step: int, loss: float | None, settings:
     estimate = rollout(filter_, evidence, first_belief(filter_, batch), generator, PARTICLES).estimate
     error = filter_.statistics.state_to_si(estimate.mean) - batch.states
     covariance = filter_.statistics.covariance_to_si(estimate.covariance)
-    standardised = (estimate.mean - losses.true_states(filter_, batch)).square().sum(-1)
+    standardised = losses.errors(filter_, estimate.mean, batch).square().sum(-1)
     slices = {}
     for name, columns in windows.parts.items():
         mask = windows.weight[:, columns] > 0

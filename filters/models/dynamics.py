@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from beliefscope.filters.angles import NO_ANGLES, Angles
 from beliefscope.filters.models.networks import Residual, Stack, linear, vector_stack
 
 
@@ -13,7 +14,8 @@ class Dynamics(nn.Module):
 
     f1 is a vector, f2 a scalar gate, so that direction and size of the change are learned separately. State and control
     pass through three layers each, followed by seven shared layers. The first shared layer is split into two summands,
-    so that the controls' part is computed once for all steps.
+    so that the controls' part is computed once for all steps. Angles that wrap are read as sine and cosine; the next
+    ones are not wrapped, so that they are continuous in the states.
 
     Attributes:
         static: indices of components that do not change, apart from noise.
@@ -21,10 +23,11 @@ class Dynamics(nn.Module):
 
     static: tuple[int, ...] = ()
 
-    def __init__(self, n: int, control_size: int, units: int) -> None:
+    def __init__(self, n: int, control_size: int, units: int, angles: Angles = NO_ANGLES) -> None:
         super().__init__()
         self.n = n
-        self.state_encoder = vector_stack(n, units)
+        self.angles = angles
+        self.state_encoder = vector_stack(n + len(angles.indices), units)
         self.control_encoder = vector_stack(control_size, units)
         self.join_state = nn.Linear(units, units, bias=False)
         self.join_control = nn.Linear(units, units)
@@ -54,7 +57,7 @@ class Dynamics(nn.Module):
 
     def forward(self, states: Tensor, control_part: Tensor) -> Tensor:
         """Next states (..., n), without noise; ``control_part`` must broadcast against the states' leading axes."""
-        hidden = self.shared(self.join_state(self.state_encoder(states)) + control_part)
+        hidden = self.shared(self.join_state(self.state_encoder(self.angles.features(states))) + control_part)
         change, gate = self.output(hidden).split([self.n, 1], dim=-1)
         return states + self._without_static(change) * torch.sigmoid(gate)
 
@@ -68,7 +71,8 @@ class Dynamics(nn.Module):
         """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass."""
         offsets = torch.eye(self.n + 1, self.n, dtype=states.dtype, device=states.device)  # the last row is zero
         x = states + offsets.view(-1, *(1,) * (states.ndim - 1), self.n)
-        hidden = linear(self.join_state, self.state_encoder.with_tangents(x)) + control_part
+        features = self.angles.features_with_tangents(x)
+        hidden = linear(self.join_state, self.state_encoder.with_tangents(features)) + control_part
         y = linear(self.output, self.shared.with_tangents(hidden))
         change, gate = y.split([self.n, 1], dim=-1)
         change, scale = self._without_static(change), torch.sigmoid(gate[-1])

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.task import Task
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import WEIGHTED, Architecture, Filter, encoders
 from beliefscope.filters.models.dynamics import Dynamics
-from beliefscope.filters.models.fusion import product_of_experts, symmetric, weighted_average
+from beliefscope.filters.models.fusion import in_one_turn, product_of_experts, symmetric, weighted_average
 from beliefscope.filters.models.networks import Residual, Stack
 from beliefscope.filters.models.single_trajectory import SingleTrajectory, is_usual
 from beliefscope.filters.models.weight_model import WeightModel
@@ -58,7 +60,8 @@ class VirtualSensor(nn.Module):
     def __init__(self, task: Task, model: str, architecture: Architecture, steps: int = 1, extra: int = 0) -> None:
         """steps: number of steps whose vectors are joined. extra: number of further inputs."""
         super().__init__()
-        n, units = len(task.components), architecture.units
+        self.angles, n, units = Angles.from_task(task), len(task.components), architecture.units
+        read = n + len(self.angles.indices)  # sines and cosines
         self.encoders = encoders(task, model.split("+"), architecture, steps, extra)
         self.state: nn.Module
         self.log_noise: nn.Sequential
@@ -68,18 +71,18 @@ class VirtualSensor(nn.Module):
             first = (nn.Linear(self.encoders.size, width), nn.ReLU(inplace=True))
             self.trunk = Stack(*first, Residual(width), Residual(width))
             self.state, self.log_noise = (
-                Stack(nn.Linear(units, n), nn.ReLU(inplace=True), Residual(n), nn.Linear(n, n)) for _ in range(2)
+                Stack(nn.Linear(units, d), nn.ReLU(inplace=True), Residual(d), nn.Linear(d, d)) for d in (read, n)
             )
         else:
             self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
-            self.state = nn.Linear(units, n)
+            self.state = nn.Linear(units, read)
             self.log_noise = nn.Sequential(nn.Linear(units, units), nn.ReLU(), nn.Linear(units, n))
 
     def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """z (T, N, n) and the square root of R's diagonal (T, N, n)."""
         features = self.trunk(self.encoders(observations))
         first, second = features.chunk(2, dim=-1) if self.halves else (features, features)
-        return self.state(first), self.log_noise(second).clamp(-5.0, 3.0).exp()
+        return self.angles.states(self.state(first)), self.log_noise(second).clamp(-5.0, 3.0).exp()
 
 
 class ExtendedKalmanFilter(Filter):
@@ -97,7 +100,7 @@ class ExtendedKalmanFilter(Filter):
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
-        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units)
+        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units, self.angles)
         self.virtual_sensors = nn.ModuleDict({m: VirtualSensor(self.task, m, architecture) for m in self.names})
         if architecture.fusion in WEIGHTED:
             self.weight_model = WeightModel(self.task, architecture, self.n)
@@ -135,7 +138,7 @@ class ExtendedKalmanFilter(Filter):
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         predicted, bank = self.predict_and_update(belief, evidence)
-        fused = self.fuse(bank, evidence.log_weights, evidence.present)
+        fused = self.wrapped(self.fuse(bank, evidence.log_weights, evidence.present))
         trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
         return (shared(fused) if self.architecture.feedback else bank), trace
 
@@ -146,13 +149,18 @@ class ExtendedKalmanFilter(Filter):
         if belief.mean.shape[1] == 1 and (single := self.single or self.single_trajectory(evidence.control)):
             return single.predict_and_update(belief, evidence)
         predicted = self.predict(belief, evidence.control.unsqueeze(1))
-        bank = update(predicted, evidence.observation, evidence.noise)
+        bank = update(predicted, self.angles.near(evidence.observation, predicted.mean), evidence.noise)
+        predicted, bank = self.wrapped(predicted), self.wrapped(bank)
         predicted = Gaussian(predicted.mean.expand_as(bank.mean), predicted.covariance.expand_as(bank.covariance))
         if evidence.present is not None:
             present = evidence.present.unsqueeze(-1)
             mean = torch.where(present, bank.mean, predicted.mean)
             bank = Gaussian(mean, torch.where(present.unsqueeze(-1), bank.covariance, predicted.covariance))
         return predicted, bank
+
+    def wrapped(self, belief: Gaussian) -> Gaussian:
+        """The belief with the angles of its mean from -pi to pi."""
+        return replace(belief, mean=self.angles.wrapped(belief.mean)) if self.angles.indices else belief
 
     def bank_of(self, belief: Gaussian) -> Gaussian:
         """K copies (N, K, n) of a belief (N, n)."""
@@ -177,6 +185,7 @@ class ExtendedKalmanFilter(Filter):
 
     def fuse(self, bank: Gaussian, log_weights: Tensor | None, present: Tensor | None = None) -> Gaussian:
         """The fused belief (N, n) of a bank (N, K, n). present: (N, K) bool, as in ``Evidence``."""
+        bank = in_one_turn(bank, self.angles)
         if log_weights is not None:
             return weighted_average(bank, log_weights, self.architecture.covariance)
         if len(self.names) == 1:

@@ -9,12 +9,20 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.belief import Gaussian
 
 CovarianceRule = Literal["paper", "moments"]
 
 LEAST_WEIGHT = exp(-40.0)
 """Smallest weight of a filter, whose square is still a normal number in single precision."""
+
+
+def in_one_turn(bank: Gaussian, angles: Angles) -> Gaussian:
+    """The bank (..., K, n) with angles at most half a turn from those of its first belief."""
+    if not angles.indices:
+        return bank
+    return Gaussian(angles.near(bank.mean, bank.mean[..., :1, :]), bank.covariance)
 
 
 def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussian:

@@ -11,7 +11,7 @@ from beliefscope.filters.batch import Batch, position_channels
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import Architecture
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, VirtualSensor
-from beliefscope.filters.models.fusion import powers, symmetric, weighted_product
+from beliefscope.filters.models.fusion import in_one_turn, powers, symmetric, weighted_product
 from beliefscope.filters.models.path_circle import FEATURES, MEMORY, circle
 
 CONTACT = "contact"
@@ -151,21 +151,23 @@ class InformationFilter(ExtendedKalmanFilter):
         alone = roots.unsqueeze(1) * torch.eye(len(self.names), device=roots.device).unsqueeze(-1)
         power = powers(evidence.log_weights, evidence.present)
         weighted = roots * power.clamp_min(TINY).sqrt() * (power > 0)
+        sensors = self.sensor_matrix(evidence)
+        expected = (sensors @ predicted.mean.unsqueeze(-1)).reshape_as(evidence.observation)
         posteriors = joint_update(
             Gaussian(predicted.mean.unsqueeze(1), predicted.covariance.unsqueeze(1)),
-            evidence.observation.flatten(1).unsqueeze(1),
-            self.sensor_matrix(evidence).unsqueeze(1),
+            self.angles.near(evidence.observation, expected).flatten(1).unsqueeze(1),
+            sensors.unsqueeze(1),
             torch.cat([weighted.unsqueeze(1), alone], dim=1).flatten(2),
         )  # of all sensors, and of each alone: (N, 1 + K, n (1 + K))
         states = self.state_of(posteriors)
         estimate = Gaussian(states.mean[:, 0], states.covariance[:, 0])
         bank = Gaussian(states.mean[:, 1:], states.covariance[:, 1:])
         trace = StepTrace(self.bank_of(self.state_of(predicted)), posterior=estimate, estimate=estimate, modality=bank)
-        return Gaussian(posteriors.mean[:, 0], posteriors.covariance[:, 0]), trace
+        return self.wrapped(Gaussian(posteriors.mean[:, 0], posteriors.covariance[:, 0])), trace
 
     def state_of(self, joint: Gaussian) -> Gaussian:
         """The state's marginal (..., n) of a joint Gaussian (..., n (1 + K))."""
-        return Gaussian(joint.mean[..., : self.n], joint.covariance[..., : self.n, : self.n])
+        return self.wrapped(Gaussian(joint.mean[..., : self.n], joint.covariance[..., : self.n, : self.n]))
 
     def inverse_noise(self, evidence: Evidence) -> Tensor:
         """(N, K, n) inverse standard deviations of v_k; zero where a reading is not used."""
@@ -207,7 +209,7 @@ class InformationFilter(ExtendedKalmanFilter):
     def fuse(self, bank: Gaussian, log_weights: Tensor | None, present: Tensor | None = None) -> Gaussian:
         """The product of a bank (N, K, n), without a prior."""
         assert log_weights is not None
-        return weighted_product(bank, powers(log_weights, present))
+        return weighted_product(in_one_turn(bank, self.angles), powers(log_weights, present))
 
     def shares(self, evidence: Evidence) -> Tensor:
         """Information share: beta times the precision of each virtual observation, sum 1 over K, (T, N, K, n)."""

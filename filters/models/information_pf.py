@@ -52,7 +52,7 @@ class InformationParticleFilter(ParticleFilter, InformationFilter):
         return resampled, StepTrace(
             predicted=Particles(x, belief.log_weights),
             posterior=posterior,
-            estimate=posterior.moments(),
+            estimate=posterior.moments(self.angles),
             log_likelihood=log_normal(error, self._information(evidence, variance)),
             ancestors=ancestors,
         )
@@ -63,7 +63,7 @@ class InformationParticleFilter(ParticleFilter, InformationFilter):
 
     def _errors(self, evidence: Evidence, x: Tensor) -> Tensor:
         """(N, M, K, n): ``z_k - x``."""
-        return evidence.observation.unsqueeze(1) - x.unsqueeze(2)
+        return self.angles.difference(evidence.observation.unsqueeze(1), x.unsqueeze(2))
 
     def _information(self, evidence: Evidence, variance: Tensor, power: Tensor | float = 1.0) -> Tensor:
         """``1 / (r_k^2 s_k + R_k / p_k)``, zero for components of observations that are not used; (N, M or 1, K, n).

@@ -45,10 +45,11 @@ class Lstm(SequenceModel):
         super().__init__(architecture)
         self.layers = nn.ModuleList(Cell(architecture.units if i == 0 else HIDDEN) for i in range(LAYERS))
         self.output = self.readout(HIDDEN)
-        self.initial = nn.Linear(self.n, LAYERS * 2 * HIDDEN)
+        self.initial = nn.Linear(self.features, LAYERS * 2 * HIDDEN)
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Recurrent:
-        return Recurrent(self.initial(belief.mean).unflatten(-1, (LAYERS, 2, HIDDEN)).tanh(), belief.mean)
+        hidden = self.initial(self.angles.features(belief.mean)).unflatten(-1, (LAYERS, 2, HIDDEN))
+        return Recurrent(hidden.tanh(), belief.mean)
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Recurrent, StepTrace]:
         assert isinstance(belief, Recurrent)

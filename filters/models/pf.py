@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.task import Task
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.filter import Architecture, Filter, encoders
@@ -34,7 +35,8 @@ class MeasurementModel(nn.Module):
         units = architecture.units
         self.encoders = encoders(task, model.split("+"), architecture)
         self.join_observation = nn.Linear(self.encoders.size, units)
-        self.state_encoder = vector_stack(len(task.components), units)
+        self.angles = Angles.from_task(task)
+        self.state_encoder = vector_stack(len(task.components) + len(self.angles.indices), units)
         self.join_state = nn.Linear(units, units, bias=False)
         residuals = (Residual(units) for _ in range(2 if architecture.networks == "authors" else 1))
         self.head = Stack(nn.ReLU(inplace=True), *residuals, nn.Linear(units, 1))
@@ -46,7 +48,7 @@ class MeasurementModel(nn.Module):
 
     def state_part(self, states: Tensor) -> Tensor:
         """States (..., n), standardised, to (..., units)."""
-        part: Tensor = self.join_state(self.state_encoder(states))
+        part: Tensor = self.join_state(self.state_encoder(self.angles.features(states)))
         return part
 
     def log_likelihood(self, observation_part: Tensor, state_part: Tensor) -> Tensor:
@@ -73,7 +75,8 @@ class ParticleFilter(Filter):
         """States (N, M, n) of the next step, with process noise."""
         control = evidence.control.unsqueeze(1)
         moved = in_chunks(lambda states: self.dynamics(states, control), states)
-        return moved + common_random_numbers.normal(moved.shape, generator) * self.process_noise(moved - states)
+        noise = common_random_numbers.normal(moved.shape, generator) * self.process_noise(moved - states)
+        return self.angles.wrapped(moved + noise)
 
     def resample(self, particles: Particles, generator: torch.Generator) -> tuple[Particles, Tensor]:
         """Resampled particles and their ancestors (N, M)."""
@@ -91,7 +94,7 @@ class MixtureParticleFilter(ParticleFilter):
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
-        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units)
+        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units, self.angles)
         self.measurement_models = nn.ModuleDict({m: MeasurementModel(self.task, m, architecture) for m in self.names})
         if architecture.fusion == "crossmodal":
             self.weight_model = WeightModel(self.task, architecture, 1)
@@ -142,7 +145,7 @@ class MixtureParticleFilter(ParticleFilter):
         return resampled, StepTrace(
             predicted=predicted,
             posterior=posterior,
-            estimate=posterior.moments(),
+            estimate=posterior.moments(self.angles),
             log_likelihood=log_likelihood,
             ancestors=ancestors,
         )

@@ -24,6 +24,7 @@ class SequenceModel(Filter):
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
         units = architecture.units
+        self.features = self.n + len(self.angles.indices)
         self.encoders = encoders(self.task, self.task.modalities, architecture)
         self.control_encoder = vector_stack(self.task.control_size, units)
         self.shared = Stack(nn.Linear(self.encoders.size + units, units), nn.ReLU(inplace=True), Residual(units))
@@ -31,7 +32,7 @@ class SequenceModel(Filter):
     def readout(self, size: int) -> Stack:
         """A new network from the memory's output (..., size) to the state (..., n)."""
         units = self.architecture.units
-        return Stack(nn.Linear(size, units), nn.ReLU(inplace=True), nn.Linear(units, self.n))
+        return Stack(nn.Linear(size, units), nn.ReLU(inplace=True), nn.Linear(units, self.features))
 
     def encode(self, batch: Batch) -> Evidence:
         control = self.control_encoder(self.statistics.standardise("control", batch.controls))
@@ -40,6 +41,6 @@ class SequenceModel(Filter):
 
     def read(self, before: Recurrent, memory: Tensor, output: Tensor) -> tuple[Recurrent, StepTrace]:
         """The belief, and the step's trace, from the new memory (N, L, S, H) and its output (N, H)."""
-        after = Recurrent(memory, self.output(output))
+        after = Recurrent(memory, self.angles.states(self.output(output)))
         unknown = torch.full((*after.mean.shape, self.n), torch.nan, device=after.mean.device)
         return after, StepTrace(predicted=before, posterior=after, estimate=Gaussian(after.mean, unknown))

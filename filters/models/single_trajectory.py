@@ -17,8 +17,9 @@ Layer = tuple[np.ndarray, np.ndarray]
 
 
 def is_usual(dynamics: nn.Module) -> bool:
-    """Whether a dynamics model has the equations below: no static components, and no method that was replaced."""
-    return type(dynamics) is Dynamics and not dynamics.static and "with_jacobian" not in vars(dynamics)
+    """Whether a dynamics model has the equations below: no static or wrapping components, and no replaced method."""
+    usual = type(dynamics) is Dynamics and not dynamics.static and not dynamics.angles.indices
+    return usual and "with_jacobian" not in vars(dynamics)
 
 
 class SingleTrajectory:

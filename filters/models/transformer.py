@@ -58,10 +58,10 @@ class Transformer(SequenceModel):
         super().__init__(architecture)
         self.layers = nn.ModuleList(Attention(architecture.units) for _ in range(LAYERS))
         self.output = self.readout(architecture.units)
-        self.initial = nn.Linear(self.n, LAYERS * architecture.units)
+        self.initial = nn.Linear(self.features, LAYERS * architecture.units)
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Recurrent:
-        memory = self.initial(belief.mean).unflatten(-1, (LAYERS, 1, -1))
+        memory = self.initial(self.angles.features(belief.mean)).unflatten(-1, (LAYERS, 1, -1))
         return Recurrent(memory.expand(-1, -1, WINDOW, -1), belief.mean)
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Recurrent, StepTrace]:

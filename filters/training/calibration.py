@@ -26,7 +26,7 @@ def fit_errors(filter_: InformationFilter, steps: Steps, count: int, seed: int, 
     if not filter_.task.start_distance:
         start = losses.perturbed(start, torch.Generator(start.mean.device).manual_seed(seed))
     filter_.requires_grad_(False)
-    evidence, truth = filter_.encode(batch), losses.true_states(filter_, batch)
+    evidence = filter_.encode(batch)
     parameters = filter_.error_parameters()
     for parameter in parameters:
         parameter.requires_grad_(True)
@@ -35,7 +35,8 @@ def fit_errors(filter_: InformationFilter, steps: Steps, count: int, seed: int, 
     for step in range(1, count + 1):
         optimiser.zero_grad()
         estimate = rollout(filter_, evidence, start, torch.Generator()).estimate
-        loss = losses.negative_log_likelihood(estimate.mean - truth, estimate.covariance).mean()
+        error = losses.errors(filter_, estimate.mean, batch)
+        loss = losses.negative_log_likelihood(error, estimate.covariance).mean()
         loss.backward()
         optimiser.step()
         schedule.step()

@@ -22,6 +22,11 @@ def true_states(filter_: Filter, batch: Batch) -> Tensor:
     return filter_.statistics.standardise("state", batch.states)
 
 
+def errors(filter_: Filter, states: Tensor, batch: Batch) -> Tensor:
+    """(T, N, n) standardised states minus the true ones, wrapping angles from -pi to pi."""
+    return filter_.angles.difference(states, true_states(filter_, batch))
+
+
 def prediction(filter_: Filter, batch: Batch) -> Tensor:
     """Mean squared error of the dynamics model, T steps ahead from the true state."""
     control = filter_.dynamics.control_part(filter_.statistics.standardise("control", batch.controls))
@@ -29,7 +34,7 @@ def prediction(filter_: Filter, batch: Batch) -> Tensor:
     x = filter_.statistics.standardise("state", batch.previous)
     for t in range(len(batch)):
         x = filter_.dynamics(x, control[t])
-        total = total + (x - target[t]).square().mean()
+        total = total + filter_.angles.difference(x, target[t]).square().mean()
     return total / len(batch)
 
 
@@ -45,16 +50,20 @@ def sensor_likelihood(filter_: InformationFilter, name: str, batch: Batch, facto
 
     The product with the training distribution's prior makes N(x; z, R) a likelihood, which a filter may multiply at
     every step. Trained as a posterior, a sensor would repeat the prior: even a black image would carry information.
+    The prior of angles that wrap is uniform.
 
     Args:
         factors: the result is the smallest of these f.
     """
     z, noise = filter_.sense(name, filter_.observations(batch))
     truth, values = true_states(filter_, batch), []
+    prior = torch.ones(filter_.n, device=z.device)  # its inverse variance
+    prior[list(filter_.angles.indices)] = 0.0
     for factor in factors:
         square = (factor * noise).square()
-        variance = square / (1.0 + square)
-        error = z / (1.0 + square) - truth
+        shrinkage = 1.0 + prior * square
+        variance = square / shrinkage
+        error = filter_.angles.difference(z / shrinkage, truth)
         values.append(with_readings(filter_, name, batch, error.square() / variance + variance.log()).mean())
     return 0.5 * torch.stack(values).amin()
 
@@ -136,7 +145,7 @@ def through_filter(
     """
     start = perturbed(first_belief(filter_, batch), noise)
     estimate = rollout(filter_, evidence, start, noise, particles).estimate
-    error = estimate.mean - true_states(filter_, batch)
+    error = errors(filter_, estimate.mean, batch)
     total = averaged(error.square().sum(-1), weight)
     if not filter_.has_covariance:
         return total

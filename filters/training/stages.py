@@ -250,8 +250,8 @@ class Trainer:
         batch = self.sample("train" if self.sets["val"] is None else "val", 1, 64 * self.plan.batch)
         control = filter_.dynamics.control_part(filter_.statistics.standardise("control", batch.controls[0]))
         predicted = filter_.dynamics(filter_.statistics.standardise("state", batch.previous), control)
-        residual = (predicted - losses.true_states(filter_, batch)[0]).square().mean(0).sqrt()
-        filter_.dynamics.log_noise.copy_(residual.clamp_min(MIN_PROCESS_NOISE).log())
+        residual = losses.errors(filter_, predicted, batch)[0]
+        filter_.dynamics.log_noise.copy_(residual.square().mean(0).sqrt().clamp_min(MIN_PROCESS_NOISE).log())
 
     def train_image_encoder(self) -> None:
         """Trains the first encoder to regress the state through a linear readout, which is then discarded.
@@ -262,7 +262,7 @@ class Trainer:
         modality = next(m for m in self.filter.task.modalities if len(modality_shape(self.filter.task, m)) == 2)
         encoder, units = self.image_encoders()[0], self.filter.architecture.units
         self.seed_generators("readout")
-        readout = nn.Linear(units, self.filter.n)
+        readout = nn.Linear(units, self.filter.n + len(self.filter.angles.indices))
         nn.init.normal_(readout.weight, std=units**-0.5, generator=self.generator)
         nn.init.zeros_(readout.bias)
         readout.to(self.device)
@@ -272,7 +272,8 @@ class Trainer:
             assert steps is not None
             batch = steps.sample(4 * self.plan.batch, 1, self.generator)
             image = self.filter.statistics.standardise(modality, batch.observations[modality][0])
-            return (readout(encoder(image)) - losses.true_states(self.filter, batch)[0]).square().mean()
+            target = self.filter.angles.features(losses.true_states(self.filter, batch)[0])
+            return (readout(encoder(image)) - target).square().mean()
 
         parameters = [*encoder.parameters(), *readout.parameters()]
         self.optimise(IMAGES, parameters, self.plan.images, self.plan.rate, loss)
@@ -292,7 +293,7 @@ class Trainer:
             if not uses_images:
                 batch = self.shifted(batch)
             if isinstance(module, VirtualSensor):
-                error = module(self.filter.observations(batch))[0] - losses.true_states(self.filter, batch)
+                error = losses.errors(filter_, module(filter_.observations(batch))[0], batch)
                 return losses.with_readings(filter_, name, batch, error.square()).mean()
             return losses.likelihood(self.filter, module, batch, self.noise)
 

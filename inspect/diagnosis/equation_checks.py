@@ -16,7 +16,7 @@ from torch import Tensor
 from beliefscope.filters.belief import Gaussian, moments
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
-from beliefscope.filters.models.fusion import product_of_experts, weighted_average
+from beliefscope.filters.models.fusion import in_one_turn, product_of_experts, weighted_average
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.statistics import measures
@@ -69,7 +69,7 @@ def _kalman_statistics(trace: Trace, filter_: ExtendedKalmanFilter) -> dict[str,
 
 def _fused(trace: Trace, filter_: ExtendedKalmanFilter) -> Gaussian:
     """Result of the fusion rule for the bank's posteriors, (T, n) and (T, n, n)."""
-    bank = Gaussian(_tensor(trace.modality_mean), _tensor(trace.modality_covariance))
+    bank = in_one_turn(Gaussian(_tensor(trace.modality_mean), _tensor(trace.modality_covariance)), filter_.angles)
     log_weights = None if trace.weights is None else _tensor(trace.weights).log()
     architecture = filter_.architecture
     if bank.mean.shape[1] == 1:
@@ -100,7 +100,7 @@ def _particle_statistics(trace: Trace, filter_: MixtureParticleFilter) -> dict[s
     assert trace.prior_log_weights is not None
     steps, count = trace.log_weights.shape
     log_weights, prior = _tensor(trace.log_weights), _tensor(trace.prior_log_weights)
-    rule = moments(_tensor(trace.particles), log_weights)
+    rule = moments(_tensor(trace.particles), log_weights, filter_.angles)
     variance, by_rule = (
         matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12)
         for matrix in (_tensor(trace.estimate_covariance), rule.covariance)

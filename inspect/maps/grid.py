@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor, nn
 
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.models.networks import Residual
 from beliefscope.filters.models.pf import MeasurementModel
 
@@ -24,7 +25,7 @@ class GridEvaluator:
     centre state s_0, so it is evaluated for S columns and S rows instead of S x S cells. The other layers run in
     place on chunks of rows that fit into the CPU caches, in preallocated buffers, because allocation costs as much as
     a layer. The state branch of the networks is cached when a grid is requested again, as for an object at rest or a
-    fixed cross-section.
+    fixed cross-section. Of an angle that wraps, the layer reads sine and cosine, which also add to its output.
     """
 
     def __init__(self, models: Sequence[MeasurementModel], scale: Tensor) -> None:
@@ -95,8 +96,18 @@ class GridEvaluator:
         """(S, units) each: terms of the first layer by column and by row."""
         layer = model.state_encoder[0]
         assert isinstance(layer, nn.Linear)
-        by_x, by_y = ((layer.weight / self._scale)[:, i] for i in along)
-        return x[:, None] * by_x, y[:, None] * by_y + layer(state)
+        columns, rows = (
+            self._term(model.angles, layer.weight, i, d, state) for i, d in zip(along, (x, y), strict=True)
+        )
+        return columns, rows + layer(model.angles.features(state))
+
+    def _term(self, angles: Angles, weight: Tensor, i: int, offsets: Tensor, state: Tensor) -> Tensor:
+        """(S, units): change of the first layer by offsets (S,) of component i. weight: (units, features)."""
+        if i not in angles.indices:
+            return offsets[:, None] * (weight[:, i] / self._scale[i])
+        states = state.repeat(len(offsets), 1)
+        states[:, i] += offsets / self._scale[i]
+        return (angles.features(states) - angles.features(state)) @ weight.T
 
 
 def chunks(columns: int, rows: int) -> Iterator[tuple[int, int]]:

@@ -331,7 +331,7 @@ def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) 
     posterior = torch.cat([s.posterior.log_weights for s in steps if isinstance(s.posterior, Particles)])
     log_likelihood = torch.cat([s.log_likelihood for s in steps if s.log_likelihood is not None])
     # All steps at once: faster than ``StepTrace.updates`` of each.
-    modality = reweighted(Particles(states, prior), log_likelihood)
+    modality = reweighted(Particles(states, prior), log_likelihood, filter_.angles)
     si = filter_.statistics
     arrays = {
         "particles": si.state_to_si(states),

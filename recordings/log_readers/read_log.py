@@ -360,16 +360,23 @@ def _task(
     units = [component.unit for component in mapping.components]
     spans = np.ptp(np.nan_to_num(states), axis=0)
     large = max((span for span, unit in zip(spans, units, strict=True) if unit == "m"), default=0.0) > LARGE
-    displayed = [replace(c, display=("m", 1.0)) if c.unit == "m" and large else c for c in mapping.components]
+    components = tuple(
+        replace(
+            component,
+            display=("m", 1.0) if component.unit == "m" and large else component.display,
+            wraps=bool(span > np.pi) and component.unit == "rad" and not component.rotation,
+        )
+        for component, span in zip(mapping.components, spans, strict=True)
+    )
     extent = max(span for span, unit in zip(spans[:2], units, strict=False) if unit == units[0]) / 2.0
     task = Task(
         name=mapping.task,
-        components=tuple(displayed),
+        components=components,
         observations={name: array.shape[1:] for name, array in sensors.items()},
         modalities={name: (name,) for name in sensors},
         control_size=controls,
         dt=dt,
-        map_components=tuple(component.name for component in displayed[:2]),
+        map_components=tuple(component.name for component in components[:2]),
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
         periods=periods,

@@ -77,7 +77,7 @@ def test_linear_system_with_two_sensors_equals_a_kalman_filter_with_one(fusion: 
         np.testing.assert_allclose(estimate.mean[:, 0], mean, atol=1e-9)
         np.testing.assert_allclose(estimate.covariance[:, 0], covariance, atol=1e-9)
         steps = rollout(filter_, evidence, start, torch.Generator(), keep=True).steps
-        updates = np.array([step.updates.mean[0, k].numpy() for step in steps if step.updates is not None])
+        updates = np.array([update.mean[0, k].numpy() for step in steps if (update := step.updates()) is not None])
         np.testing.assert_allclose(updates[0], mean[0], atol=1e-9)  # the first prior is common
         assert np.abs(updates - mean).max() > 0.1
 

@@ -101,7 +101,7 @@ def train(
 
 def _check_training(task: Task, episodes: Sequence[Episode], sample: bool) -> None:
     """Raise BadInput for a sample set without training episodes; warn of angles that wrap around."""
-    from beliefscope.filters.training.angles import wrapping_warning
+    from beliefscope.filters.angles import wrapping_warning
 
     if sample and task.simulate is not None and all(episode.split != "train" for episode in episodes):
         raise BadInput(

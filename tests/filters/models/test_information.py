@@ -278,6 +278,7 @@ class ConstantNoise:
 
     def __init__(self, filter_: InformationFilter, readings: Tensor, noise: float) -> None:
         self.statistics, self.observations = filter_.statistics, filter_.observations
+        self.n, self.angles = filter_.n, filter_.angles
         self.reading = readings, torch.full_like(readings, noise)
 
     def sense(self, name: str, observations: object) -> tuple[Tensor, Tensor]:
