@@ -91,7 +91,7 @@ def train(
     }
     # The number of steps distinguishes data sets extended by faulty copies, which their hash does not cover.
     inputs = {key: record[key] for key in ("seed", "plan", "data_hash", "versions", "device")}
-    inputs |= {"task": architecture.task.name, "steps": len(steps.states)}
+    inputs |= {"task": architecture.task.name, "steps": len(steps.states), "angles": filter_.angles.indices}
     store = None if shared is None else SharedModules(shared)
     trainer = Trainer(
         filter_, train_steps, plan, seed, val_steps, report, blackouts, store, cache_key(**inputs), on_validation
