@@ -285,6 +285,11 @@ class Task:
         return names.index(component)
 
     @property
+    def angles(self) -> tuple[int, ...]:
+        """Indices of the components in rad, whose differences are modulo a turn; those of rotations too."""
+        return tuple(i for i, component in enumerate(self.components) if component.unit == "rad")
+
+    @property
     def rotations(self) -> tuple[slice, ...]:
         """Where the vector of each rotation is in the state."""
         names = [component.rotation for component in self.components]
@@ -315,7 +320,7 @@ class Task:
     def difference(self, states: NDArray[Any], reference: NDArray[Any]) -> Array:
         """(..., n) differences of states, angles wrapped to -pi..pi; of rotations, see ``rotations.difference``."""
         change = np.array(states - reference, dtype=np.float64)
-        angles = [i for i, component in enumerate(self.components) if component.unit == "rad"]
+        angles = list(self.angles)
         change[..., angles] = (change[..., angles] + np.pi) % (2.0 * np.pi) - np.pi
         for where in self.rotations:
             change[..., where] = rotations.difference(states[..., where], reference[..., where])

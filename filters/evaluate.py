@@ -19,6 +19,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.notebook_html import html_table
 from beliefscope.datasets.task import Task
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.covariance_floor import with_floor
@@ -309,7 +310,8 @@ def _stay(task: Task, mean: Tensor, states: Tensor) -> Run:
 
 def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:
     """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each trajectory."""
-    trajectories = [(_wrapped(task, e), c) for e, c in trajectories]
+    # An estimate that counts turns has no larger errors.
+    trajectories = [(Angles(task.angles).wrapped(e), c) for e, c in trajectories]
     late = [(e[first:], c[first:]) for e, c in trajectories for first in [task.first_counted(len(e))]]
     result = metrics(task, torch.cat([e for e, _ in late]), torch.cat([c for _, c in late]))
     sums = [[float(len(e)), *(float(values.sum()) for values in squares(task, e).values())] for e, _ in late]
@@ -327,12 +329,6 @@ def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) 
         rmse_after_contact=after if has_contact and touched.any() else {},
         squares=np.array(sums),
     )
-
-
-def _wrapped(task: Task, error: Tensor) -> Tensor:
-    """Errors (..., n) whose angles are in -pi..pi: those of an estimate that counts turns are not larger."""
-    angle = torch.tensor([component.unit == "rad" for component in task.components])
-    return error - torch.where(angle, 2.0 * math.pi * torch.round(error / (2.0 * math.pi)), 0.0)
 
 
 def squares(task: Task, error: Tensor) -> dict[str, Tensor]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput, type_name, unknown_name
 from beliefscope.datasets.task import Task
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.belief import Gaussian, moments
 
 SHAPES = {
@@ -305,7 +306,7 @@ def _turned(task: Task, linear: Gaussian, particles: Tensor, log_weights: Tensor
 
     Deviations are differences from the particle of the largest weight, wrapped to -pi..pi.
     """
-    angles = [i for i, component in enumerate(task.components) if component.unit == "rad" and not component.rotation]
+    angles = [i for i in task.angles if not task.components[i].rotation]
     distances = particles[..., angles] - linear.mean[..., angles].unsqueeze(-2)
     apart = (distances.abs() > torch.pi).any(-1).any(-1)
     if not apart.any():
@@ -313,17 +314,11 @@ def _turned(task: Task, linear: Gaussian, particles: Tensor, log_weights: Tensor
     states = particles.expand(*log_weights.shape, particles.shape[-1])[apart].double()
     weights = log_weights[apart].double().exp().unsqueeze(-1)
     best = states.gather(1, weights.argmax(1, keepdim=True).expand(-1, -1, states.shape[-1]))
-    mean = best + (weights * _wrapped(states - best, angles)).sum(1, keepdim=True)
-    deviation = _wrapped(states - mean, angles)
+    mean = best + (weights * Angles(tuple(angles)).wrapped(states - best)).sum(1, keepdim=True)
+    deviation = Angles(tuple(angles)).wrapped(states - mean)
     linear.mean[apart] = mean.squeeze(1).to(linear.mean.dtype)
     linear.covariance[apart] = ((weights * deviation).mT @ deviation).to(linear.covariance.dtype)
     return linear
-
-
-def _wrapped(states: Tensor, angles: list[int]) -> Tensor:
-    """States (..., n) with angles in -pi..pi."""
-    states[..., angles] = (states[..., angles] + torch.pi) % (2.0 * torch.pi) - torch.pi
-    return states
 
 
 def derived(values: Values, task: Task) -> Values:

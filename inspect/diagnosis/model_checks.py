@@ -72,7 +72,7 @@ def error_statistics(trace: Trace) -> dict[str, float]:
     """Root mean square errors of the estimate: ``error`` of the position in m, ``angle error`` of the angles in rad."""
     at = measures.counted(trace)
     values = {"error//all": float(np.sqrt(np.square(measures.main_error(trace)[at, -1]).mean()))}
-    angles = [i for i, c in enumerate(trace.task.components) if c.unit == "rad"]
+    angles = list(trace.task.angles)
     if angles:
         values["angle error//all"] = float(np.sqrt(np.square(measures.errors(trace)[at, -1][:, angles]).mean()))
     return values

@@ -247,7 +247,7 @@ def _check_same_run(first: Mapping[str, Any], other: Mapping[str, Any]) -> None:
 def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
     """(T, ...) columns of a trace in a survey; speeds in m/s and rad/s."""
     task, steps = trace.task, np.arange(len(trace))
-    angles = [i for i, c in enumerate(task.components) if c.unit == "rad"]
+    angles = list(task.angles)
     scores = {f"score {name}": s.values(trace) for name, s in scores_of(task).items() if s.why_not(trace) is None}
     episode = trace.episode
     recent = max(1, round(RECENT / episode.dt))
@@ -296,7 +296,7 @@ def _speeds(trace: Trace, task: Task) -> Array:
     states = trace.episode.states
     motion = task.difference(states, np.concatenate([states[:1], states[:-1]]))
     changes = [motion[:, list(task.map_indices)]]
-    changes += [motion[:, [i]] for i, c in enumerate(task.components) if c.unit == "rad"]
+    changes += [motion[:, [i]] for i in task.angles]
     effector = trace.episode.observations.get("effector_position")
     if effector is not None:
         changes.append(np.diff(effector, axis=0, prepend=effector[:1]))

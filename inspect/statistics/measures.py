@@ -38,7 +38,7 @@ def layer_label(layer: str) -> str:
 
 def wrapped(task: Task, difference: NDArray[Any]) -> Array:
     """Sums of differences of states (..., n), angles wrapped to -pi..pi; for states, see ``Task.difference``."""
-    return wrap_angles(difference, [i for i, component in enumerate(task.components) if component.unit == "rad"])
+    return wrap_angles(difference, task.angles)
 
 
 def wrap_angles(difference: NDArray[Any], angles: Sequence[int]) -> Array:
