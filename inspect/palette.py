@@ -18,7 +18,6 @@ COLOURS: dict[str, str] = {
 """Okabe and Ito's palette, distinguishable with colour vision deficiency. Each colour has one meaning."""
 
 SPARE_COLOURS: tuple[str, ...] = (
-    "#0072B2",
     "#F0E442",
     "#999999",
     "#882255",
@@ -26,9 +25,10 @@ SPARE_COLOURS: tuple[str, ...] = (
     "#332288",
     "#8C6D31",
     "#A6D854",
+    "#0072B2",
 )
-"""Colours of other modalities, in the order of the trace's modalities; with dashes, since eight colours are too many
-for some colour vision deficiencies."""
+"""Colours of other modalities, in the order of the trace's modalities, the one most like those above last; with dashes,
+since eight colours are too many for some colour vision deficiencies."""
 
 
 def colour(source: str, modalities: Sequence[str]) -> str:
