@@ -32,7 +32,7 @@ from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.train import train
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import arrays_of, trace
 
 Arrays = dict[str, Any]

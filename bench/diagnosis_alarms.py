@@ -20,7 +20,7 @@ from beliefscope.datasets.catalog import load_task
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.case import compared, observe
 from beliefscope.inspect.diagnosis.diagnose import required_profile
-from beliefscope.inspect.diagnosis.setting import Setting
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.traces.batch import trace_all
 
 RATES = (0.05, 0.02, 0.01)
@@ -54,8 +54,8 @@ def false_alarms(task: str, name: str, count: int, orders: int, seed: int) -> li
         for sample in rng.permutation(count)[: count // SIZE * SIZE].reshape(-1, SIZE):
             rows, sensors = zip(*(observed[i] for i in sample), strict=True)
             chosen = [traces[i] for i in sample]
-            setting = Setting(checkpoint, {t.episode_index: t.episode for t in chosen}, 300, frozenset())
-            cases = [compared(setting, chosen, rows, sensors, profile, rate) for rate in RATES]
+            inputs = RunInputs(checkpoint, {t.episode_index: t.episode for t in chosen}, 300, frozenset())
+            cases = [compared(inputs, chosen, rows, sensors, profile, rate) for rate in RATES]
             alarms.append([bool(case.alarms) for case in cases])
     return np.mean(alarms, axis=0).tolist()
 

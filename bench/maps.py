@@ -17,7 +17,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.engine import one_thread
 from beliefscope.filters.models.fusion import mixture
 from beliefscope.filters.models.pf import MeasurementModel, MixtureParticleFilter
-from beliefscope.inspect.likelihood import COARSE, FINE, MapEngine
+from beliefscope.inspect.maps.map_engine import COARSE, FINE, MapEngine
 
 BARS = {FINE: 20, COARSE: 150}  # sets a second
 RATIO, WHOLE = 1.5, 20  # times direct evaluation; s for all coarse maps of an episode

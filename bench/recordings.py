@@ -26,7 +26,7 @@ from page import browsing
 from served import serving
 from subject import NAMES, STEPS, Row
 
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import trace
 from beliefscope.inspect.traces.run import start_run
 from beliefscope.recordings.live import LiveRecorder

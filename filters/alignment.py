@@ -13,9 +13,9 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.data_check import findings
 from beliefscope.filters.evaluate import run
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.out_of_distribution import findings
 
 ITERATIONS = 3
 

@@ -30,7 +30,7 @@ from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import task_to_json
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_from_arrays
 from beliefscope.inspect.traces.data import STATIC
 from beliefscope.recordings.rerun_log import entities

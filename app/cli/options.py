@@ -263,7 +263,7 @@ class Runs:
     def check(self, checkpoint: Checkpoint, episodes: list[Episode], align: bool) -> list[Episode]:
         """Warn if the episodes differ from the training data; with ``align``, the episodes in its frame."""
         from beliefscope.filters.alignment import align as move
-        from beliefscope.filters.data_check import data_warning
+        from beliefscope.filters.out_of_distribution import data_warning
 
         if align:
             episodes, alignment = move(checkpoint, episodes, self.particles, self.seed)

@@ -12,8 +12,8 @@ from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.recordings import RecordingFolder
 from beliefscope.inspect.catalog import quick
-from beliefscope.inspect.likelihood import FINE, LikelihoodMap, Quantity
 from beliefscope.inspect.maps.likelihood_map import MapOptions
+from beliefscope.inspect.maps.map_engine import FINE, LikelihoodMap, Quantity
 from beliefscope.inspect.traces.live_file import SUFFIX, write_live
 from beliefscope.recordings.probe import RecordingInfo
 

@@ -10,7 +10,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
-from beliefscope.inspect.likelihood import missing_quantities
+from beliefscope.inspect.maps.map_engine import missing_quantities
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 from beliefscope.recordings.report.pdf import browser
 

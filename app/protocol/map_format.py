@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.maps.map_statistics import measure_maps, particle_cloud
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.trace import Trace

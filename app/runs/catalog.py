@@ -14,7 +14,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import available_presets
-from beliefscope.datasets.first_moment import first_moment
+from beliefscope.datasets.initial_view import initial_view
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
@@ -179,7 +179,7 @@ def task_catalogs(
     for name, path in data.items():
         with _collect_error(problems):
             episodes = open_dataset(path, given=tasks)
-            first_moment(episodes)  # the page opens it there: damage of these episodes is a problem of the data set
+            initial_view(episodes)  # the page opens it there: damage of these episodes is a problem of the data set
             _catalog_of(catalogs, episodes.task, name).user_data[name] = episodes
             # A file of the MIT Push data set fits several tasks: offer it for each one that the user has filters for.
             for task in tasks_with_filters:
@@ -261,7 +261,7 @@ def _filter_json(name: str, checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def _data_json(name: str, data: Dataset) -> dict[str, Any]:
-    episode, step = first_moment(data)
+    episode, step = initial_view(data)
     episodes = episode_list.nearby(data, episode)
     return {"name": name, "first": episode, "first_step": step, "count": len(data), "episodes": episodes}
 

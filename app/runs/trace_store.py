@@ -31,7 +31,7 @@ from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.datasets.first_moment import first_moment
+from beliefscope.datasets.initial_view import initial_view
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference, task_to_json
 from beliefscope.filters.checkpoint import Checkpoint
@@ -127,7 +127,7 @@ class TraceStore:
                     raise BadInput("; ".join(problems) or "no trained filter is available; train one first")
                 catalog, filter_ = first, next(iter(first.filters))
             data, episodes = next(iter(catalog.data.items()))
-            return Selection(catalog.task.name, filter_, first_moment(episodes)[0], data=data)
+            return Selection(catalog.task.name, filter_, initial_view(episodes)[0], data=data)
 
     def _examples(self) -> list[Example]:
         """The examples, first those of the user's data.

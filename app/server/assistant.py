@@ -22,7 +22,7 @@ from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.events import find_failures
 from beliefscope.inspect.figures.top_view import draw_step
-from beliefscope.inspect.likelihood import COARSE, MapEngine, no_maps
+from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, no_maps
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.summaries import phase_summaries, step_values
 from beliefscope.inspect.trace import Trace, trace

@@ -6,7 +6,7 @@ from beliefscope.app.protocol.messages import SceneLayers, Viewpoint
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.embedded_viser import EmbeddedViser
 from beliefscope.app.views.scene_belief import BeliefScene, ComparisonEstimate
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 

@@ -23,7 +23,7 @@ from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.task import Outline, Task
 from beliefscope.inspect.figures.scene_belief import DISC_SPACING, DrawnBelief, rgb
 from beliefscope.inspect.figures.scene_shapes import DISC, FAN, OUTLINE_EDGES, RGB, UP, Array, dashed
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.statistics.measures import layer_label
 from beliefscope.inspect.trace import Trace
 

@@ -27,7 +27,7 @@ from beliefscope.inspect.figures.scene_shapes import (
     map_pixels,
 )
 from beliefscope.inspect.figures.soft_shadows import SoftShadows
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.sensors import camera_images
 

@@ -20,7 +20,7 @@ from beliefscope.app.views.scene import Scene
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.inspect.likelihood import COARSE, FINE
+from beliefscope.inspect.maps.map_engine import COARSE, FINE
 
 log = logging.getLogger("beliefscope.app")
 # Deadlines in s: coarse maps, which follow a moving cursor, come first.

@@ -59,8 +59,8 @@ from beliefscope.filters.external.calls import (
 )
 from beliefscope.filters.external.fingerprint import fingerprint
 from beliefscope.filters.external.hooks import Capture
+from beliefscope.filters.external.module_weights import load_weights, pretrained_std
 from beliefscope.filters.external.step_values import StepValues, with_ancestors
-from beliefscope.filters.external.weights import load_weights, pretrained_std
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import START_VARIANCE
 

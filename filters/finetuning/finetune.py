@@ -18,9 +18,9 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix
-from beliefscope.filters.finetuning.calibration import calibrate_noise, noise_parameters
 from beliefscope.filters.finetuning.loop import FilterLoop, FineTuneLoop, Validation, validate
 from beliefscope.filters.finetuning.module_selection import digest, freeze, select_parameters
+from beliefscope.filters.finetuning.noise_scale import calibrate_noise, noise_parameters
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
 from beliefscope.filters.training.encoder_cache import Images, cached_encoders, index_images
 from beliefscope.filters.training.resume import Partial, cache_key

@@ -19,8 +19,8 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.networks import ImageEncoder, reset_weights
 from beliefscope.filters.models.pf import MeasurementModel
 from beliefscope.filters.training import losses
-from beliefscope.filters.training.calibration import fit_errors
 from beliefscope.filters.training.encoder_cache import encode_images, weights_key
+from beliefscope.filters.training.error_parameters import fit_errors
 from beliefscope.filters.training.optimiser import optimiser_step, parameter_groups
 from beliefscope.filters.training.plan import BLACKOUTS, Plan, Report
 from beliefscope.filters.training.resume import SharedModules, cache_key

@@ -17,12 +17,12 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
-from beliefscope.filters.data_check import summarise
 from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.information_pf import with_particles
+from beliefscope.filters.out_of_distribution import summarise
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Plan, Report, evaluated_blackouts
 from beliefscope.filters.training.resume import Partial, SharedModules, cache_key

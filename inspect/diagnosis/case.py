@@ -13,9 +13,9 @@ from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
-from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
@@ -40,7 +40,7 @@ class Case:
         p_value: probability of deviations of this size in a healthy filter.
     """
 
-    setting: Setting
+    inputs: RunInputs
     traces: Sequence[Trace]
     rows: Rows
     sensors: Rows
@@ -67,25 +67,25 @@ def observe(trace: Trace, checkpoint: Checkpoint, profile: HealthyProfile) -> tu
     return episode_statistics(trace, checkpoint, sensors), sensors
 
 
-def examine_again(case: Case, setting: Setting, traces: Sequence[Trace]) -> Case:
+def examine_again(case: Case, inputs: RunInputs, traces: Sequence[Trace]) -> Case:
     """Another run of the episodes of a case; statistics of sensors remain where the readings are the same."""
     sensors_by_episode = {id(trace.episode): sensors for trace, sensors in zip(case.traces, case.sensors, strict=True)}
     rows, sensors = [], []
     for trace in traces:
         same = sensors_by_episode.get(id(trace.episode))
         sensors.append(sensor_statistics(trace.episode, case.profile.reference) if same is None else same)
-        rows.append(episode_statistics(trace, setting.checkpoint, sensors[-1]))
-    return compared(setting, traces, rows, sensors, case.profile, case.alarm_rate)
+        rows.append(episode_statistics(trace, inputs.checkpoint, sensors[-1]))
+    return compared(inputs, traces, rows, sensors, case.profile, case.alarm_rate)
 
 
 def compared(
-    setting: Setting, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
+    inputs: RunInputs, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
     scattered, grouped = with_scatter(*with_adjusted(profile, rows, sensors))
-    comparison = compare(scattered, grouped, task=setting.checkpoint.task)
+    comparison = compare(scattered, grouped, task=inputs.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
-    return Case(setting, traces, rows, sensors, grouped, profile, deviations, comparison.p_value, alarm_rate)
+    return Case(inputs, traces, rows, sensors, grouped, profile, deviations, comparison.p_value, alarm_rate)
 
 
 def focus(case: Case) -> Case:
@@ -98,16 +98,16 @@ def focus(case: Case) -> Case:
         return case
     traces = list(compress(case.traces, hit))
     rows, sensors = (list(compress(rows, hit)) for rows in (case.rows, case.sensors))
-    episodes = {trace.episode_index: case.setting.episodes[trace.episode_index] for trace in traces}
-    setting = replace(case.setting, episodes=episodes, affected=frozenset(episodes))
-    part = compared(setting, traces, rows, sensors, case.profile, case.alarm_rate)
+    episodes = {trace.episode_index: case.inputs.episodes[trace.episode_index] for trace in traces}
+    inputs = replace(case.inputs, episodes=episodes, affected=frozenset(episodes))
+    part = compared(inputs, traces, rows, sensors, case.profile, case.alarm_rate)
     part = replace(part, p_value=case.p_value)
     return part if part.alarms else case
 
 
 def explain_all(case: Case) -> dict[str, Explanation]:
     """How well each cause that can be observed explains all deviations, by name."""
-    causes = applicable(causes_of(case.setting.checkpoint.task), case.by_statistic)
+    causes = applicable(causes_of(case.inputs.checkpoint.task), case.by_statistic)
     return {cause.name: explain(cause, case.deviations) for cause in causes}
 
 

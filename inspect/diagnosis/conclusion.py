@@ -83,7 +83,7 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
         return "models" if kind.startswith(("module", "dynamics", "process noise")) else "filter"
 
     numbers = Counter(subject(deviation.statistic) for deviation in case.deviations)
-    order = [*case.setting.checkpoint.task.observations, "control", "labels", "models", "filter"]
+    order = [*case.inputs.checkpoint.task.observations, "control", "labels", "models", "filter"]
     return {name: numbers[name] for name in dict.fromkeys([*order, *numbers]) if numbers[name]}
 
 
@@ -95,7 +95,7 @@ def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
     Args:
         numbers: of ``statistics_by_subject``.
     """
-    sensors = [display_name(key) for key in case.setting.checkpoint.task.observations if key not in numbers]
+    sensors = [display_name(key) for key in case.inputs.checkpoint.task.observations if key not in numbers]
     of_sensors, compared = _of_sensors(case), case.by_statistic
     absent = [
         label_of(name)
@@ -120,12 +120,12 @@ def conclude(
         effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown
             unless it does not use the sensor.
     """
-    by_name = {cause.name: cause for cause in causes_of(case.setting.checkpoint.task)}
+    by_name = {cause.name: cause for cause in causes_of(case.inputs.checkpoint.task)}
     ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    is_effect_known = effects is not None or (sure and is_unused(candidates[0].cause, case.setting.checkpoint))
+    is_effect_known = effects is not None or (sure and is_unused(candidates[0].cause, case.inputs.checkpoint))
     effect = (effects or {}).get(candidates[0].cause.name) if sure else None
     masked = is_effect_known and not is_visible(case.by_statistic, effect)
     headline = _headline(affected, candidates, masked, len(case.rows))
@@ -143,7 +143,7 @@ def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | No
         steps=affected_steps(case, alarms[0], affected) if alarms else None,
         evidence=tuple(_evidence(case, alarm) for alarm in alarms[:EVIDENCE]),
         recovered=None if effect is None else effect.recovery,
-        next=next_action(cause, case.setting.checkpoint),
+        next=next_action(cause, case.inputs.checkpoint),
     )
 
 
@@ -203,7 +203,7 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
 
 def _search(case: Case, count: int) -> str:
     """The next action without a probable cause. count: number of all episodes."""
-    checkpoint = case.setting.checkpoint
+    checkpoint = case.inputs.checkpoint
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
     external = isinstance(checkpoint, ExternalFilter)
@@ -229,7 +229,7 @@ def _since(case: Case, candidate: Candidate) -> str:
 
 
 def _provenance(case: Case) -> dict[str, Any]:
-    checkpoint, numbers = case.setting.checkpoint, statistics_by_subject(case)
+    checkpoint, numbers = case.inputs.checkpoint, statistics_by_subject(case)
     return {
         "task": checkpoint.task.name,
         "filter": checkpoint.name,

@@ -33,8 +33,8 @@ from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
-from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.undo import brings_back
 from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
@@ -93,8 +93,8 @@ def diagnose(
     for _, results in run_blocks(run, blocks, engine, workers, lambda share: report(0.6 * share)):
         observed |= {result[0].episode_index: result for result in results}
     traces, rows, sensors = zip(*(observed[index] for index in episodes), strict=True)
-    setting = _setting(checkpoint, traces, particles, profile)
-    case = compared(setting, traces, rows, sensors, profile, alarm_rate)
+    inputs = _run_inputs(checkpoint, traces, particles, profile)
+    case = compared(inputs, traces, rows, sensors, profile, alarm_rate)
     return _diagnosed(case, seed, base, engine, workers, lambda share: report(0.6 + 0.4 * share))
 
 
@@ -151,8 +151,8 @@ def _examined(
 ) -> Case:
     check_size(profile.episodes, len(traces), alarm_rate)
     rows, sensors = zip(*(observe(trace, checkpoint, profile) for trace in traces), strict=True)
-    setting = _setting(checkpoint, traces, particles, profile)
-    return compared(setting, traces, rows, sensors, profile, alarm_rate)
+    inputs = _run_inputs(checkpoint, traces, particles, profile)
+    return compared(inputs, traces, rows, sensors, profile, alarm_rate)
 
 
 def check_size(healthy: int, count: int, alarm_rate: float) -> None:
@@ -170,10 +170,10 @@ def check_size(healthy: int, count: int, alarm_rate: float) -> None:
         )
 
 
-def _setting(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> Setting:
+def _run_inputs(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> RunInputs:
     """The inputs of traces."""
     episodes = {trace.episode_index: trace.episode for trace in traces}
-    return Setting(checkpoint, episodes, particles, frozenset(episodes), healthy=profile)
+    return RunInputs(checkpoint, episodes, particles, frozenset(episodes), healthy=profile)
 
 
 def _diagnosed(
@@ -248,18 +248,18 @@ def confirm(
 
 def _undone(everything: Case, case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect | None:
     """Effect of undoing a cause; None if it cannot be undone."""
-    cause = next(cause for cause in causes_of(case.setting.checkpoint.task) if cause.name == name)
+    cause = next(cause for cause in causes_of(case.inputs.checkpoint.task) if cause.name == name)
     alarms = symptoms_of(cause, case.alarms)
     hit = affected_episodes(case, alarms)
     steps = affected_steps(case, alarms[0], hit) if alarms else None
     indices = [trace.episode_index for trace, affected in zip(case.traces, hit, strict=True) if affected]
-    setting = replace(case.setting, affected=frozenset(indices), steps=steps)
-    replay = replay_without(cause, setting, case.by_statistic, seed, base)
+    inputs = replace(case.inputs, affected=frozenset(indices), steps=steps)
+    replay = replay_without(cause, inputs, case.by_statistic, seed, base)
     if replay is None:
         return None
     action, traces = replay
-    after = examine_again(case, setting, traces)
+    after = examine_again(case, inputs, traces)
     restored = max(0.0, 1.0 - burden(after.deviations) / burden(case.deviations))
-    others = [trace for trace in everything.traces if trace.episode_index not in case.setting.episodes]
+    others = [trace for trace in everything.traces if trace.episode_index not in case.inputs.episodes]
     ratios = effect_ratios(everything.traces, [*traces, *others])
     return Effect(recovery(case.traces, traces), restored, ratios, brings_back(action, base))

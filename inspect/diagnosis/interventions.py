@@ -9,7 +9,7 @@ import numpy as np
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.cause import Cause, Recovery
-from beliefscope.inspect.diagnosis.setting import Deviations, Setting
+from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs
 from beliefscope.inspect.diagnosis.undo import undo
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import virtual_innovations
@@ -20,12 +20,12 @@ from beliefscope.inspect.traces.batch import trace_all
 
 
 def replay_without(
-    cause: Cause, setting: Setting, deviations: Deviations, seed: int, base: Checkpoint | None = None
+    cause: Cause, inputs: RunInputs, deviations: Deviations, seed: int, base: Checkpoint | None = None
 ) -> tuple[str, list[Trace]] | None:
     """The first intervention that can undo a cause, and traces of the episodes without it, in their order; or None."""
     for name in filter(None, cause.undo.split("|")):
         try:
-            changed = undo(name, setting, deviations, base)
+            changed = undo(name, inputs, deviations, base)
         except BadInput:  # modules of an external filter cannot be changed
             return None
         if changed is not None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
+from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
-from beliefscope.inspect.diagnosis.setting import Deviations, Setting, Undo
 from beliefscope.inspect.diagnosis.vector_checks import CHANGE, FORCE, TORQUE, free_motion, in_contact, lever
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
@@ -28,14 +28,14 @@ NUDGE = 1e-3
 
 
 def _with_readings(
-    setting: Setting, key: str, change: Callable[[NDArray[Any], Episode], NDArray[Any]]
-) -> Setting | None:
+    inputs: RunInputs, key: str, change: Callable[[NDArray[Any], Episode], NDArray[Any]]
+) -> RunInputs | None:
     """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes the episode.
 
     Controls that derive from the readings are recomputed, as when faults are injected.
     """
-    episodes = dict(setting.episodes)
-    for index in setting.affected:
+    episodes = dict(inputs.episodes)
+    for index in inputs.affected:
         episode = episodes[index]
         if key == "control":
             controls = change(episode.controls, episode).astype(np.float32)
@@ -49,28 +49,28 @@ def _with_readings(
             changed = np.rint(changed).clip(0, 255)
         observations = {**episode.observations, key: changed.astype(readings.dtype)}
         episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
-    return replace(setting, episodes=episodes)
+    return replace(inputs, episodes=episodes)
 
 
-def _with_labels(setting: Setting, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Setting:
+def _with_labels(inputs: RunInputs, change: Callable[[NDArray[Any]], NDArray[Any]]) -> RunInputs:
     """Changed true states (T, n) in the affected episodes."""
     episodes = {
         index: replace(episode, states=change(episode.states).astype(np.float32))
-        if index in setting.affected
+        if index in inputs.affected
         else episode
-        for index, episode in setting.episodes.items()
+        for index, episode in inputs.episodes.items()
     }
-    return replace(setting, episodes=episodes)
+    return replace(inputs, episodes=episodes)
 
 
-def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
+def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """A delayed image, the delayed haptics, controls or labels, advanced by their delay.
 
     Of a sensor with a delay behind the labelled contact: each such sensor by its own delay.
     """
     behind = {
         name: round(d.value - d.healthy)
-        for name in setting.checkpoint.task.observations
+        for name in inputs.checkpoint.task.observations
         if (d := deviations.get(f"contact lag/{name}/all")) is not None
     }
     if behind.get(key, 0) > 0:
@@ -81,9 +81,9 @@ def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | Non
         if not steps:
             return None
         if key == "labels":
-            return _with_labels(setting, lambda values: _ahead(values, steps))
-        steps_of = dict.fromkeys(setting.checkpoint.task.modalities.get(key, (key,)), steps)
-    result: Setting | None = setting
+            return _with_labels(inputs, lambda values: _ahead(values, steps))
+        steps_of = dict.fromkeys(inputs.checkpoint.task.modalities.get(key, (key,)), steps)
+    result: RunInputs | None = inputs
     for name, count in steps_of.items():
         if result is not None:
             result = _with_readings(result, name, lambda values, episode, count=count: _ahead(values, count))  # type: ignore[misc]
@@ -95,7 +95,7 @@ def _ahead(values: NDArray[Any], steps: int) -> NDArray[Any]:
     return values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
 
 
-def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:
+def realign_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Images shifted back; their borders are repeated."""
     x, y = (_shift(deviations, axis) for axis in "xy")
     if x is None or y is None:
@@ -106,7 +106,7 @@ def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:
         height, width = images.shape[1:]
         return images[:, rows.clip(0, height - 1)][:, :, columns.clip(0, width - 1)]
 
-    return _with_readings(setting, "image", back)
+    return _with_readings(inputs, "image", back)
 
 
 def _shift(deviations: Deviations, axis: str) -> float | None:
@@ -119,13 +119,13 @@ def _shift(deviations: Deviations, axis: str) -> float | None:
     return float(np.average([d.value - d.healthy for d in shifts], weights=weights))
 
 
-def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
+def expose_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Images of healthy brightness."""
     ratio = _ratio(deviations, "brightness/image/all")
-    return None if not ratio else _with_readings(setting, "image", lambda images, episode: images / ratio)
+    return None if not ratio else _with_readings(inputs, "image", lambda images, episode: images / ratio)
 
 
-def tare(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
+def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force or torque without its excess level in free motion; that of some steps only is removed from these."""
     levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
     if None in levels:
@@ -143,89 +143,89 @@ def tare(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
                 readings[part, axis] -= np.median(readings[part, axis][free[part]]) - level.healthy
         return readings
 
-    return _with_readings(setting, key, unbiased)
+    return _with_readings(inputs, key, unbiased)
 
 
-def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
+def detrend_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force without its excess slope in free motion."""
     slope = [_excess(deviations, f"drift/force {axis}/free motion") for axis in "xyz"]
     if None in slope:
         return None
     return _with_readings(
-        setting, "force", lambda f, episode: f - np.array(slope)[: f.shape[1]] * episode.dt * np.arange(len(f))[:, None]
+        inputs, "force", lambda f, episode: f - np.array(slope)[: f.shape[1]] * episode.dt * np.arange(len(f))[:, None]
     )
 
 
-def scale_force(setting: Setting, deviations: Deviations) -> Setting | None:
+def scale_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force of healthy size: from how much the hand yields to it or, where this is unknown, from its size."""
     ratios = [ratio for axis in "xyz" if (ratio := _ratio(deviations, f"compliance/force {axis}/all"))]
     gain = 1.0 / float(np.median(ratios)) if ratios else _ratio(deviations, "size/force/contact")
-    return None if not gain else _with_readings(setting, "force", lambda force, episode: force / gain)
+    return None if not gain else _with_readings(inputs, "force", lambda force, episode: force / gain)
 
 
-def negate_force(setting: Setting, deviations: Deviations) -> Setting | None:
+def negate_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force with the opposite sign."""
-    return _with_readings(setting, "force", lambda force, episode: -force)
+    return _with_readings(inputs, "force", lambda force, episode: -force)
 
 
-def permute_force(setting: Setting, deviations: Deviations) -> Setting | None:
+def permute_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force with the order of axes that best agrees with the torque in contact; None if that is the order it has."""
     orders = list(permutations(range(3)))
     left = np.zeros(len(orders))
-    for index in setting.affected:
-        observations, at = setting.episodes[index].observations, in_contact(setting.episodes[index])
+    for index in inputs.affected:
+        observations, at = inputs.episodes[index].observations, in_contact(inputs.episodes[index])
         if {FORCE, TORQUE} <= observations.keys() and at.sum() >= MIN_STEPS:
             force, torque = (observations[key].astype(np.float64)[at] for key in (FORCE, TORQUE))
             left += [lever(force[:, order], torque)[1] for order in orders]
     order = orders[int(left.argmin())]
-    return None if order == (0, 1, 2) else _with_readings(setting, FORCE, lambda force, episode: force[:, order])
+    return None if order == (0, 1, 2) else _with_readings(inputs, FORCE, lambda force, episode: force[:, order])
 
 
-def restore_contact(setting: Setting, deviations: Deviations) -> Setting | None:
+def restore_contact(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """A contact flag computed from the force: set where it exceeds its healthy size without the flag (``CLEARLY``)."""
     names = [f"unflagged force/{CONTACT}/all", *(f"level/{FORCE} {axis}/free motion" for axis in "xyz")]
-    if setting.healthy is None or not all(name in setting.healthy.statistics for name in names):
+    if inputs.healthy is None or not all(name in inputs.healthy.statistics for name in names):
         return None
-    unflagged, *zero = (float(np.nanmean(setting.healthy.statistics[name])) for name in names)
+    unflagged, *zero = (float(np.nanmean(inputs.healthy.statistics[name])) for name in names)
 
     def restored(flag: NDArray[Any], episode: Episode) -> NDArray[Any]:
         size = np.linalg.norm(episode.observations[FORCE].astype(np.float64) - zero, axis=1)
         return (size > CLEARLY * unflagged)[:, None]
 
-    return _with_readings(setting, CONTACT, restored)
+    return _with_readings(inputs, CONTACT, restored)
 
 
-def shift_hand(setting: Setting, deviations: Deviations) -> Setting | None:
+def shift_hand(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Hand positions without their offset: from commanded positions or, if these derive from the measured ones, from
     the offset of the hand in the image, which determines x and y."""
     offset = [_excess(deviations, f"offset/control {axis}/all") for axis in "xyz"]
     pixels = [_excess(deviations, f"hand offset/image {axis}/all") for axis in "xy"]
     derived = any(
         not np.array_equal(derived_controls(e, {**e.observations, HAND: e.observations[HAND] + 1.0}), e.controls)
-        for e in setting.episodes.values()
+        for e in inputs.episodes.values()
         if HAND in e.observations
     )
     if not derived and None not in offset:
         shift = -np.array(offset, dtype=np.float64)
-    elif None not in pixels and (camera := _hand_camera(setting)) is not None:
+    elif None not in pixels and (camera := _hand_camera(inputs)) is not None:
         centre = camera.scale[0]
         nudged = camera.pixels(centre + NUDGE * np.eye(len(centre))[:2]) - camera.pixels(centre[None])
         shift = np.zeros(len(centre))
         shift[:2] = -np.linalg.lstsq(nudged.T / NUDGE, np.array(pixels, dtype=np.float64), rcond=None)[0]
     else:
         return None
-    return _with_readings(setting, HAND, lambda position, episode: position - shift[: position.shape[1]])
+    return _with_readings(inputs, HAND, lambda position, episode: position - shift[: position.shape[1]])
 
 
-def _hand_camera(setting: Setting) -> LandmarkFilter | None:
+def _hand_camera(inputs: RunInputs) -> LandmarkFilter | None:
     """Where the hand is seen in healthy images."""
-    reference = None if setting.healthy is None else setting.healthy.reference
+    reference = None if inputs.healthy is None else inputs.healthy.reference
     return None if reference is None else reference.hand
 
 
-def shift_labels(setting: Setting, deviations: Deviations) -> Setting | None:
+def shift_labels(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Labels without an offset: the excess bias of all measurement models, weighted by their precision."""
-    task = setting.checkpoint.task
+    task = inputs.checkpoint.task
     shift = np.zeros(len(task.components))
     for i, component in enumerate(task.components):
         biases = [
@@ -237,20 +237,20 @@ def shift_labels(setting: Setting, deviations: Deviations) -> Setting | None:
             return None
         weights = [max(d.high - d.low, 1e-6) ** -2 for d in biases]
         shift[i] = np.average([d.value - d.healthy for d in biases], weights=weights)
-    return _with_labels(setting, lambda states: states + shift)
+    return _with_labels(inputs, lambda states: states + shift)
 
 
-def scale_control(setting: Setting, deviations: Deviations) -> Setting | None:
+def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Controls whose change of the hand position has the healthy scale."""
     scale = _ratio(deviations, "scale/control/all")
-    channels = CHANGE if setting.checkpoint.task.control_size >= CHANGE.stop else slice(None)
+    channels = CHANGE if inputs.checkpoint.task.control_size >= CHANGE.stop else slice(None)
 
     def rescaled(controls: NDArray[Any], episode: Episode) -> NDArray[Any]:
         controls = controls.copy()
         controls[:, channels] /= scale
         return controls
 
-    return None if not scale else _with_readings(setting, "control", rescaled)
+    return None if not scale else _with_readings(inputs, "control", rescaled)
 
 
 def _excess(deviations: Deviations, name: str) -> float | None:

@@ -13,7 +13,7 @@ from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
-from beliefscope.inspect.likelihood import COARSE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES

@@ -20,7 +20,7 @@ from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
-from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine, Quantity
+from beliefscope.inspect.maps.map_engine import FINE, LikelihoodMap, MapEngine, Quantity
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures

@@ -12,7 +12,7 @@ from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.scene_shapes import RGB, grid, on_floor
-from beliefscope.inspect.maps.particles import modality_shares
+from beliefscope.inspect.maps.modality_shares import modality_shares
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace

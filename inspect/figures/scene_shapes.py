@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.simulation.shapes import Shape, shapes
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.meshes import mesh_of
-from beliefscope.inspect.likelihood import COARSE, LikelihoodMap
+from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap
 from beliefscope.inspect.palette import colour_table
 from beliefscope.inspect.trace import Trace
 

@@ -23,7 +23,7 @@ from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
 from beliefscope.datasets.task import Outline, Task, display_name
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.palette import COLOURS, colour, colour_table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace

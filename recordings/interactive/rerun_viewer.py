@@ -11,7 +11,7 @@ from typing import Any
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.write import write_recording
 

@@ -8,7 +8,7 @@ import anywidget
 import traitlets
 
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.likelihood import COARSE
+from beliefscope.inspect.maps.map_engine import COARSE
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.interactive.export import FOLDER, as_text, body, run_document, style
 

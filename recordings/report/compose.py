@@ -34,7 +34,7 @@ from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
 from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.figures.top_view import draw_step, draws_force
-from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.map_engine import FINE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures

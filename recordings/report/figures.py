@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import with_unit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures

@@ -15,7 +15,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import metrics
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Table, Value
-from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
+from beliefscope.inspect.maps.map_engine import LikelihoodMap, Quantity
 from beliefscope.inspect.maps.map_statistics import measure_maps
 from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES

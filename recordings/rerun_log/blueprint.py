@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.point_clouds import extent_of, point_sensors, points_of
 from beliefscope.datasets.task import Component, Task, display_name, with_unit
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab
 from beliefscope.recordings.rerun_log.entities import SIGMAS, angles, plane_height, positions

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.entities import rgba, series, sources

@@ -33,8 +33,8 @@ from beliefscope.inspect.diagnosis.diagnose import diagnose as diagnose_episodes
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.failures.events import Failures, find_failures as rank_failures
 from beliefscope.inspect.healthy import measure_profile, profile_of
-from beliefscope.inspect.likelihood import COARSE, MapEngine
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap, Quantity
+from beliefscope.inspect.maps.map_engine import COARSE, MapEngine
 from beliefscope.inspect.sweep import Inputs
 from beliefscope.inspect.trace import Trace, trace as trace_episode
 from beliefscope.recordings.interactive.export import write_interactive

@@ -13,7 +13,7 @@ import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.maps.map_engine import LikelihoodMap, MapEngine
 from beliefscope.inspect.maps.map_statistics import measure_maps
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.trace import Trace, trace

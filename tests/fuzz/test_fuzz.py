@@ -10,8 +10,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import file_readers
 import mutate
-import readers
 
 from beliefscope.datasets.readers import hdf5_guard
 
@@ -21,35 +21,35 @@ SLOW = ("study", "mit-hdf5", "mit-json", "recording", "log-rerun")
 """Readers whose files need a training or rendering, or that can crash the process."""
 
 
-@pytest.mark.parametrize("name", [name for name in readers.READERS if name not in SLOW])
+@pytest.mark.parametrize("name", [name for name in file_readers.READERS if name not in SLOW])
 def test_reader_raises_only_bad_input(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if name in readers.HDF5:  # without the probe, only truncated and edited files are safe to read
+    if name in file_readers.HDF5:  # without the probe, only truncated and edited files are safe to read
         monkeypatch.setattr(hdf5_guard, "needs_probe", lambda path: False)
         monkeypatch.setattr(mutate, "corrupt_bytes", lambda data, rng: data[: rng.randrange(len(data))])
-    readers.check_valid(name, tmp_path)
-    results = [readers.attempt(name, seed=11, number=number, folder=tmp_path) for number in range(25)]
+    file_readers.check_valid(name, tmp_path)
+    results = [file_readers.attempt(name, seed=11, number=number, folder=tmp_path) for number in range(25)]
     assert results.count("refused") > 5, "enough inputs are invalid"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SLOW[:3])
 def test_slow_reader_raises_only_bad_input(name: str, tmp_path: Path) -> None:
-    readers.check_valid(name, tmp_path)
+    file_readers.check_valid(name, tmp_path)
     for number in range(100):
-        readers.attempt(name, seed=11, number=number, folder=tmp_path)
+        file_readers.attempt(name, seed=11, number=number, folder=tmp_path)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in readers.LOG_READERS if name not in SLOW])
+@pytest.mark.parametrize("name", [name for name in file_readers.LOG_READERS if name not in SLOW])
 def test_readers_of_logs_raise_only_bad_input(name: str, tmp_path: Path) -> None:
     for number in range(10_000):
-        readers.attempt(name, seed=12, number=number, folder=tmp_path)
+        file_readers.attempt(name, seed=12, number=number, folder=tmp_path)
 
 
 def test_server_survives_invalid_requests_and_messages(tmp_path: Path) -> None:
     import http_fuzz  # its packages are slow to import
 
-    threads, settings = threading.active_count(), readers.server_settings(tmp_path)
+    threads, settings = threading.active_count(), file_readers.server_settings(tmp_path)
     with http_fuzz.running_server(settings) as (client, log):
         http = http_fuzz.fuzz_http(client, log, 40, 11)
         socket = http_fuzz.fuzz_socket(client, log, 25, 11)

@@ -29,7 +29,7 @@ from beliefscope.inspect.compare.two_runs import compare_runs
 from beliefscope.inspect.failures.events import find_failures
 from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of, scores_of
 from beliefscope.inspect.figures.paper import maps_figure, steps_by_contact
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.sweep import summary
 from beliefscope.inspect.trace import Trace, trace

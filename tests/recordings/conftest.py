@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.simulation.door import DOOR
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 MODALITIES = ("image", "haptics")

@@ -15,7 +15,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording

@@ -14,7 +14,7 @@ import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.recordings.interactive.export import MAP_BYTES, write_interactive

@@ -17,7 +17,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.read import read_recording

@@ -2,9 +2,9 @@
 
     python tools/stress/fuzz.py [part ...] --inputs 10000 --seed 0 --keep DIR
 
-Parts are ``http``, ``socket`` and the readers in tests/fuzz/readers.py; default: all. Files are read in subprocesses
-with limited memory and time per input; a crash of a subprocess counts as a failure. Failing inputs are saved in DIR
-with the error. Exit code 1 if any input fails.
+Parts are ``http``, ``socket`` and the readers in tests/fuzz/file_readers.py; default: all. Files are read in
+subprocesses with limited memory and time per input; a crash of a subprocess counts as a failure. Failing inputs are
+saved in DIR with the error. Exit code 1 if any input fails.
 """
 
 from __future__ import annotations
@@ -48,39 +48,41 @@ class Outcome:
 
 def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
     """Run all inputs of one reader, in subprocesses."""
-    import readers
+    import file_readers
 
     from beliefscope.datasets.errors import BadInput
     from beliefscope.datasets.store import open_dataset
     from beliefscope.recordings.log_readers.columns import preview_columns
     from beliefscope.recordings.open_trace import open_recording
 
-    guarded = {"recording": open_recording, "log-rerun": preview_columns} | dict.fromkeys(readers.HDF5, open_dataset)
+    guarded = {"recording": open_recording, "log-rerun": preview_columns} | dict.fromkeys(
+        file_readers.HDF5, open_dataset
+    )
     outcome = Outcome(inputs)
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        readers.check_valid(name, Path(folder))  # also fills the caches
+        file_readers.check_valid(name, Path(folder))  # also fills the caches
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, mmap.mmap(-1, 32) as shared:
 
         def save_failure(number: int, error: str) -> None:
             outcome.failures[error.splitlines()[-1][:160]] += 1
-            with readers.corrupted(name, seed, number, Path(folder)) as path:
+            with file_readers.corrupted(name, seed, number, Path(folder)) as path:
                 target = keep / f"{name.replace(' ', '-')}-{number}"
                 target.mkdir(parents=True, exist_ok=True)
                 for file in Path(folder).glob(f"{path.stem}.*"):
-                    readers.copy(file, target / file.name)
+                    file_readers.copy(file, target / file.name)
                 (target / "error.txt").write_text(error)
 
         def is_contained(number: int) -> bool:
             """Whether the package refuses a file that crashes its reader, because a subprocess reads it first."""
-            with readers.corrupted(name, seed, number, Path(folder)) as path:
+            with file_readers.corrupted(name, seed, number, Path(folder)) as path:
                 try:
                     guarded[name](path)
                 except BadInput:
                     return True
             return False
 
-        with readers.corrupted(name, seed, 0, Path(folder)):
+        with file_readers.corrupted(name, seed, 0, Path(folder)):
             pass  # creates the valid file in this process, because Rerun cannot write in a fork
         first = 0
         while first < inputs:
@@ -104,7 +106,7 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
 
 def _read_all(name: str, seed: int, first: int, last: int, folder: str, shared: mmap.mmap) -> None:
     """Read inputs in a forked process, without the probe subprocess. Counts are in shared memory."""
-    import readers
+    import file_readers
 
     from beliefscope.datasets.readers import hdf5_guard
 
@@ -118,7 +120,7 @@ def _read_all(name: str, seed: int, first: int, last: int, folder: str, shared: 
         shared[0:8] = number.to_bytes(8, "little")
         signal.setitimer(signal.ITIMER_PROF, TIMEOUT)  # SIGPROF terminates the process
         try:
-            counts[readers.attempt(name, seed, number, Path(folder))] += 1
+            counts[file_readers.attempt(name, seed, number, Path(folder))] += 1
         except BaseException as error:
             text = "".join(traceback.format_exception(error))
             (Path(folder) / "errors" / str(number)).write_text(text.encode(errors="replace").decode())
@@ -129,12 +131,12 @@ def fuzz_server(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
     """Run all inputs of the HTTP routes or of a view's socket, then check for leaked files and threads."""
     import threading
 
+    import file_readers
     import http_fuzz
-    import readers
 
     start, before = time.monotonic(), threading.active_count()
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
-        server_settings = readers.server_settings(Path(folder))
+        server_settings = file_readers.server_settings(Path(folder))
         with http_fuzz.running_server(server_settings) as (client, log):
             run = http_fuzz.fuzz_http if name == "http" else http_fuzz.fuzz_socket
             tally = run(client, log, inputs, seed)
@@ -172,10 +174,10 @@ def _run_forked(work: Callable[[], None]) -> int:
 
 
 def main() -> None:
-    import readers
+    import file_readers
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = [*readers.READERS, *SERVER]
+    parts = [*file_readers.READERS, *SERVER]
     parser.add_argument("parts", nargs="*", metavar="part", help=f"any of: {', '.join(parts)}")
     parser.add_argument("--inputs", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)

@@ -35,7 +35,7 @@ def figure(
     """
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.figures import paper
-    from beliefscope.inspect.likelihood import no_maps
+    from beliefscope.inspect.maps.map_engine import no_maps
 
     figure_format(output)
     if kind == "weights" and steps:

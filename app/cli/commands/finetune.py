@@ -196,7 +196,7 @@ def _external(
     source: other arguments of ``finetune_external``. data: file of the episodes, for the suggested command.
     """
     from beliefscope.filters.external.load import load_external
-    from beliefscope.filters.external.weights import save_weights
+    from beliefscope.filters.external.module_weights import save_weights
     from beliefscope.filters.finetuning.external import finetune_external, loss_of
 
     with _progress(base, source["partial"]) as callbacks:

@@ -48,7 +48,7 @@ def report(
       beliefscope report runs/*.trace -o report --title "Doors, 40 % image blackout" --pdf
       beliefscope report run.trace --event 35 --event 68 --all
     """
-    from beliefscope.inspect.likelihood import no_maps
+    from beliefscope.inspect.maps.map_engine import no_maps
     from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
     from beliefscope.recordings.report.folder import check_folder

@@ -18,8 +18,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.figures.scene_belief import DrawnBelief, camera_axis
 from beliefscope.inspect.figures.scene_shapes import LOG_RANGE, OUTLINE_EDGES, body_meshes, map_pixels
-from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.maps.particles import modality_shares
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
+from beliefscope.inspect.maps.modality_shares import modality_shares
 from beliefscope.inspect.palette import colour_table
 from beliefscope.inspect.trace import Trace, trace
 

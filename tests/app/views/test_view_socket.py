@@ -16,7 +16,7 @@ from beliefscope.app.protocol.map_format import LOG_RANGE, quantise
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.filters.checkpoint import load_checkpoint
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.maps.map_statistics import measure_maps
 from beliefscope.inspect.statistics.measures import particle_log_weights
 from beliefscope.inspect.trace import load_trace

@@ -13,7 +13,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.load import ExternalFilter, load_external
-from beliefscope.filters.external.weights import save_weights
+from beliefscope.filters.external.module_weights import save_weights
 from beliefscope.filters.finetuning.choices import choices
 from beliefscope.filters.finetuning.external import finetune_external, loss_of
 from beliefscope.filters.finetuning.finetune import Callbacks

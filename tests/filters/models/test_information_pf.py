@@ -20,7 +20,7 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.information_pf import InformationParticleFilter, with_particles
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import standalone_evidence
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 

@@ -10,7 +10,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.compare.counterfactual import compare
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import ARRAYS, Trace, trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 

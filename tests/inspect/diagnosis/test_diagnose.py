@@ -26,7 +26,7 @@ from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared
 from beliefscope.inspect.diagnosis.cause import SHOWN
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis, preliminary
-from beliefscope.inspect.diagnosis.setting import Setting
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.trace import Trace
@@ -78,7 +78,9 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     """A filter whose covariance has always been too small does not deviate from its own record."""
     name = "nees/fused/all"
     record = HealthyProfile("test", 44, None, {name: np.append(nees * np.linspace(0.9, 1.1, 43), 500.0)})
-    case = compared(Setting(checkpoint(), {}, 300, frozenset()), runs()[:2], [{name: nees}] * 2, [{}] * 2, record, 0.05)
+    case = compared(
+        RunInputs(checkpoint(), {}, 300, frozenset()), runs()[:2], [{name: nees}] * 2, [{}] * 2, record, 0.05
+    )
     result = healthy(case)
     assert result.headline.startswith(start)
     assert [deviation.value for deviation in result.deviations] == [nees]
@@ -129,9 +131,9 @@ def test_sensors_without_statistics_are_named() -> None:
     sensors = {name: np.ones(20) for name in ("level/force x/free motion", "noise/force x/all")}
     record = HealthyProfile("test", 20, None, {name: values + 0.1 * np.arange(20) for name, values in sensors.items()})
     rows = [{"noise/force x/all": 1.5 + 0.1 * i} for i in range(3)]
-    setting = Setting(checkpoint(), {}, 300, frozenset())
+    inputs = RunInputs(checkpoint(), {}, 300, frozenset())
     sensed = [{**row, "level/force x/free motion": np.nan} for row in rows]
-    result = healthy(compared(setting, runs(), rows, sensed, record, 0.05))
+    result = healthy(compared(inputs, runs(), rows, sensed, record, 0.05))
     *sensors_, statistic = result.to_json()["unmeasured"]
     assert sensors_ == [name.replace("_", " ") for name in checkpoint().task.observations if name != "force"]
     assert statistic == "level of force (x) in free motion"
@@ -149,12 +151,12 @@ def test_focused_episodes_are_compared_with_each_other() -> None:
     episodes = dict(simulated(100, 6)) | {i: faulty("effector_offset=0.03")[i] for i in (1, 4)}
     runs = list(trace_all(checkpoint(), episodes, episodes, 0, 300))
     rows, sensors = zip(*(observe(run, checkpoint(), profile()) for run in runs), strict=True)
-    setting = Setting(checkpoint(), episodes, 300, frozenset(episodes))
-    case = compared(setting, runs, rows, sensors, profile(), 0.05)
+    inputs = RunInputs(checkpoint(), episodes, 300, frozenset(episodes))
+    case = compared(inputs, runs, rows, sensors, profile(), 0.05)
     part = focus(case)
     chosen = [run.episode_index for run in part.traces]
     assert chosen == [1, 4]
-    alone = compared(part.setting, part.traces, [rows[i] for i in chosen], part.sensors, profile(), 0.05)
+    alone = compared(part.inputs, part.traces, [rows[i] for i in chosen], part.sensors, profile(), 0.05)
     assert part.grouped == alone.grouped
     assert part.grouped != [case.grouped[i] for i in chosen]
 
@@ -166,8 +168,8 @@ def test_a_fault_without_a_probable_cause_has_deviations_and_a_next_action(count
     episodes = {i: faulty("image_frozen:from=10")[i] for i in range(count)}
     traces = list(trace_all(checkpoint(), episodes, episodes, 0, 300))
     rows, sensors = zip(*(observe(trace, checkpoint(), profile()) for trace in traces), strict=True)
-    setting = Setting(checkpoint(), episodes, 300, frozenset(episodes), healthy=profile())
-    case = compared(setting, traces, rows, sensors, profile(), 0.05)
+    inputs = RunInputs(checkpoint(), episodes, 300, frozenset(episodes), healthy=profile())
+    case = compared(inputs, traces, rows, sensors, profile(), 0.05)
     unlikely = {name: replace(explanation, support=-3.0) for name, explanation in explain_all(case).items()}
     result = conclude(case, case, unlikely, {})
     assert (result.state, result.listed) == ("unsure", ())
@@ -193,8 +195,8 @@ def deviations_in(values: Callable[[float, float], list[float]]) -> Case:
     healthy = np.array([0.1 * (i % 11) for i in range(44)])
     name = "level/force x/free motion"
     rows = [{name: value} for value in values(float(healthy.mean()), float(healthy.std()))]
-    setting = Setting(checkpoint(), {}, 300, frozenset())
-    return compared(setting, [], rows, rows, HealthyProfile("test", 44, None, {name: healthy}), 0.05)
+    inputs = RunInputs(checkpoint(), {}, 300, frozenset())
+    return compared(inputs, [], rows, rows, HealthyProfile("test", 44, None, {name: healthy}), 0.05)
 
 
 @pytest.mark.long

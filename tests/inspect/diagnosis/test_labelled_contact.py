@@ -15,8 +15,8 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.causes.own_sensors import own_causes
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
-from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.undo_readings import advance
 from beliefscope.inspect.diagnosis.window_checks import window_values
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
@@ -91,14 +91,14 @@ def test_delayed_sensors_are_advanced_by_their_own_delay(episode: Episode) -> No
     def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
         return np.zeros((*controls.shape[:-1], 2))
 
-    setting = Setting(as_external(still, "still", TASK), {0: late}, 1, frozenset({0}))
+    inputs = RunInputs(as_external(still, "still", TASK), {0: late}, 1, frozenset({0}))
     deviations = {
         name: Deviation(name, value, 0.0, 0.0, 0.0, 0.0, True, 5.0)
         for name, value in {"contact lag/force/all": 5.0, "contact lag/torque/all": 4.0}.items()
     }
-    result = advance("force", setting, deviations)
+    result = advance("force", inputs, deviations)
     assert result is not None
     observations = result.episodes[0].observations
     assert np.array_equal(observations["force"][:-5], episode.observations["force"][:-5])
     assert np.array_equal(observations["torque"][5:-5], episode.observations["torque"][4:-6])
-    assert advance("battery", setting, deviations) is None
+    assert advance("battery", inputs, deviations) is None

@@ -21,8 +21,8 @@ from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
 from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood, recovery
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
-from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, brings_back, undo
 from beliefscope.inspect.diagnosis.vector_checks import free_motion
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
@@ -41,16 +41,16 @@ def episodes() -> dict[int, Episode]:
         return {index: data[index] for index in data.held_out()[:3]}
 
 
-def setting(filter_: Checkpoint, data: dict[int, Episode] | None = None) -> Setting:
+def inputs(filter_: Checkpoint, data: dict[int, Episode] | None = None) -> RunInputs:
     data = data or episodes()
-    return Setting(filter_, data, 30, frozenset(data))
+    return RunInputs(filter_, data, 30, frozenset(data))
 
 
-def traces(run: Setting) -> list[Trace]:
+def traces(run: RunInputs) -> list[Trace]:
     return list(trace_all(run.checkpoint, run.episodes, run.episodes, 0, run.particles))
 
 
-def deviations(healthy: Setting, faulty: Setting) -> dict[str, Deviation]:
+def deviations(healthy: RunInputs, faulty: RunInputs) -> dict[str, Deviation]:
     """Mean statistics of two runs."""
     rows = [
         [episode_statistics(trace, run.checkpoint, sensor_statistics(trace.episode, None)) for trace in traces(run)]
@@ -102,7 +102,7 @@ def inverted(filter_: Any) -> None:
 def test_the_replay_without_a_fault_of_the_model_is_the_original_run(
     name: str, change: Callable[[Any], None], action: str
 ) -> None:
-    healthy, faulty = setting(checkpoint(name)), setting(planted(name, change))
+    healthy, faulty = inputs(checkpoint(name)), inputs(planted(name, change))
     changed = undo(action, faulty, deviations(healthy, faulty))
     assert changed is not None
     distance = [
@@ -118,10 +118,10 @@ def test_a_base_checkpoint_replaces_modules(action: str) -> None:
         change: Callable[[Any], None] = inverted
     else:
         change = (lambda f: f.dynamics.output.bias.add_(1.0)) if "dynamics" in action else biased
-    faulty = setting(planted("crossmodal-ekf", change))
+    faulty = inputs(planted("crossmodal-ekf", change))
     changed = undo(action, faulty, {}, base=checkpoint("crossmodal-ekf"))
     assert changed is not None
-    for a, b in zip(traces(setting(checkpoint("crossmodal-ekf"))), traces(changed), strict=True):
+    for a, b in zip(traces(inputs(checkpoint("crossmodal-ekf"))), traces(changed), strict=True):
         np.testing.assert_array_equal(a.estimate_mean, b.estimate_mean)
 
 
@@ -156,7 +156,7 @@ def test_readings_without_a_fault_are_the_original_ones(
     faults: str, action: str, symptoms: dict[str, Deviation], key: str
 ) -> None:
     faulty = {index: Faults.parse(faults).apply(episode) for index, episode in episodes().items()}
-    changed = undo(action, setting(checkpoint("crossmodal-ekf"), faulty), symptoms)
+    changed = undo(action, inputs(checkpoint("crossmodal-ekf"), faulty), symptoms)
     assert changed is not None
     for index, episode in episodes().items():
         inner = (slice(0, -3), slice(3, -3), slice(3, -3))[: episode.observations[key].ndim]
@@ -168,7 +168,7 @@ def test_readings_without_a_fault_are_the_original_ones(
 def test_a_bias_of_some_steps_is_removed_from_these() -> None:
     """Without knowledge of its steps, up to the noise of their level; contact hides where it begins and ends."""
     faulty = {index: Faults.parse("force_bias=8:from=60").apply(episode) for index, episode in episodes().items()}
-    changed = undo("tare force", setting(checkpoint("crossmodal-ekf"), faulty), BIAS)
+    changed = undo("tare force", inputs(checkpoint("crossmodal-ekf"), faulty), BIAS)
     assert changed is not None
     free = [free_motion(episode) for episode in episodes().values()]
     true, wrong, restored = (
@@ -182,7 +182,7 @@ def test_a_bias_of_some_steps_is_removed_from_these() -> None:
 def test_controls_that_derive_from_readings_are_restored_with_them() -> None:
     """A delay of all haptic sensors also delays the controls, which are computed from them."""
     faulty = {index: Faults.parse("delay=haptics:steps=3").apply(episode) for index, episode in episodes().items()}
-    changed = undo("advance haptics", setting(checkpoint("crossmodal-ekf"), faulty), values(lag__image__all=-3.0))
+    changed = undo("advance haptics", inputs(checkpoint("crossmodal-ekf"), faulty), values(lag__image__all=-3.0))
     assert changed is not None
     for index, episode in episodes().items():
         assert not np.array_equal(faulty[index].controls, episode.controls)
@@ -196,7 +196,7 @@ def test_the_contact_flag_is_restored_from_the_force(fault: str) -> None:
     """Whatever the flag was: it agrees with the true one at 95 % of the steps, also in the controls."""
     faulty = {index: Faults.parse(fault).apply(episode) for index, episode in episodes().items()}
     filter_ = checkpoint("crossmodal-ekf")
-    changed = undo("restore contact", replace(setting(filter_, faulty), healthy=required_profile(filter_)), {})
+    changed = undo("restore contact", replace(inputs(filter_, faulty), healthy=required_profile(filter_)), {})
     assert changed is not None
     flags = [[e[i].observations["contact"] for i in episodes()] for e in (episodes(), faulty, changed.episodes)]
     true, wrong, restored = (np.concatenate(group) for group in flags)
@@ -213,7 +213,7 @@ def test_an_offset_of_the_hand_is_measured_by_commanded_positions() -> None:
         clean = data[data.held_out()[0]]
     faulty = Faults.parse("effector_offset=0.02:y=-0.01").apply(clean)
     symptoms = values(offset__control_x__all=-0.02, offset__control_y__all=0.01, offset__control_z__all=0.0)
-    changed = undo("shift hand", setting(filter_, {0: faulty}), symptoms)
+    changed = undo("shift hand", inputs(filter_, {0: faulty}), symptoms)
     assert changed is not None
     distance = changed.episodes[0].observations["effector_position"] - clean.observations["effector_position"]
     assert np.abs(distance).max() < 1e-6
@@ -229,7 +229,7 @@ def test_an_offset_of_the_hand_is_measured_in_the_image() -> None:
     centre = reference.hand.scale[:1]
     pixels = (reference.hand.pixels(centre) - reference.hand.pixels(centre + np.array([[0.02, -0.01, 0.0]])))[0]
     symptoms = values(hand_offset__image_x__all=pixels[0], hand_offset__image_y__all=pixels[1])
-    run = replace(setting(checkpoint("crossmodal-ekf"), faulty), healthy=profile)
+    run = replace(inputs(checkpoint("crossmodal-ekf"), faulty), healthy=profile)
     changed = undo("shift hand", run, symptoms)
     assert changed is not None
     for index, episode in episodes().items():
@@ -241,9 +241,9 @@ def test_an_offset_of_the_hand_is_measured_in_the_image() -> None:
 def test_labels_are_restored() -> None:
     delayed = {i: replace(e, states=e.states[np.maximum(np.arange(len(e)) - 3, 0)]) for i, e in episodes().items()}
     offset = {i: replace(e, states=e.states + np.float32([0.02, 0.0, 0.0])) for i, e in episodes().items()}
-    healthy = setting(checkpoint("crossmodal-ekf"))
-    advanced = undo("advance labels", setting(checkpoint("crossmodal-ekf"), delayed), values(lag__labels__all=3.0))
-    run = setting(checkpoint("crossmodal-ekf"), offset)
+    healthy = inputs(checkpoint("crossmodal-ekf"))
+    advanced = undo("advance labels", inputs(checkpoint("crossmodal-ekf"), delayed), values(lag__labels__all=3.0))
+    run = inputs(checkpoint("crossmodal-ekf"), offset)
     shifted = undo("shift labels", run, deviations(healthy, run))
     assert advanced is not None
     assert shifted is not None
@@ -253,7 +253,7 @@ def test_labels_are_restored() -> None:
 
 
 def test_only_affected_episodes_change() -> None:
-    run = replace(setting(checkpoint("crossmodal-ekf")), affected=frozenset(list(episodes())[:1]))
+    run = replace(inputs(checkpoint("crossmodal-ekf")), affected=frozenset(list(episodes())[:1]))
     changed = undo("negate force", run, {})
     assert changed is not None
     same = [changed.episodes[index] is episode for index, episode in episodes().items()]
@@ -262,7 +262,7 @@ def test_only_affected_episodes_change() -> None:
 
 @pytest.mark.parametrize(("own", "expected"), [(20, 300), (300, None), (1000, None)])
 def test_few_particles_become_as_many_as_in_the_record(own: int, expected: int | None) -> None:
-    run = replace(setting(checkpoint("unimodal-pf")), particles=own)
+    run = replace(inputs(checkpoint("unimodal-pf")), particles=own)
     deviation = Deviation("particles//all", float(own), 300.0, 300.0, 300.0, 0.0, True, -10.0)
     changed = undo("healthy particles", run, {deviation.statistic: deviation})
     assert (None if changed is None else changed.particles) == expected
@@ -278,9 +278,9 @@ def test_only_some_interventions_bring_back_what_was_healthy(name: str, expected
 
 
 def test_the_last_modality_is_not_dropped() -> None:
-    assert undo("drop image", setting(checkpoint("image-ekf")), {}) is None
-    assert undo("drop image", setting(checkpoint("feature-ekf")), {}) is None
-    assert undo("drop image", setting(checkpoint("unimodal-ekf")), {}) is not None
+    assert undo("drop image", inputs(checkpoint("image-ekf")), {}) is None
+    assert undo("drop image", inputs(checkpoint("feature-ekf")), {}) is None
+    assert undo("drop image", inputs(checkpoint("unimodal-ekf")), {}) is not None
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-pf", "image-ekf"])
@@ -290,19 +290,19 @@ def test_lost_images_are_skipped_step_by_step(name: str) -> None:
         {index: Faults.parse(f"blackout=0.4:gray={value}").apply(e) for index, e in episodes().items()}
         for value in (0, 128)
     )
-    runs = [undo("skip lost images", setting(checkpoint(name), data), {}) for data in (black, gray)]
+    runs = [undo("skip lost images", inputs(checkpoint(name), data), {}) for data in (black, gray)]
     assert None not in runs
     first, second = (traces(run) for run in runs if run is not None)
     for index, (a, b) in enumerate(zip(first, second, strict=True)):
         np.testing.assert_array_equal(a.estimate_mean, b.estimate_mean)
-        clean = traces(setting(checkpoint(name)))[index]
+        clean = traces(inputs(checkpoint(name)))[index]
         lost = np.flatnonzero((black[a.episode_index].observations["image"] == 0).all((1, 2)))
         np.testing.assert_array_equal(a.estimate_mean[: lost[0]], clean.estimate_mean[: lost[0]])
         assert not np.array_equal(a.estimate_mean[lost[0]], clean.estimate_mean[lost[0]])
 
 
 def test_recovery_compares_runs() -> None:
-    healthy, faulty = (traces(setting(c)) for c in (checkpoint("crossmodal-ekf"), planted("crossmodal-ekf", biased)))
+    healthy, faulty = (traces(inputs(c)) for c in (checkpoint("crossmodal-ekf"), planted("crossmodal-ekf", biased)))
     same, better = recovery(faulty, faulty), recovery(faulty, healthy)
     assert (same.error, same.nll) == (0.0, 0.0)
     assert better.error > 0.3
@@ -310,7 +310,7 @@ def test_recovery_compares_runs() -> None:
 
 
 def test_recovery_is_of_the_error_that_falls_most() -> None:
-    after = traces(setting(checkpoint("crossmodal-ekf")))
+    after = traces(inputs(checkpoint("crossmodal-ekf")))
 
     def moved(trace: Trace, component: int) -> Trace:
         """An estimate that is 0.1 m or rad more wrong."""
@@ -325,7 +325,7 @@ def test_recovery_is_of_the_error_that_falls_most() -> None:
 
 
 def test_without_ground_truth_the_innovations_are_compared() -> None:
-    (trace, *_) = traces(setting(checkpoint("crossmodal-ekf")))
+    (trace, *_) = traces(inputs(checkpoint("crossmodal-ekf")))
     unknown = replace(trace, episode=replace(trace.episode, states=np.full_like(trace.episode.states, np.nan)))
     assert math.isfinite(negative_log_likelihood(unknown))
     assert negative_log_likelihood(unknown) != negative_log_likelihood(trace)

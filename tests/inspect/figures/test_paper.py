@@ -17,7 +17,7 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.figures import paper
-from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import Trace, trace
 
 pytestmark = pytest.mark.slow

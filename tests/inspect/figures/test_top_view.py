@@ -15,7 +15,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.figures.top_view import draw_step, footprint, outline, scene_footprints
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.maps.map_engine import LikelihoodMap, MapEngine
 from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace, trace
 

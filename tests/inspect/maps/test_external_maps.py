@@ -18,7 +18,7 @@ from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.likelihood import log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
-from beliefscope.inspect.likelihood import MapEngine, no_maps
+from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, trace
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "traces"))

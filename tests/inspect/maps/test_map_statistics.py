@@ -14,7 +14,7 @@ from beliefscope.datasets.simulation.door import DOOR, panel_outline
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.likelihood_maps import ENTRY
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.trace import trace
 

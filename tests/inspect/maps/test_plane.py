@@ -14,7 +14,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.external.unavailable import UnavailableFilter
-from beliefscope.inspect.likelihood import MapEngine, no_maps
+from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
 from beliefscope.inspect.maps.plane import plane_of, round_up
 from beliefscope.inspect.trace import Trace, trace
 

@@ -11,7 +11,7 @@ import pytest
 
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.inspect.diagnostics.likelihood_maps import median_interval
-from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap
+from beliefscope.inspect.maps.map_engine import COARSE, FINE, LikelihoodMap
 from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.maps.shape import SHAPES
 

@@ -21,7 +21,7 @@ from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.setting import Setting
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.undo import drop
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.statistics import measures
@@ -129,15 +129,15 @@ def test_errors_are_statistics_of_an_external_filter(door: list[Episode]) -> Non
 
 def test_dropping_a_sensor_is_an_undo(door: list[Episode]) -> None:
     filter_ = load_external(EXAMPLE)
-    setting = Setting(filter_, dict(enumerate(door[:2])), 300, frozenset({1}), (10, 20))
-    changed = drop("haptics", setting, {})
+    inputs = RunInputs(filter_, dict(enumerate(door[:2])), 300, frozenset({1}), (10, 20))
+    changed = drop("haptics", inputs, {})
     assert changed is not None
     same, other = (changed.episodes[i].observations["force"] == door[i].observations["force"] for i in (0, 1))
     assert same.all()
     assert other[:10].all()
     assert not other[10:20].all()
-    assert drop("sound", setting, {}) is None
-    assert replace(setting, affected=frozenset()).episodes == setting.episodes
+    assert drop("sound", inputs, {}) is None
+    assert replace(inputs, affected=frozenset()).episodes == inputs.episodes
 
 
 def test_occlusion_of_a_step_equals_the_kalman_gain() -> None:

@@ -28,7 +28,7 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.slices.report import slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.trace import Trace, save_trace, trace

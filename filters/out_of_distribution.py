@@ -9,7 +9,7 @@ Two tests, both on means over R episodes, because the steps of an episode are de
   product of every two channels, which shows swapped axes and wrong signs. New checkpoints have this summary in their
   record; ``pretrained/data_summary.json`` has that of the shipped ones.
 
-Thresholds leave no false warning on the sample sets (tests/filters/test_data_check.py).
+Thresholds leave no false warning on the sample sets (tests/filters/test_out_of_distribution.py).
 """
 
 from __future__ import annotations

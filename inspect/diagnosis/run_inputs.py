@@ -14,7 +14,7 @@ from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
 @dataclass(frozen=True)
-class Setting:
+class RunInputs:
     """Inputs of a run.
 
     Attributes:
@@ -34,17 +34,17 @@ class Setting:
 Deviations = Mapping[str, Deviation]
 """Statistic -> deviation."""
 
-Undo = Callable[[Setting, Deviations], Setting | None]
-"""Returns the setting without the fault; None if it cannot be undone."""
+Undo = Callable[[RunInputs, Deviations], RunInputs | None]
+"""Returns the inputs without the fault; None if it cannot be undone."""
 
 
-def without_sensor(setting: Setting, external: ExternalFilter, modality: str) -> Setting | None:
+def without_sensor(inputs: RunInputs, external: ExternalFilter, modality: str) -> RunInputs | None:
     """The affected steps without information of a modality's sensors; None if no other modality remains."""
     if modality not in external.task.modalities or len(external.task.modalities) < 2:
         return None
-    steps = slice(*(setting.steps or (None,)))
+    steps = slice(*(inputs.steps or (None,)))
     episodes = {
-        index: without(episode, [modality], external.adapter.absent, steps) if index in setting.affected else episode
-        for index, episode in setting.episodes.items()
+        index: without(episode, [modality], external.adapter.absent, steps) if index in inputs.affected else episode
+        for index, episode in inputs.episodes.items()
     }
-    return replace(setting, episodes=episodes)
+    return replace(inputs, episodes=episodes)

@@ -16,7 +16,7 @@ SEARCHED = 100
 _moments: WeakKeyDictionary[Dataset, tuple[int, int]] = WeakKeyDictionary()
 
 
-def first_moment(data: Dataset) -> tuple[int, int]:
+def initial_view(data: Dataset) -> tuple[int, int]:
     """Episode and step to display first: of a data set with outages, where an outage begins in the first contact.
 
     It is the first held-out episode whose first contact has images for at least ``BEFORE`` steps and then, still in

@@ -15,7 +15,7 @@ from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, update
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.inspect.likelihood import QUANTITIES, LikelihoodMap, MapEngine
+from beliefscope.inspect.maps.map_engine import QUANTITIES, LikelihoodMap, MapEngine
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.trace import trace
 

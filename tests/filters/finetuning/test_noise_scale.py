@@ -12,8 +12,8 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
-from beliefscope.filters.finetuning.calibration import calibrate_noise, noise_parameters
 from beliefscope.filters.finetuning.finetune import finetune
+from beliefscope.filters.finetuning.noise_scale import calibrate_noise, noise_parameters
 from beliefscope.filters.finetuning.settings import FineTune
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.alignment import align, move
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.data_check import _shipped_summaries, data_warning, summarise, summary_key
+from beliefscope.filters.out_of_distribution import _shipped_summaries, data_warning, summarise, summary_key
 
 TASKS = ("door", "push")
 

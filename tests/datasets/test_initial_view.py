@@ -10,7 +10,7 @@ import pytest
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.first_moment import first_moment, outage_in_first_contact
+from beliefscope.datasets.initial_view import initial_view, outage_in_first_contact
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace
@@ -63,13 +63,13 @@ def test_first_moment_of_a_data_set(base: Episode, tmp_path: Path) -> None:
         episodes = [train, *(episode(base, *stretches, outages) for stretches in (without, fitting, fitting))]
         write_dataset(tmp_path / f"{name}.h5", find_task("push"), episodes)
         with open_dataset(tmp_path / f"{name}.h5") as data:
-            assert first_moment(data) == expected
+            assert initial_view(data) == expected
 
 
 def test_share_passes_from_image_to_haptics_at_the_first_moment_of_the_samples() -> None:
     checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
-        index, step = first_moment(data)
+        index, step = initial_view(data)
         run = trace(checkpoint, data[index], index)
     assert run.effective_weights is not None
     haptics, contact = run.effective_weights[:, 1].mean(-1), int(run.episode.contact.argmax())
