@@ -1,4 +1,4 @@
-"""Animation of the dashboard over an included field run, as an animated WebP image for the README.
+"""Animation of the dashboard over a run of a field task, as an animated WebP image for the README.
 
 python bench/animation.py docs/images/page.webp
 

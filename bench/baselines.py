@@ -1,11 +1,11 @@
-"""Re-evaluate shipped checkpoints from offset starts, beside their baselines, as a Markdown table.
+"""Re-evaluate pretrained checkpoints from offset starts, beside their baselines, as a Markdown table.
 
     python bench/baselines.py door/crossmodal-ekf push/crossmodal-ekf > table.md
 
-An argument is a shipped filter or the path of a checkpoint, such as one of a study. Without arguments: all shipped
-filters of door and push. The test episodes of the sample sets, 64 a task, were not used in training. The belief starts
-3 cm and 20 deg off; the first 30 steps count only in "from step 0". Brackets: 95 % percentile bootstrap over
-trajectories.
+An argument is a pretrained filter or the path of a checkpoint, such as one of a study. Without arguments: all
+pretrained filters of door and push. The test episodes of the sample sets, 64 a task, were not used in training. The
+belief starts 3 cm and 20 deg off; the first 30 steps count only in "from step 0". Brackets: 95 % percentile bootstrap
+over trajectories.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.start_offset import STUDY_OFFSET
 from beliefscope.filters.training.plan import EVALUATED_BLACKOUTS
@@ -40,7 +40,7 @@ def main(names: list[str]) -> None:
     print("| task | filter | image blackout | quantity | filter | from step 0 | dynamics | stay |")
     print("| --- | --- | ---: | --- | ---: | ---: | ---: | ---: |", flush=True)
     for text in names:
-        path = Path(text) if text.endswith(".safetensors") else shipped(*text.split("/"))
+        path = Path(text) if text.endswith(".safetensors") else pretrained_path(*text.split("/"))
         checkpoint = load_checkpoint(path)
         task, filter_ = checkpoint.task, checkpoint.filter
         with open_dataset(sample_path(task.name)) as data:

@@ -14,7 +14,7 @@ from healthy_profiles import SIZES
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.conventions import Conventions, conventions
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -30,7 +30,7 @@ UNDONE = {
 
 def diagnosed(name: str, sample: int, seed: int, faults: str = "") -> Conventions:
     task, filter_ = name.split("/")
-    checkpoint, simulate = load_checkpoint(shipped(task, filter_)), load_task(task).simulate
+    checkpoint, simulate = load_checkpoint(pretrained_path(task, filter_)), load_task(task).simulate
     assert simulate is not None
     injected = Faults.parse(faults)
     episodes = {

@@ -27,7 +27,7 @@ from valid_files import episodes
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.catalog import architecture
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.training.plan import PLANS
@@ -40,11 +40,11 @@ STEPS = 60
 
 
 def trace_arrays(name: str) -> Arrays:
-    return arrays_of(trace(load_checkpoint(shipped("door", name)), episodes("door", STEPS)[0], seed=3))
+    return arrays_of(trace(load_checkpoint(pretrained_path("door", name)), episodes("door", STEPS)[0], seed=3))
 
 
 def map_arrays(name: str) -> Arrays:
-    checkpoint = load_checkpoint(shipped("door", name))
+    checkpoint = load_checkpoint(pretrained_path("door", name))
     engine = MapEngine(checkpoint, trace(checkpoint, episodes("door", STEPS)[0], seed=3))
     return {str(step): engine.map(step).log_likelihood for step in (0, 20, 40)}
 
@@ -57,7 +57,8 @@ def trained_weights(name: str) -> Arrays:
 
 def finetuned_weights(name: str) -> Arrays:
     settings = FineTune(train=("haptics-only",), length=8, windows=4, steps=4, check=2, particles=8, seed=3)
-    result = finetune(load_checkpoint(shipped("door", name)), episodes("door", STEPS), data_hash="0", settings=settings)
+    base = load_checkpoint(pretrained_path("door", name))
+    result = finetune(base, episodes("door", STEPS), data_hash="0", settings=settings)
     assert result is not None
     return {key: value.numpy() for key, value in result.filter.state_dict().items()}
 

@@ -17,7 +17,7 @@ import torch
 from healthy_profiles import SIZES
 
 from beliefscope.datasets.catalog import load_task
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.case import compared, observe
 from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
@@ -43,7 +43,7 @@ def main() -> None:
 
 def false_alarms(task: str, name: str, count: int, orders: int, seed: int) -> list[float]:
     """Share of samples with an alarm, by alarm rate."""
-    checkpoint = load_checkpoint(shipped(task, name))
+    checkpoint = load_checkpoint(pretrained_path(task, name))
     profile, simulate = required_profile(checkpoint), load_task(task).simulate
     assert simulate is not None
     episodes = {index: simulate(seed, index, SIZES[task][1]) for index in range(count)}

@@ -1,4 +1,4 @@
-"""Alarms of the fast diagnostics on healthy and on faulty copies of the shipped filters.
+"""Alarms of the fast diagnostics on healthy and on faulty copies of the pretrained filters.
 
 python bench/false_alarms.py DIR [TASK-FILTER ...]
 

@@ -1,4 +1,4 @@
-"""Calibrate the shipped filters of a field task on held-out episodes and print their NEES on others.
+"""Calibrate the pretrained filters of a field task on held-out episodes and print their NEES on others.
 
     beliefscope collect push-field --episodes 960 --steps 200 --seed 31 --split test -o first.h5
     beliefscope collect push-field --episodes 240 --steps 200 --seed 32 --split test -o second.h5
@@ -22,7 +22,7 @@ from field_tasks import Array, mean_of_steps, nees_by_step, phase_mean, phases
 
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
-from beliefscope.filters.names import shipped
+from beliefscope.filters.names import pretrained_path
 
 RULES = ("crossmodal", "unimodal", "feature", "image", "haptics")
 FILTERS = ("information-ekf", "crossmodal-pf", *(f"{rule}-ekf" for rule in RULES))
@@ -63,7 +63,7 @@ def main(task: str, paths: Sequence[Path]) -> None:
     by_phase = masks["contact"] + 2 * masks["outage"]
     print(f"| filter | factors | {' | '.join(masks)} |")
     for name in FILTERS:
-        filter_ = load_checkpoint(shipped(task, name)).filter
+        filter_ = load_checkpoint(pretrained_path(task, name)).filter
         starts = range(0, len(episodes), EPISODES)
         values = np.concatenate([nees_by_step(filter_, episodes[i : i + EPISODES]) for i in starts], 1)
         print(f"| {name} | none | {row(values, masks)} |")

@@ -10,7 +10,7 @@ from subject import NAMES, Row
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.finetuning.batch_mix import Mix
 from beliefscope.filters.finetuning.loop import FilterLoop
 from beliefscope.filters.finetuning.module_selection import freeze, select_parameters
@@ -29,7 +29,7 @@ def measure() -> list[Row]:
         episodes = [data[i] for i in range(8)]
     settings = FineTune(mix=((Slice("blackout", Faults.parse("blackout=0.4")), 1.0),))
     for name in NAMES:
-        filter_ = load_checkpoint(shipped("push", name)).filter
+        filter_ = load_checkpoint(pretrained_path("push", name)).filter
         mix = Mix.from_shares(filter_.task, filter_.names, settings.shares(), episodes, settings.seed)
         full_filter = copy.deepcopy(filter_)
         full = backward(FilterLoop(full_filter, select_parameters(full_filter), settings, mix, mix))

@@ -1,4 +1,4 @@
-"""Effect of each fine-tuning preset on the shipped filters, as a Markdown table.
+"""Effect of each fine-tuning preset on the pretrained filters, as a Markdown table.
 
     python bench/finetune_presets.py                             # the default of every filter of door and push
     python bench/finetune_presets.py --all door/crossmodal-ekf   # all presets of a filter
@@ -25,7 +25,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.store import has_sample, open_dataset, sample_path
-from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.defaults import default_settings
@@ -55,7 +55,7 @@ def ratio(before: np.ndarray, after: np.ndarray) -> list[float]:
 
 def run(task: str, name: str, preset: str) -> Result:
     """Fine-tunes one filter with one preset, unless it was done before."""
-    base = load_checkpoint(shipped(task, name))
+    base = load_checkpoint(pretrained_path(task, name))
     settings = replace(default_settings(base.filter), train=(preset,))
     path = FOLDER / f"{task}-{name}-{preset}.json"
     key = {"base": base.hash, "settings": settings.to_json()}
@@ -121,7 +121,7 @@ def main(arguments: list[str]) -> None:
     print("| --- | --- | --- | ---: | ---: | --- | --- | ---: | ---: |", flush=True)
     for text in [argument for argument in arguments if argument != "--all"] or names:
         task, name = text.split("/")
-        filter_ = load_checkpoint(shipped(task, name)).filter
+        filter_ = load_checkpoint(pretrained_path(task, name)).filter
         for preset in presets(filter_) if every else default_settings(filter_).train:
             print(row(run(task, name, preset)), flush=True)
 

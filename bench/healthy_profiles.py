@@ -1,4 +1,4 @@
-"""Write the healthy profiles of the shipped checkpoints beside them.
+"""Write the healthy profiles of the pretrained checkpoints beside them.
 
 python bench/healthy_profiles.py [TASK-FILTER ...] [--push-real push-real.h5]
 

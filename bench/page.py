@@ -316,7 +316,7 @@ def main() -> None:
     parser.add_argument("--play", type=float, metavar="MINUTES", help="only measure the memory during playback")
     parser.add_argument("--first", action="store_true", help="only measure the first screen and the 3D scene")
     parser.add_argument("--diagnosis", action="store_true", help="only measure the diagnosis")
-    parser.add_argument("--keys", action="store_true", help="only measure the keys, on a shipped episode")
+    parser.add_argument("--keys", action="store_true", help="only measure the keys, on a sample episode")
     args = parser.parse_args()
     if args.first:
         with browsing() as page, serving() as served:

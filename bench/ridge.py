@@ -12,7 +12,7 @@ import argparse
 import numpy as np
 
 from beliefscope.datasets.simulation.door import DOOR
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.likelihood_maps import maps, median_interval
 from beliefscope.inspect.trace import trace
 
@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--filter", default="crossmodal-pf")
     options = parser.parse_args()
     assert DOOR.simulate is not None
-    checkpoint = load_checkpoint(shipped("door", options.filter))
+    checkpoint = load_checkpoint(pretrained_path("door", options.filter))
     episodes = [DOOR.simulate(options.seed, index, options.steps) for index in range(options.episodes)]
     runs = [trace(checkpoint, episode, index) for index, episode in enumerate(episodes)]
     survey = maps(runs, checkpoint)

@@ -30,7 +30,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.sweep import Inputs
 from beliefscope.recordings.sweep_table import CHECKPOINTS, RESULTS, TABLES, Experiments, run_sweep
 
@@ -55,7 +55,7 @@ def cpu() -> float:
 def survey(folder: Path) -> None:
     """Cost of an episode of 100 steps, and the speed-up of two processes over all episodes with three seeds."""
     for name in ("crossmodal-ekf", "crossmodal-pf"):
-        cells = Inputs((shipped("door", name),), seeds=(0, 1, 2), all_episodes=True).cells(32)
+        cells = Inputs((pretrained_path("door", name),), seeds=(0, 1, 2), all_episodes=True).cells(32)
         episodes = sum(len(cell.episodes) for cell in cells)
         run_sweep(cells[:1], folder / f"{name}-0")  # imports and first calls
         seconds = []
@@ -70,10 +70,10 @@ def survey(folder: Path) -> None:
 
 
 def checkpoints(folder: Path, count: int) -> list[Path]:
-    """Copies of a shipped filter with slightly different weights."""
+    """Copies of a pretrained filter with slightly different weights."""
     folder.mkdir()
     paths = [folder / f"run{i:03d}.safetensors" for i in range(count)]
-    base = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    base = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     state = {key: value.clone() for key, value in base.filter.state_dict().items()}
     for i, path in enumerate(paths):
         generator = np.random.default_rng(i)
@@ -87,7 +87,7 @@ def checkpoints(folder: Path, count: int) -> list[Path]:
 def large_table(folder: Path, rows: int) -> None:
     """A sweep's folder with so many rows: those of a real sweep, for many checkpoints."""
     real = folder / "real"
-    filters = [shipped(task, name) for task in ("door", "push") for name in ("crossmodal-ekf", "image-ekf")]
+    filters = [pretrained_path(task, name) for task in ("door", "push") for name in ("crossmodal-ekf", "image-ekf")]
     table = run_sweep(Inputs(tuple(filters), faults=("", "blackout=0.8")).cells(), real)
     large, copies = folder / "large", -(-rows // len(table))
     large.mkdir()

@@ -24,7 +24,7 @@ from playwright.sync_api import Page, sync_playwright
 from served import serving
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import shipped
+from beliefscope.filters.checkpoint import pretrained_path
 from beliefscope.inspect.sweep import Inputs
 from beliefscope.recordings.sweep_table import run_sweep
 
@@ -204,7 +204,8 @@ def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, wanted: C
 
 def run_small_sweep(folder: Path) -> None:
     """Filters of one task over a few episodes, with two levels of blackout and a force bias."""
-    paths = tuple(shipped("door", name) for name in ("crossmodal-ekf", "image-ekf", "haptics-ekf", "unimodal-ekf"))
+    names = ("crossmodal-ekf", "image-ekf", "haptics-ekf", "unimodal-ekf")
+    paths = tuple(pretrained_path("door", name) for name in names)
     faults = ("", "blackout=0.4", "blackout=0.8", "force_bias:x=8")
     with open_dataset(sample_path("door")) as data:
         episodes = tuple(data.held_out()[:6])
@@ -257,7 +258,7 @@ def main() -> None:
                 args.view = args.view or list(READ_ONLY_VIEWS)
                 shoot_all(server.url)
             return
-        filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(files) / f"{LONG}.safetensors")
+        filter_ = shutil.copy(pretrained_path("door", "crossmodal-pf"), Path(files) / f"{LONG}.safetensors")
         data = shutil.copy(sample_path("door"), Path(files) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
         workspace = Path(files) / "workspace"
         run_small_sweep(sweep := Path(files) / "sweep-of-doors")

@@ -2,8 +2,8 @@
 
     python bench/slices.py FIELD [FIRST_SEED]
 
-FIELD/push and FIELD/door have ``outages.h5`` of bench/field_tasks.py; errors are those of the shipped filters on these
-60 episodes of 200 steps, and on the 64 held-out episodes of door and push.
+FIELD/push and FIELD/door have ``outages.h5`` of bench/field_tasks.py; errors are those of the pretrained filters on
+these 60 episodes of 200 steps, and on the 64 held-out episodes of door and push.
 
 Each data set pairs the covariates of every episode with the errors of a random episode, rotated by a random number of
 steps. So real errors, with their dependence, have no relation to real covariates; then the errors of one random slice
@@ -31,7 +31,7 @@ import numpy as np
 from scipy.special import betaincinv, stdtrit
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.slices.covariates import StepCovariate, covariates_of
 from beliefscope.inspect.slices.search import Candidate, Index, find_candidates, random_pairings
 from beliefscope.inspect.statistics import measures
@@ -57,7 +57,7 @@ class Table:
 
 
 def table_of(task: str, field: Path) -> Table:
-    checkpoint = load_checkpoint(shipped(task, FILTERS[task]))
+    checkpoint = load_checkpoint(pretrained_path(task, FILTERS[task]))
     path = field / task.removesuffix("-field") / "outages.h5" if task.endswith("-field") else sample_path(task)
     with open_dataset(path) as data:
         traces = list(trace_all(checkpoint, data, data.held_out()))

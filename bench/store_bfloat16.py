@@ -4,7 +4,7 @@
 
 Tensors with at least 1024 values and two axes are rounded to 8 significant bits; filters compute in 32 bits as before.
 Prints the errors and the NEES before and after, of 10 held-out episodes. Then run
-``bench/healthy_profiles.py`` and ``bench/shipped.py``: profiles and README contain the hash of the file.
+``bench/healthy_profiles.py`` and ``bench/pretrained.py``: profiles and README contain the hash of the file.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Evaluate the shipped checkpoints of a study from offset starts, without training, and write its tables and figures.
+"""Evaluate the pretrained filters of a study from offset starts, without training, and write its tables and figures.
 
     python bench/study_offsets.py
 
-Reads ``filters/pretrained/study.json``, evaluates those of its checkpoints that are shipped (seed 0) on the test
+Reads ``filters/pretrained/study.json``, evaluates those of its checkpoints that are in that folder (seed 0) on the test
 episodes of the sample sets, from starts 3 cm and 20 deg off, and writes the rows into the file, and tables and figures
 into ``docs/study``. Finished evaluations are kept in ``build/study_offsets``, from which an interrupted run resumes.
 """
@@ -13,7 +13,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
+from beliefscope.app.workspace.studies import BUILT_IN, FILE, Results, Study
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -39,8 +39,8 @@ DATA = "the {} test episodes of the sample set"
 
 
 @dataclass(frozen=True)
-class ShippedCell:
-    """A cell of the shipped study (``study_table.Condition``)."""
+class PretrainedCell:
+    """A cell of the built-in study (``study_table.Condition``)."""
 
     task: str
     filter: str
@@ -53,19 +53,19 @@ class ShippedCell:
 
 def offset_rows(results: Results) -> tuple[list[Row], dict[str, str]]:
     """Rows of the offset starts, and the data of each task: their description."""
-    documents: dict[ShippedCell, Document | None] = {}
+    documents: dict[PretrainedCell, Document | None] = {}
     data: dict[str, str] = {}
     for name in results.cells:
         task, filter_, seed = name.split("/")
-        cell = ShippedCell(task, filter_, int(seed.removeprefix("seed")))
+        cell = PretrainedCell(task, filter_, int(seed.removeprefix("seed")))
         documents[cell] = _document(cell, results.checkpoints.get(name))
         if (document := documents[cell]) is not None:
             data[task] = DATA.format(document["episodes"]["test"])
     return [row for row in rows_of(documents) if row.filter != TRIVIAL], data
 
 
-def _document(cell: ShippedCell, checkpoint_hash: str | None) -> Document | None:
-    """The evaluation of a shipped checkpoint in the form of a cell's document; None if it is not shipped."""
+def _document(cell: PretrainedCell, checkpoint_hash: str | None) -> Document | None:
+    """The evaluation of a pretrained checkpoint in the form of a cell's document; None if there is none."""
     path = PRETRAINED / f"{cell.task}-{cell.filter}.safetensors"
     if not path.is_file() or (checkpoint := load_checkpoint(path)).hash != checkpoint_hash:
         return None
@@ -89,7 +89,7 @@ def _document(cell: ShippedCell, checkpoint_hash: str | None) -> Document | None
 
 
 def main() -> None:
-    study = Study(SHIPPED, PRETRAINED, False)
+    study = Study(BUILT_IN, PRETRAINED, False)
     results = study.read()
     offsets, data = offset_rows(results)
     at_truth = [row for row in results.rows if not row.start]

@@ -1,4 +1,4 @@
-"""Benchmark subject: the shipped filters on one simulated door episode of 800 steps."""
+"""Benchmark subject: the pretrained filters on one simulated door episode of 800 steps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.table import Table
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import Trace, trace
 
 STEPS = 800
@@ -53,7 +53,7 @@ def episode() -> Episode:
 
 @cache
 def checkpoint(name: str) -> Checkpoint:
-    return load_checkpoint(shipped("door", name))
+    return load_checkpoint(pretrained_path("door", name))
 
 
 @cache

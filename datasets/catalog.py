@@ -21,11 +21,11 @@ from beliefscope.datasets.task_json import check_definition, difference, task_fr
 TASKS: dict[str, Task] = {
     task.name: task for task in (DOOR, PUSH, DOOR_FIELD, PUSH_FIELD, PUSH_FIELD_YAW, *PUSH_REAL_TASKS)
 }
-"""Shipped tasks by name."""
+"""Built-in tasks by name."""
 
 
 def find_task(task: str | Task) -> Task:
-    """Return the shipped task with the name, or the given one. Runs no user code, so names read from files are safe.
+    """Return the built-in task with the name, or the given one. Runs no user code, so names read from files are safe.
 
     Raises:
         BadInput: for an unknown name.
@@ -43,10 +43,10 @@ def stored_task(stored: Any, given: Iterable[Task] = ()) -> Task:
 
     Args:
         stored: JSON value of the file. given: tasks that the user has loaded. The functions of a task are those of a
-            given or shipped one with the same name and layout; without one, the task has none.
+            given or built-in one with the same name and layout; without one, the task has none.
 
     Raises:
-        BadInput: for an invalid definition, and for the name of a task that is neither given nor shipped.
+        BadInput: for an invalid definition, and for the name of a task that is neither given nor built in.
     """
     tasks = [*given, *TASKS.values()]
     if isinstance(stored, str):
@@ -65,7 +65,7 @@ copyreg.pickle(Task, _reduce)
 
 
 def load_task(task: str | Task) -> Task:
-    """Return a shipped task by name, or a user-defined one. Runs user code: not for names read from files.
+    """Return a built-in task by name, or a user-defined one. Runs user code: not for names read from files.
 
     Args:
         task: name, definition, or ``path/to/file.py:NAME`` or ``package.module:NAME``, which runs the file once.

@@ -1,6 +1,6 @@
 """Index of a data file, stored beside it: opening reads the index instead of the attributes of all episodes.
 
-Large files and the included ones have an index. It belongs to a file of the same size and time, or of the same size and
+Large files and sample data have an index. It belongs to a file of the same size and time, or of the same size and
 content: installing a file changes its time.
 """
 
@@ -49,7 +49,7 @@ def read_index(path: Path) -> tuple[tuple[EpisodeSummary, ...], str] | None:
 
 
 def write_index(path: Path, summaries: tuple[EpisodeSummary, ...], digest: str, by_content: bool = False) -> None:
-    """Store the index if the folder can be written and the file is large, or ``by_content``, as of included files."""
+    """Store the index if the folder can be written and the file is large, or ``by_content``, as of sample data."""
     if len(summaries) < EPISODES and not by_content:
         return
     columns = {name: [getattr(s, name) for s in summaries] for name in COLUMNS}

@@ -53,7 +53,7 @@ def sample_path(task: str | Task) -> Path:
 
 
 def has_sample(task: str | Task) -> bool:
-    """Whether the task is a shipped one with a sample dataset."""
+    """Whether the task is a built-in one with a sample dataset."""
     task = find_task(task)
     return task.name in TASKS and not difference(TASKS[task.name], task) and _sample_file(task.name).exists()
 

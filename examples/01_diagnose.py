@@ -8,12 +8,12 @@ from pathlib import Path
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
 
-checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
 faults = Faults.parse("blackout=0.4")  # 40 % image blackout
 with open_dataset(sample_path("door")) as data:
     traces = [trace(checkpoint, data[i], i, faults=faults) for i in data.held_out()[:5]]

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
-checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
+checkpoint = load_checkpoint(pretrained_path("push", "crossmodal-pf"))
 with open_dataset(sample_path("push")) as data:
     index = data.held_out()[0]
     replay = Replay(checkpoint, trace(checkpoint, data[index], index))

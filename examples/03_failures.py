@@ -5,11 +5,11 @@ from pathlib import Path
 
 from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.failures import find_failures
 
-checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
+checkpoint = load_checkpoint(pretrained_path("push", "crossmodal-pf"))
 with open_dataset(sample_path("push")) as data:
     failures = find_failures(checkpoint, data, by="disagreement")
 

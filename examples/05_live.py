@@ -12,12 +12,12 @@ import torch
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import single_step
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.recordings.live import LiveRecorder
 
 with open_dataset(sample_path("door")) as data:
     robot = data[9]  # replaces a robot: step t has the observations at that time
-checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
 filter_, generator = checkpoint.filter, torch.Generator().manual_seed(0)
 first = filter_.statistics.standardise("state", torch.from_numpy(robot.states[:1]))
 start = Gaussian(first, 0.1 * torch.eye(filter_.n)[None])

@@ -33,7 +33,7 @@ from beliefscope.filters.batch import Statistics
 from beliefscope.filters.catalog import build
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
-from beliefscope.filters.names import PRETRAINED as PRETRAINED, check_not_source, shipped as shipped
+from beliefscope.filters.names import PRETRAINED as PRETRAINED, check_not_source, pretrained_path as pretrained_path
 
 FORMAT = 1
 

@@ -98,7 +98,7 @@ class Architecture:
         """Inverse of ``to_json``. Missing values take their default.
 
         Args:
-            task: definition; by default the shipped task with the name in the values.
+            task: definition; by default the built-in task with the name in the values.
 
         Raises BadInput for unknown keys, and without task, kind or models.
         """

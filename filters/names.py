@@ -1,4 +1,4 @@
-"""Names of the built-in filters and their shipped checkpoints. Without PyTorch: a wrong name is reported at once."""
+"""Names of the built-in filters and their pretrained checkpoints. Without PyTorch: a wrong name is reported at once."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def filter_names(task: Task) -> dict[str, tuple[str, tuple[str, ...]]]:
     return {key.format(modality=names[0]): (key, names) for key, kind in MODELS.items() for names in models[kind]}
 
 
-def shipped(task: str | Task, name: str) -> Path:
+def pretrained_path(task: str | Task, name: str) -> Path:
     """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
     check_not_source(name)
     definition = find_task(task)
     filters, task = filter_names(definition), definition.name
     paths = {filter_: PRETRAINED / f"{task}-{filter_}.safetensors" for filter_ in filters}
-    is_shipped = task in TASKS and not difference(TASKS[task], definition)
-    available = [filter_ for filter_, path in paths.items() if is_shipped and path.is_file()]
+    is_built_in = task in TASKS and not difference(TASKS[task], definition)
+    available = [filter_ for filter_, path in paths.items() if is_built_in and path.is_file()]
     if name not in filters:
         raise unknown_name("filter", name, available)
     if name not in available:

@@ -12,11 +12,11 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.external.load import ExternalFilter, load_external
-from beliefscope.filters.names import is_code, is_path, shipped
+from beliefscope.filters.names import is_code, is_path, pretrained_path
 
 
 def open_filter(task: str | Task, text: str) -> Checkpoint:
-    """Load a built-in filter by name, a checkpoint by path, or an external filter by its build function.
+    """Load a pretrained filter by name, a checkpoint by path, or an external filter by its build function.
 
     Args:
         task: definition, name or ``path/to/file.py:NAME``. A checkpoint file needs only the name.
@@ -25,7 +25,7 @@ def open_filter(task: str | Task, text: str) -> Checkpoint:
     """
     if not is_path(text) or is_code(text):
         task = load_task(task)
-        return load_external(text, task) if is_code(text) else load_checkpoint(shipped(task, text))
+        return load_external(text, task) if is_code(text) else load_checkpoint(pretrained_path(task, text))
     given = () if isinstance(task, str) and ":" not in task else (load_task(task),)
     checkpoint = load_checkpoint(Path(text), given)
     name = given[0].name if given else task

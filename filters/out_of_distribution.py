@@ -7,7 +7,7 @@ Two tests, both on means over R episodes, because the steps of an episode are de
   1 / sqrt(R).
 * Features whose mean and spread between training episodes are known: brightness and contrast of images, and the mean
   product of every two channels, which shows swapped axes and wrong signs. New checkpoints have this summary in their
-  record; ``pretrained/data_summary.json`` has that of the shipped ones.
+  record; ``pretrained/data_summary.json`` has that of the pretrained ones.
 
 Thresholds leave no false warning on the sample sets (tests/filters/test_out_of_distribution.py).
 """
@@ -132,7 +132,7 @@ def summarise(statistics: Statistics, task: Task, episodes: Sequence[Episode]) -
 
 
 def summary_key(statistics: Statistics) -> str:
-    """Identifies the training data of shipped checkpoints: SHA-256 of the normalisation statistics."""
+    """Identifies the training data of pretrained checkpoints: SHA-256 of the normalisation statistics."""
     digest = hashlib.sha256()
     for name, value in sorted(statistics.state_dict().items()):
         digest.update(name.encode() + value.cpu().numpy().tobytes())
@@ -140,7 +140,7 @@ def summary_key(statistics: Statistics) -> str:
 
 
 @lru_cache(maxsize=1)
-def _shipped_summaries() -> Mapping[str, Any]:
+def _pretrained_summaries() -> Mapping[str, Any]:
     return json.loads(SUMMARIES.read_text()) if SUMMARIES.is_file() else {}
 
 
@@ -157,7 +157,7 @@ def findings(checkpoint: Checkpoint, episodes: Sequence[Episode], ignored: Seque
     task, statistics = checkpoint.task, checkpoint.statistics
     parts = [_normalised(statistics, task, episode) for episode in episodes]
     result = _channel_findings(task, statistics, [values for values, _ in parts])
-    summary = checkpoint.record.get("data_summary") or _shipped_summaries().get(summary_key(statistics))
+    summary = checkpoint.record.get("data_summary") or _pretrained_summaries().get(summary_key(statistics))
     if summary:
         result += _feature_findings(task, summary, np.array([_features(*part) for part in parts]), ignored)
     kept = [finding for finding in result if finding.channel.key not in ignored]

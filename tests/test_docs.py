@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 import beliefscope as bs
 from beliefscope import __version__
-from beliefscope.filters.checkpoint import PRETRAINED, shipped
+from beliefscope.filters.checkpoint import PRETRAINED, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.palette import COLOURS
 
@@ -164,7 +164,7 @@ def test_documented_colours_match_the_palette() -> None:
 
 @pytest.mark.slow
 def test_readme_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert shipped("door", "crossmodal-pf").is_file()
+    assert pretrained_path("door", "crossmodal-pf").is_file()
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     names: dict[str, object] = {}
     exec(compile(example, "README.md", "exec"), names)

@@ -23,7 +23,7 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import load_trace, trace
 from beliefscope.inspect.traces.live_file import load_live
@@ -95,7 +95,7 @@ def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     output = example("05_live.py", tmp_path, capsys)
     assert output == f"{tmp_path}/live/example.live: 100 steps, the hinge is at (81.0, -19.8) cm\n"
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         expected = trace(checkpoint, data[9])
     result = load_live(tmp_path / "live" / "example.live")

@@ -21,7 +21,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 
 pytestmark = pytest.mark.slow
@@ -42,14 +42,14 @@ def episodes(path: Path, version: int) -> None:
 
 
 def checkpoint(path: Path, version: int) -> None:
-    path.write_bytes(shipped("door", "image-ekf").read_bytes())
+    path.write_bytes(pretrained_path("door", "image-ekf").read_bytes())
     set_format(path, "beliefscope", version)
 
 
 def run(path: Path, version: int) -> None:
     if not path.exists():
         with open_dataset(sample_path("door")) as data:
-            result = trace(load_checkpoint(shipped("door", "image-ekf")), data[0], episode_index=0, seed=0)
+            result = trace(load_checkpoint(pretrained_path("door", "image-ekf")), data[0], episode_index=0, seed=0)
         save_trace(result, path)
     set_format(path, "beliefscope-trace", version)
 
@@ -130,7 +130,7 @@ def test_a_workspace_of_a_later_version_is_readable_and_kept(
         assert [(run["name"], run["state"]) for run in responses["live"].json()["runs"]] == [("a", "damaged")]
         assert [file["name"] for file in responses["recordings"].json()["recordings"]] == ["a.rrd"]
         store = client.app.state.store  # type: ignore[attr-defined]
-        new = SavedFilter("door", "mine", str(shipped("door", "image-ekf")), default=True)
+        new = SavedFilter("door", "mine", str(pretrained_path("door", "image-ekf")), default=True)
         with pytest.raises(BadInput, match=r"kept\.json' is damaged or was written by another version: move it away"):
             save_filter(store, new)
     assert {name: (tmp_path / "ws" / name).read_text() for name in LATER} == LATER

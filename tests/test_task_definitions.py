@@ -197,7 +197,7 @@ def recorded(task: Task, folder: Path, states: int) -> Trace:
 
 
 def test_tasks_with_the_same_name(tmp_path: Path) -> None:
-    """Two definitions with one name, which is also that of a shipped task."""
+    """Two definitions with one name, which is also that of a built-in task."""
     (tmp_path / "rover.py").write_text(DEFINITION)
     task = replace(load_task(f"{tmp_path / 'rover.py'}:TASK"), name="push")
     wider = replace(task, components=(*task.components, Component("heading", "rad")))

@@ -20,7 +20,7 @@ from beliefscope.app.runs.catalog import task_catalogs
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 from beliefscope.recordings.read import read_recording
 
@@ -84,10 +84,10 @@ def malicious_task(tmp_path: Path) -> str:
 
 def test_tasks_named_in_files_are_not_run(tmp_path: Path, malicious_task: str) -> None:
     path = tmp_path / "filter.safetensors"
-    with safe_open(shipped("door", "crossmodal-ekf"), "pt") as file:
+    with safe_open(pretrained_path("door", "crossmodal-ekf"), "pt") as file:
         header = json.loads(file.metadata()["beliefscope"])
     header["architecture"]["task"] = malicious_task
-    tensors = load_file(shipped("door", "crossmodal-ekf"))
+    tensors = load_file(pretrained_path("door", "crossmodal-ekf"))
     path.write_bytes(save(tensors, metadata={"beliefscope": json.dumps(header)}))
     with pytest.raises(BadInput, match="does not exist"):
         load_checkpoint(path)
@@ -100,7 +100,7 @@ def test_tasks_named_in_files_are_not_run(tmp_path: Path, malicious_task: str) -
         open_dataset(data)
 
     with open_dataset(sample_path("door")) as episodes:
-        result = trace(load_checkpoint(shipped("door", "crossmodal-ekf")), episodes[0], episode_index=0, seed=0)
+        result = trace(load_checkpoint(pretrained_path("door", "crossmodal-ekf")), episodes[0], episode_index=0, seed=0)
     save_trace(result, tmp_path / "run.trace")
     with safe_open(tmp_path / "run.trace", "pt") as file:
         metadata = {key: value.replace('"door"', json.dumps(malicious_task)) for key, value in file.metadata().items()}

@@ -2,7 +2,7 @@
 
     python tools/request_files.py [--list]
 
-The requests go to a test client on the included data. A file counts if one of its functions is called in the server
+The requests go to a test client on the sample data. A file counts if one of its functions is called in the server
 process, in any thread. If the filter runs in a thread, the count of a trace includes the filter's own files.
 """
 

@@ -106,7 +106,7 @@ def camera(_: Place) -> Finding:
 
 
 def weights(_: Place) -> Finding:
-    """Check the hashes of the built-in filters and episodes."""
+    """Check the hashes of the pretrained filters and the sample data."""
     from beliefscope.datasets.store import sample_path
     from beliefscope.filters.checkpoint import PRETRAINED
 
@@ -114,7 +114,8 @@ def weights(_: Place) -> Finding:
     changed = [name for folder in folders for name in changed_files(folder)]
     if changed:
         return Finding(f"{', '.join(changed)} missing or modified", "failed", "reinstall beliefscope")
-    return Finding(f"{sum(len(read_sums(folder)) for folder in folders)} built-in files have the expected hashes")
+    count = sum(len(read_sums(folder)) for folder in folders)
+    return Finding(f"{count} files of pretrained filters and sample data have the expected hashes")
 
 
 def page(_: Place) -> Finding:

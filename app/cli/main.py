@@ -106,8 +106,8 @@ def beliefscope(
 
     \b
     Start here:
-      beliefscope demo           open the dashboard on the included example in a browser
-      beliefscope serve          serve the included filters and episodes, and your own
+      beliefscope demo           open the dashboard on an example in a browser
+      beliefscope serve          serve the pretrained filters, the sample data, and your own
 
     \b
     From a simulator to a recording:

@@ -103,7 +103,7 @@ DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=..
 CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=...)
 TRACE_FILTER = option(
     "NAME|CHECKPOINT",
-    "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
+    "Filter that produced the traces. Default: the pretrained filter with the traces' checkpoint hash.",
     "",
 )
 
@@ -123,7 +123,7 @@ OPTIONS: dict[str, Any] = {
     ),
     "filter": option(
         "NAME|CHECKPOINT|MODULE:BUILD",
-        "Built-in filter such as crossmodal-pf, path of a .safetensors file, or external filter given by its "
+        "Pretrained filter such as crossmodal-pf, path of a .safetensors file, or external filter given by its "
         "build function: package.module:build or path/to/file.py:build (docs/own_filter.md).",
     ),
     "data": option(
@@ -236,13 +236,13 @@ class Runs:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises BadInput for an unknown name of a task or built-in filter, before a command imports PyTorch."""
+        """Raises BadInput for an unknown name of a task or pretrained filter, before a command imports PyTorch."""
         from beliefscope.datasets.catalog import TASKS
-        from beliefscope.filters.names import is_code, is_path, shipped
+        from beliefscope.filters.names import is_code, is_path, pretrained_path
 
         has_definition = self.task not in TASKS and (":" in self.task or self.data is not None)
         if not (has_definition or is_path(self.filter) or is_code(self.filter)):
-            shipped(self.task, self.filter)
+            pretrained_path(self.task, self.filter)
 
     def open(self) -> tuple[Checkpoint, Faults]:
         """The filter, and the faults to inject."""
@@ -300,7 +300,7 @@ class Run(Runs):
 
 
 def definition_of(task: str, path: Path | None) -> Task | str:
-    """The task of the data if it is named and not shipped, so that the file that defines it is not needed."""
+    """The task of the data if it is named and not a built-in one, so that the file that defines it is not needed."""
     from beliefscope.datasets.catalog import TASKS
     from beliefscope.datasets.store import open_dataset
 
@@ -311,7 +311,7 @@ def definition_of(task: str, path: Path | None) -> Task | str:
 
 
 def own_definitions(paths: Iterable[Path]) -> dict[str, Task]:
-    """Name -> task of the data sets whose task is not shipped. Files that cannot be read have none."""
+    """Name -> task of the data sets whose task is not a built-in one. Files that cannot be read have none."""
     from beliefscope.datasets.catalog import TASKS
     from beliefscope.datasets.store import open_dataset
 

@@ -1,4 +1,4 @@
-"""Catalog of filters and data sets by task: the user's own first, then the included ones."""
+"""Catalog of filters and data sets by task: the user's own first, then pretrained filters and sample data."""
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -19,18 +19,18 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
-from beliefscope.filters.checkpoint import Checkpoint, DeferredCheckpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, DeferredCheckpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.external.load import load_external
 from beliefscope.filters.names import is_path
 
 SAMPLE = "sample"
-"""Name of the data set that ships with a task."""
+"""Name of the sample data set of a task."""
 
 PRETRAINED = frozenset(name for task in TASKS.values() for name in filters_of(task))
 """Names of the pretrained filters of all tasks."""
 
 EXTERNAL = {"door": {"hand-on-arc": "beliefscope.filters.external.hand_on_arc:build"}}
-"""Task -> included external filters: name -> source."""
+"""Task -> external filters that are always listed: name -> source."""
 
 DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 """The first of these that is pretrained for a task is listed first."""
@@ -38,7 +38,7 @@ DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 
 @dataclass
 class TaskCatalog:
-    """Filters and data sets of one task by name. The included ones are loaded on first use.
+    """Filters and data sets of one task by name. Pretrained filters and sample data are loaded on first use.
 
     secondary: filters of the user that do not replace the default filter: listed after it, and after the user's
     other filters. removed: names of filters that were removed since the server started.
@@ -56,8 +56,8 @@ class TaskCatalog:
         first = max(1, len(filters))
         for name in dict.fromkeys((*DEFAULT_FILTERS, *filters_of(self.task))):
             if name not in self.user_filters:
-                with suppress(BadInput):  # no pretrained checkpoint ships
-                    filters[name] = _included(shipped(self.task, name))
+                with suppress(BadInput):  # not every filter is pretrained
+                    filters[name] = _pretrained(pretrained_path(self.task, name))
         for name, source in EXTERNAL.get(self.task.name, {}).items():
             filters.setdefault(name, _external(source, self.task))
         listed = list(filters.items())
@@ -68,7 +68,7 @@ class TaskCatalog:
     def data(self) -> dict[str, Dataset]:
         data = dict(self.user_data)
         if SAMPLE not in data:
-            with suppress(BadInput):  # no sample set ships
+            with suppress(BadInput):  # not every task has sample data
                 data[SAMPLE] = _sample(sample_path(self.task), self.task)
         return data
 
@@ -148,8 +148,8 @@ class TaskCatalog:
             data.close()
 
 
-# Included files do not change: the catalogs of a process share them.
-_included = cache(DeferredCheckpoint)
+# These files do not change: the catalogs of a process share them.
+_pretrained = cache(DeferredCheckpoint)
 _sample = cache(open_dataset)
 _external = cache(load_external)
 
@@ -198,8 +198,8 @@ def task_catalogs(
         for name, catalog in catalogs.items()
         if name not in TASKS or catalog.user_data or catalog.user_filters.keys() - catalog.secondary
     }
-    included = {name: catalogs.get(name, TaskCatalog(task)) for name, task in TASKS.items()}
-    return own | {name: catalog for name, catalog in included.items() if name not in own}, problems
+    built_in = {name: catalogs.get(name, TaskCatalog(task)) for name, task in TASKS.items()}
+    return own | {name: catalog for name, catalog in built_in.items() if name not in own}, problems
 
 
 def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, source: str) -> TaskCatalog:
@@ -236,7 +236,7 @@ def result_folders(given: Mapping[str, Path], workspace: Path, file: str, reserv
 
 
 def served_names(filters: Sequence[str], data: Path | None) -> tuple[list[str], str]:
-    """Names, as on the page, of filters (files or built-in ones) and of the data; None: the sample set."""
+    """Names, as on the page, of filters (files or pretrained ones) and of the data; None: the sample set."""
     files = short_names(map(Path, filter(is_path, filters)), PRETRAINED)
     paths = {path.resolve(): name for name, path in files.items()}
     names = [paths[Path(text).resolve()] if is_path(text) else text for text in filters]

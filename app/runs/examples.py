@@ -48,7 +48,7 @@ EXAMPLES = (
     ),
     Example(
         "External filter",
-        "A Kalman filter in plain PyTorch that uses no camera, compared with an included filter.",
+        "A Kalman filter in plain PyTorch that uses no camera, compared with a pretrained filter.",
         "?task=door&filter=hand-on-arc&step=29&against=filter%3Dcrossmodal-ekf&tab=compare",
     ),
     Example(

@@ -8,15 +8,15 @@ from pathlib import Path
 from beliefscope.app.runs.catalog import result_folders
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.sweep_filters import HASH_DIGITS, NAME, Candidate
-from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
+from beliefscope.app.workspace.studies import BUILT_IN, FILE, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 
 
 def all_studies(folders: Mapping[str, Path], workspace: Path) -> list[Study]:
     """The studies given to the server by name, those in the workspace, and the built-in one."""
-    named = result_folders(folders, workspace, FILE, SHIPPED)
-    return [*(Study(name, folder, True) for name, folder in named.items()), Study(SHIPPED, PRETRAINED, False)]
+    named = result_folders(folders, workspace, FILE, BUILT_IN)
+    return [*(Study(name, folder, True) for name, folder in named.items()), Study(BUILT_IN, PRETRAINED, False)]
 
 
 def study_filter_name(cell: str, hash_: str) -> str:

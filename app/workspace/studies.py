@@ -14,8 +14,8 @@ from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.legacy_names import rename_keys
 from beliefscope.filters.training.study_table import Row
 
-SHIPPED = "shipped"
-"""Name of the built-in study. The weights of its first seed are built in, too."""
+BUILT_IN = "shipped"
+"""Name of the built-in study. The checkpoints of its first seed are the pretrained filters."""
 
 FILE = "study.json"
 FINISHED = "finished"

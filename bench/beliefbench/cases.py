@@ -18,7 +18,7 @@ from beliefbench.sensor_faults import LABEL_CAUSES, SENSOR_CAUSES
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.catalog import architecture
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.healthy_profile import find_profile
 
 FILTERS = {
@@ -50,7 +50,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Spec:
-    """Everything that determines a case. The files are a function of this and of the shipped checkpoints."""
+    """Everything that determines a case. The files are a function of this and of the pretrained checkpoints."""
 
     task: str
     filter: str
@@ -172,8 +172,8 @@ def load_case(folder: Path) -> Case:
 
 @cache
 def healthy_profile(task: str, filter_: str) -> dict[str, Any]:
-    """JSON of the healthy profile of a shipped checkpoint."""
-    profile = find_profile(task, filter_, load_checkpoint(shipped(task, filter_)).hash, None)
+    """JSON of the healthy profile of a pretrained checkpoint."""
+    profile = find_profile(task, filter_, load_checkpoint(pretrained_path(task, filter_)).hash, None)
     assert profile is not None
     return profile.to_json()
 

@@ -18,7 +18,7 @@ from beliefbench.sensor_faults import LABEL_CAUSES, SENSOR_CAUSES, inject, misla
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import write_dataset
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.statistics.measures import counted, errors, nees
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -31,7 +31,7 @@ def write_case(spec: Spec, directory: Path) -> Path:
     """Write the folder of a case. The truth is written last: a folder without it is incomplete."""
     folder = directory / spec.name
     folder.mkdir(parents=True, exist_ok=True)
-    original = load_checkpoint(shipped(spec.task, spec.filter))
+    original = load_checkpoint(pretrained_path(spec.task, spec.filter))
     clean = clean_episodes(spec)
     episodes, filter_, details, particles = clean, copy.deepcopy(original.filter), [], PARTICLES
     rng = spec.rng

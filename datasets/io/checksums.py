@@ -1,4 +1,4 @@
-"""Hashes of shipped files, in the format of sha256sum."""
+"""Hashes of the pretrained filters and the sample data, in the format of sha256sum."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def has_run() -> bool:
 
 def load_module(place: str) -> ModuleType:
     """Run a file or import a module. Raises BadInput if it does not exist or fails."""
-    if not place.startswith("beliefscope."):  # filters that are included
+    if not place.startswith("beliefscope."):  # filters of this package
         _places.add(place)
     return _run_file(Path(place)) if place.endswith(".py") else _import(place)
 

@@ -16,7 +16,7 @@ from beliefscope.datasets.errors import BadInput, reason_unreadable, type_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 
 
 def save_weights(tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -45,5 +45,5 @@ def pretrained_std(task: Task) -> Tensor:
     """(n,) m and rad: standard deviations of the pretrained filters' training states; NaN if there are none."""
     for name in filters_of(task):
         with suppress(BadInput):  # not every filter is pretrained
-            return load_checkpoint(shipped(task, name)).filter.statistics.mean_std("state")[1]
+            return load_checkpoint(pretrained_path(task, name)).filter.statistics.mean_std("state")[1]
     return torch.full((len(task.components),), torch.nan)

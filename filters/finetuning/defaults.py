@@ -1,6 +1,6 @@
 """The default fine-tuning of a filter: learn a sensor fault that the training data lack.
 
-docs/finetune.md has its effect on the shipped filters.
+docs/finetune.md has its effect on the pretrained filters.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def reason(filter_: Filter) -> str:
     ((slice_, _),) = settings.mix
     modules = settings.train[0].replace("-", " ")
     return (
-        f"Included filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which multiplies their "
+        f"Pretrained filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which multiplies their "
         f"error; by default, the modules of \u201c{modules}\u201d learn from data with this fault. If this "
         "brings no change, try other modules or faults."
     )

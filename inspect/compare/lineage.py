@@ -185,8 +185,8 @@ def base_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
     return record.get("base") or record.get("parent") or {}
 
 
-def lineage_of(places: Iterable[Path], shipped: Path = PRETRAINED) -> Lineage:
-    """Read the checkpoints in files and folders (recursively), and their built-in ancestors.
+def lineage_of(places: Iterable[Path], pretrained: Path = PRETRAINED) -> Lineage:
+    """Read the checkpoints in files and folders (recursively), and their pretrained ancestors.
 
     Raises BadInput for a missing path, and if there is no checkpoint.
     """
@@ -207,7 +207,7 @@ def lineage_of(places: Iterable[Path], shipped: Path = PRETRAINED) -> Lineage:
         why = f": {left_out[0]}" if left_out else ""
         raise BadInput(f"no checkpoint in {', '.join(repr(str(place)) for place in places)}{why}")
     missing = {member.base for member in members.values() if member.base} - members.keys()
-    for path in sorted(shipped.glob("*.safetensors")) if missing else []:
+    for path in sorted(pretrained.glob("*.safetensors")) if missing else []:
         if hashlib.sha256(path.read_bytes()).hexdigest() in missing:
             member = Ancestor.from_checkpoint(load_checkpoint(path), path)
             members[member.hash] = member

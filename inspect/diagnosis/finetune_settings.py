@@ -48,7 +48,7 @@ MODULES = {
 """Cause or component -> preset; ``*`` stands for the modality."""
 
 CLEAN_SHARE = 0.8
-"""Weight of clean data with a sensor fault. At equal weights, the shipped information filters lose accuracy on them."""
+"""Weight of clean data with a sensor fault. At equal weights, pretrained information filters lose accuracy on them."""
 
 
 def training_for(cause: str, filter_: Filter, faults: Faults = NO_FAULTS) -> FineTune | None:

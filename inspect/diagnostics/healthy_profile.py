@@ -1,7 +1,7 @@
 """Healthy profile: trajectory statistics of a checkpoint on clean held-out episodes, which its later runs should match.
 
-New checkpoints have it in their header; shipped ones have a file beside them, which keeps their hash. What is the same
-for all shipped filters of a task, such as statistics of its sensors, is in a file of the task.
+New checkpoints have it in their header; pretrained ones have a file beside them, which keeps their hash. What is the
+same for all pretrained filters of a task, such as statistics of its sensors, is in a file of the task.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
-from beliefscope.filters.checkpoint import Checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, pretrained_path
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.inspect.statistics.reference_images import Reference
 
@@ -26,9 +26,9 @@ Array = NDArray[np.float64]
 FORMAT = 2
 """Version 1 had no reference and no statistics of sensors and modules; it is still read."""
 SUFFIX = ".profile.json"
-"""Of the file beside a shipped checkpoint."""
+"""Of the file beside a pretrained checkpoint."""
 SENSORS_SUFFIX = ".sensors.json"
-"""Of the file of a task: ``statistics`` and ``reference`` of the profiles of all its shipped filters."""
+"""Of the file of a task: ``statistics`` and ``reference`` of the profiles of all its pretrained filters."""
 
 DIGITS = 3
 """Significant digits of stored values, whose rounding is small against the differences between trajectories."""
@@ -91,42 +91,42 @@ def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Chec
 
 
 def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> Any:
-    """JSON of a profile: beside the shipped checkpoint of this hash, else in its header; None without either.
+    """JSON of a profile: beside the pretrained checkpoint of this hash, else in its header; None without either.
 
-    The file beside a shipped checkpoint is measured again when statistics are added, its header is not.
+    The file beside a pretrained checkpoint is measured again when statistics are added, its header is not.
     """
     own = checkpoint.healthy_profile if isinstance(checkpoint, Checkpoint) else None
-    return _beside_shipped(task, filter_, checkpoint_hash) or own
+    return _beside_pretrained(task, filter_, checkpoint_hash) or own
 
 
 def included_reference(task: Task) -> Reference | None:
-    """Healthy images of a task with shipped filters; None without any."""
-    image = _sensors_of_shipped(task.name)["reference"]
+    """Healthy images of a task with pretrained filters; None without any."""
+    image = _sensors_of_pretrained(task.name)["reference"]
     return None if image is None else Reference.from_json(image)
 
 
-def _beside_shipped(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
-    """JSON of the profile in the file beside the shipped checkpoint of this hash."""
-    document = _file_beside_shipped(task, filter_)
+def _beside_pretrained(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
+    """JSON of the profile in the file beside the pretrained checkpoint of this hash."""
+    document = _file_beside_pretrained(task, filter_)
     return document["healthy_profile"] if document and document["checkpoint"] == checkpoint_hash else None
 
 
-@lru_cache(maxsize=4)  # shipped files do not change; reading one takes 2 ms
-def _file_beside_shipped(task: str, filter_: str) -> dict[str, Any] | None:
+@lru_cache(maxsize=4)  # files of pretrained filters do not change; reading one takes 2 ms
+def _file_beside_pretrained(task: str, filter_: str) -> dict[str, Any] | None:
     try:
-        path = shipped(task, filter_)
+        path = pretrained_path(task, filter_)
     except BadInput:
         return None
     path = path.with_name(path.stem + SUFFIX)
     if not path.is_file():
         return None
-    document, sensors = json.loads(path.read_text()), _sensors_of_shipped(task)
+    document, sensors = json.loads(path.read_text()), _sensors_of_pretrained(task)
     profile = document["healthy_profile"]
     profile |= {"statistics": profile["statistics"] | sensors["statistics"], "reference": sensors["reference"]}
     return document
 
 
 @lru_cache(maxsize=4)
-def _sensors_of_shipped(task: str) -> dict[str, Any]:
+def _sensors_of_pretrained(task: str) -> dict[str, Any]:
     path = PRETRAINED / (task + SENSORS_SUFFIX)
     return json.loads(path.read_text()) if path.is_file() else {"statistics": {}, "reference": None}

@@ -8,7 +8,7 @@ from typing import Any
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.names import is_code
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.traces.data import Trace
@@ -33,7 +33,7 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
 
     Args:
         files: of the traces, for messages.
-        filter_: name or path of the filter; if empty, the built-in filter with the traces' checkpoint hash.
+        filter_: name or path of the filter; if empty, the pretrained filter with the traces' checkpoint hash.
 
     Raises:
         BadInput: the traces are of different checkpoints, or not of the given filter.
@@ -49,7 +49,7 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
             raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}{own}")
         return checkpoint
     try:
-        checkpoint = load_checkpoint(shipped(first.task, first.filter))
+        checkpoint = load_checkpoint(pretrained_path(first.task, first.filter))
     except BadInput:
         return None
     return checkpoint if checkpoint.hash == first.checkpoint_hash else None

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def serve_command(filters: Iterable[str | Path], data: Path | None, seed: int) -> str:
-    """The command that serves these filters and data in addition to the built-in ones."""
+    """The command that serves these filters and data in addition to the pretrained filters and sample data."""
     words = ["beliefscope", "serve", *_options("--data", [data] if data else []), *_options("--filter", filters)]
     return shlex.join([*words, *_options("--seed", [seed] if seed else [])])
 

@@ -15,7 +15,7 @@ from beliefscope.datasets.episode_check import check_episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import Faults, read_faults
 from beliefscope.datasets.task import Task
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.evaluate import Metrics, evaluate as evaluate_filter
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
@@ -68,7 +68,7 @@ def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkp
         return as_external(source, kind, task, name=name or kind)
     if is_code(source):
         return load_external(source, task)
-    return load_checkpoint(_shipped(source))
+    return load_checkpoint(_pretrained_path(source))
 
 
 def open_dataset(source: str | Path | Sequence[Episode], task: Task | None = None) -> Dataset:
@@ -321,7 +321,7 @@ def sweep(
         all_episodes: whether to run over training episodes as well. workers: processes.
     """
     sources = [str((f.path or f.name) if isinstance(f, Checkpoint) else f) for f in filters]
-    files = tuple(Path(f) if f.endswith(".safetensors") else _shipped(f) for f in sources)
+    files = tuple(Path(f) if f.endswith(".safetensors") else _pretrained_path(f) for f in sources)
     sets = tuple(store.sample_path(str(d)) if str(d) in TASKS else Path(d).resolve() for d in data)
     inputs = Inputs(files, sets, tuple(faults), tuple(range(seeds)), particles, all_episodes)
     target = Path(folder)
@@ -355,7 +355,7 @@ def serve(
     workspace: str | Path = "workspace",
     port: int = 8000,
 ) -> None:
-    """Serve the dashboard on this machine until interrupted: all included filters and data, and these ones.
+    """Serve the dashboard on this machine until interrupted: all pretrained filters, sample data, and these ones.
 
     Args:
         filters: checkpoint files, or filters of your own (``load_filter``), which run in this process only.
@@ -373,12 +373,12 @@ def serve(
     serve_until_signal(settings, port=port)
 
 
-def _shipped(text: str) -> Path:
+def _pretrained_path(text: str) -> Path:
     """File of a pretrained filter, ``TASK/NAME``."""
     task, _, name = text.partition("/")
     if not name or is_code(text):
         raise BadInput(f"filter {text!r} is neither TASK/NAME, such as door/crossmodal-pf, nor a .safetensors file")
-    return shipped(task, name)
+    return pretrained_path(task, name)
 
 
 def _filter(filter_: object, data: Data) -> Checkpoint:

@@ -21,7 +21,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import Trace
 
 SEED = 7
@@ -35,7 +35,7 @@ def episodes() -> list[Episode]:
 
 @pytest.fixture(scope="module")
 def originals() -> dict[str, Checkpoint]:
-    return {name: load_checkpoint(shipped("push", name)) for name in ("crossmodal-ekf", "crossmodal-pf")}
+    return {name: load_checkpoint(pretrained_path("push", name)) for name in ("crossmodal-ekf", "crossmodal-pf")}
 
 
 def faulty(original: Checkpoint, cause: str, magnitude: float, episodes: list[Episode]) -> Checkpoint:

@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from store_bfloat16 import VALUES, halve
 
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 
 
 def test_matrices_are_rounded_and_nothing_else_changes(tmp_path: Path) -> None:
-    original = shipped("push", "crossmodal-ekf")
+    original = pretrained_path("push", "crossmodal-ekf")
     path = tmp_path / original.name
     path.write_bytes(original.read_bytes())
     halve(path)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import shipped
+from beliefscope.filters.checkpoint import pretrained_path
 from beliefscope.inspect.sweep import Cell, Inputs
 from beliefscope.recordings.sweep_table import Experiments, run_sweep
 
@@ -25,7 +25,7 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path:
 
     paths = []
     for width, name in enumerate(("image-ekf", "haptics-ekf")):
-        paths.append(Path(shutil.copy(shipped("door", name), tmp_path / f"{name}.safetensors")))
+        paths.append(Path(shutil.copy(pretrained_path("door", name), tmp_path / f"{name}.safetensors")))
         paths[-1].with_suffix(".json").write_text(
             json.dumps({"width": width, "run": f"https://tracker.example/{name}"})
         )

@@ -10,13 +10,13 @@ import pytest
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.interactive.export import write_interactive
 
 
 def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
-    checkpoint = load_checkpoint(shipped("push", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("push", "crossmodal-ekf"))
     with open_dataset(sample_path("push")) as data:
         run = trace(checkpoint, data[29], 29, faults=Faults.parse("blackout=0.4"))
     write_interactive(run, tmp_path / "run.html", checkpoint, 21)
@@ -71,8 +71,8 @@ def test_widget_shares_its_cursor(context: Any) -> None:
     from beliefscope.recordings.interactive.widget import RunWidget  # imports IPython
 
     with open_dataset(sample_path("push")) as data:
-        run = trace(load_checkpoint(shipped("push", "crossmodal-ekf")), data[29], 29)
-    widget = RunWidget(run, load_checkpoint(shipped("push", "crossmodal-ekf")), 21)
+        run = trace(load_checkpoint(pretrained_path("push", "crossmodal-ekf")), data[29], 29)
+    widget = RunWidget(run, load_checkpoint(pretrained_path("push", "crossmodal-ekf")), 21)
     traits = {name: getattr(widget, name) for name in ("_esm", "_run", "_body", "_style", "step")}
     page = context.new_page()
     problems: list[str] = []

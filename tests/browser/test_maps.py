@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.maps.map_engine import LikelihoodMap, MapEngine
 from beliefscope.inspect.maps.map_statistics import measure_maps
 from beliefscope.inspect.maps.shape import SHAPES
@@ -24,7 +24,7 @@ LINK = f"?filter=crossmodal-pf&step={STEP}&tab=diagnostics"
 
 @pytest.fixture(scope="module")
 def engine() -> MapEngine:
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
     return MapEngine(checkpoint, trace(checkpoint, episode, episode_index=9))

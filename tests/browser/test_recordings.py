@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording
 
@@ -27,7 +27,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         index = data.held_out()[0]
     paths = []
     for name in ("crossmodal-ekf", "image-ekf"):
-        run = trace(load_checkpoint(shipped("push", name)), episode, episode_index=index, seed=0)
+        run = trace(load_checkpoint(pretrained_path("push", name)), episode, episode_index=index, seed=0)
         paths.append(write_recording(run, folder / f"{name} of mine.rrd"))
     return paths
 

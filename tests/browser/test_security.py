@@ -10,7 +10,7 @@ import h5py
 import pytest
 
 from beliefscope.datasets.store import sample_path
-from beliefscope.filters.checkpoint import shipped
+from beliefscope.filters.checkpoint import pretrained_path
 
 MARKUP = "<img src=x onerror=window.hacked=1>"
 
@@ -24,7 +24,7 @@ def test_access_link_opens_a_read_only_page_with_names_as_text(
     with h5py.File(data, "r+") as file:
         for group in file.values():
             group.attrs["provenance"] = group.attrs["provenance"].replace("push", "<b onload=hacked=1>")
-    shutil.copy(shipped("door", "crossmodal-ekf"), checkpoint)
+    shutil.copy(pretrained_path("door", "crossmodal-ekf"), checkpoint)
     server = start_server("--token", "--read-only", "--data", str(data), "--filter", str(checkpoint))
     address, _, token = server.url.partition("?token=")
 

@@ -23,7 +23,7 @@ def test_file_size(task: str) -> None:
 
 
 def test_all_episodes_are_for_testing(episodes: list[Episode]) -> None:
-    """Of seed 2: the shipped filters of field tasks are trained on seed 0 and measured on seed 1."""
+    """Of seed 2: the pretrained filters of field tasks are trained on seed 0 and measured on seed 1."""
     assert [(e.seed, e.provenance["spawn_index"], e.split, len(e)) for e in episodes] == [
         (2, index, "test", 200) for index in range(40)
     ]

@@ -12,7 +12,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.initial_view import initial_view, outage_in_first_contact
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import trace
 
 
@@ -67,7 +67,7 @@ def test_first_moment_of_a_data_set(base: Episode, tmp_path: Path) -> None:
 
 
 def test_share_passes_from_image_to_haptics_at_the_first_moment_of_the_samples() -> None:
-    checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
         index, step = initial_view(data)
         run = trace(checkpoint, data[index], index)

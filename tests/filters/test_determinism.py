@@ -15,7 +15,7 @@ import torch
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import run
 from beliefscope.inspect.trace import save_trace, trace
 
@@ -42,7 +42,8 @@ def threads() -> Iterator[None]:
 def write_trace(name: str, path: Path) -> bytes:
     """The file of a trace of a pretrained filter."""
     with open_dataset(sample_path("door")) as data:
-        save_trace(trace(load_checkpoint(shipped("door", name)), data[9], episode_index=9, seed=5, particles=100), path)
+        filter_ = load_checkpoint(pretrained_path("door", name))
+        save_trace(trace(filter_, data[9], episode_index=9, seed=5, particles=100), path)
     return path.read_bytes()
 
 
@@ -51,7 +52,7 @@ def test_repeated_runs_are_identical_and_threads_only_change_rounding(
     name: str, tmp_path: Path, short_episodes: Callable[..., list[Episode]]
 ) -> None:
     assert write_trace(name, tmp_path / "one") == write_trace(name, tmp_path / "again")
-    filter_, episodes = load_checkpoint(shipped("door", name)).filter, short_episodes("door", [9], 25)
+    filter_, episodes = load_checkpoint(pretrained_path("door", name)).filter, short_episodes("door", [9], 25)
     batch, errors = Steps.from_episodes(filter_.task, episodes).episode(0), []
     for threads in (1, 2):  # two wait for each other while other programs run: few steps. A trace always uses one.
         torch.set_num_threads(threads)

@@ -16,7 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate, metrics, nees_bounds
 from beliefscope.filters.external.load import as_external
 from beliefscope.filters.filter import Filter
@@ -81,7 +81,7 @@ def test_metrics_do_not_depend_on_the_number_of_processes(monkeypatch: pytest.Mo
     monkeypatch.setattr("beliefscope.filters.evaluate.BLOCK", 2)
     with open_dataset(sample_path("push")) as dataset:
         episodes = [shortened(dataset[i], 36 if i == 0 else 40) for i in range(4)]
-    filter_ = load_checkpoint(shipped("push", "crossmodal-pf")).filter
+    filter_ = load_checkpoint(pretrained_path("push", "crossmodal-pf")).filter
     shares: list[float] = []
     serial, parallel = (
         evaluate(filter_, episodes, particles=20, baselines=True, modalities=True, workers=n, progress=shares.append)
@@ -262,7 +262,7 @@ def test_squares_give_the_rmse() -> None:
 
 
 def test_updates_and_standalone_filters_are_reported_separately() -> None:
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as dataset:
         episodes = [dataset[i] for i in dataset.held_out()[:3]]
     document = evaluate(checkpoint.filter, episodes, modalities=True).to_dict()

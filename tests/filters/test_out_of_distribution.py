@@ -14,8 +14,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.alignment import align, move
-from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.out_of_distribution import _shipped_summaries, data_warning, summarise, summary_key
+from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, pretrained_path
+from beliefscope.filters.out_of_distribution import _pretrained_summaries, data_warning, summarise, summary_key
 
 TASKS = ("door", "push")
 
@@ -27,12 +27,12 @@ def task(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def checkpoint(task: str) -> Checkpoint:
-    return load_checkpoint(shipped(task, "crossmodal-ekf"))
+    return load_checkpoint(pretrained_path(task, "crossmodal-ekf"))
 
 
 @pytest.fixture(scope="module")
 def fresh(task: str) -> list[Episode]:
-    """The 50 test episodes of seed 2: the shipped filters were trained on seed 1, the summary is of seed 0."""
+    """The 50 test episodes of seed 2: the pretrained filters were trained on seed 1, the summary is of seed 0."""
     with open_dataset(sample_path(task)) as data:
         return [data[index] for index in range(140, 190)]
 
@@ -123,14 +123,14 @@ def test_offset_that_is_not_constant(checkpoint: Checkpoint, fresh: list[Episode
         align(checkpoint, moved)
 
 
-def test_shipped_summaries_are_of_the_sample_sets() -> None:
+def test_pretrained_summaries_are_of_the_sample_sets() -> None:
     """As printed by the function that writes the record of new checkpoints, and available to every simulated filter."""
     for task in TASKS:
         with open_dataset(sample_path(task)) as data:
             episodes = [data[s.index] for s in data.summaries if s.split == "train"]
-        statistics = load_checkpoint(shipped(task, "crossmodal-ekf")).filter.statistics
-        summary = _shipped_summaries()[summary_key(statistics)]
+        statistics = load_checkpoint(pretrained_path(task, "crossmodal-ekf")).filter.statistics
+        summary = _pretrained_summaries()[summary_key(statistics)]
         assert summary == {"task": task, **summarise(statistics, find_task(task), episodes)}
         for path in PRETRAINED.glob(f"{task}-*.safetensors"):
             if not any(other in path.name for other in ("real", "field")):  # whose records have it
-                assert summary_key(load_checkpoint(path).filter.statistics) in _shipped_summaries()
+                assert summary_key(load_checkpoint(path).filter.statistics) in _pretrained_summaries()

@@ -14,7 +14,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, DeferredCheckpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, DeferredCheckpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.trace import trace
 
@@ -33,7 +33,7 @@ NAMES = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
 def test_loading_does_not_import_the_compiler() -> None:
     code = (
         "import sys; from beliefscope.filters.checkpoint import *; "
-        "[load_checkpoint(shipped('door', f'crossmodal-{kind}')) for kind in ('ekf', 'pf')]; "
+        "[load_checkpoint(pretrained_path('door', f'crossmodal-{kind}')) for kind in ('ekf', 'pf')]; "
         "assert 'torch._dynamo' not in sys.modules, 'its import takes seconds'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
@@ -93,7 +93,7 @@ def test_blackout_reduces_the_weight_of_the_image(checkpoint: Checkpoint, held_o
 
 
 def test_a_deferred_checkpoint_equals_the_loaded_one() -> None:
-    path = shipped("door", "crossmodal-ekf")
+    path = pretrained_path("door", "crossmodal-ekf")
     deferred, loaded = DeferredCheckpoint(path), load_checkpoint(path)
     for name in ("name", "hash", "record", "healthy_profile", "task", "kind"):
         assert getattr(deferred, name) == getattr(loaded, name), name
@@ -108,6 +108,6 @@ def test_a_deferred_checkpoint_equals_the_loaded_one() -> None:
 
 def test_a_deferred_checkpoint_checks_its_header(tmp_path: Path) -> None:
     path = tmp_path / "damaged.safetensors"
-    path.write_bytes(shipped("door", "crossmodal-ekf").read_bytes()[:1000])
+    path.write_bytes(pretrained_path("door", "crossmodal-ekf").read_bytes()[:1000])
     with pytest.raises(BadInput, match="not a readable safetensors file"):
         DeferredCheckpoint(path)

@@ -36,7 +36,7 @@ from beliefscope.datasets.faults.injection import FAULT_PRESETS, Faults
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.resume import Partial
 from beliefscope.filters.training.study import Cell
@@ -73,7 +73,7 @@ def read_push(path: Path) -> None:
 
 @cache
 def checkpoint(name: str) -> Checkpoint:
-    return load_checkpoint(shipped("door", name))
+    return load_checkpoint(pretrained_path("door", name))
 
 
 @cache
@@ -188,7 +188,7 @@ def read_job(path: Path) -> None:
 
 
 def write_saved_filters(path: Path) -> None:
-    saved = saved_filters.SavedFilter("door", "mine", str(shipped("door", "image-ekf")), True)
+    saved = saved_filters.SavedFilter("door", "mine", str(pretrained_path("door", "image-ekf")), True)
     path.write_text(json.dumps([asdict(saved)]))
 
 
@@ -236,7 +236,7 @@ def read_finetune(path: Path) -> None:
         (folder / f"{name}.json").write_text(json.dumps(content))
     if path.with_suffix(".name").exists():
         shutil.copy(path, folder / f"{path.with_suffix('.name').read_text()}.json")
-    shutil.copy(shipped("door", "haptics-ekf"), folder / "finetuned.safetensors")
+    shutil.copy(pretrained_path("door", "haptics-ekf"), folder / "finetuned.safetensors")
     response = client.get("/api/tuned/run")
     if response.is_error:
         raise BadInput(response.text)

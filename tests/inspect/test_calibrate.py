@@ -11,7 +11,7 @@ from scipy.special import chdtri, ndtri
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.calibrate import calibrate
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -24,7 +24,7 @@ FACTOR = 4.0
 @pytest.fixture(scope="module")
 def traces() -> list[Trace]:
     """Errors are Gaussian; the fused covariance is too small by ``FACTOR``, those of the modalities are correct."""
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         (first,) = trace_all(checkpoint, data, [0])
     rng, true = np.random.default_rng(0), np.diag(SIGMA**2).astype(np.float32)

@@ -18,7 +18,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Component, Task
 from beliefscope.datasets.task_json import task_from_json, task_to_json
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
@@ -224,7 +224,7 @@ def test_start_offsets_have_the_unit_of_the_component() -> None:
 
 def test_rows_of_sweeps_have_the_error_of_the_main_component() -> None:
     """The main error is that of the first of two components: its key is also that of the component."""
-    door = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    door = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         run = trace(door, data[9], 9)
     task_ = replace(run.task, map_components=("hinge_x",))

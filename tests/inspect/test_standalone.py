@@ -17,7 +17,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.rollout import rollout
 from beliefscope.filters.subsets import standalone_evidence
@@ -121,7 +121,7 @@ def test_other_observations_and_weights_have_no_effect(name: str, episode: Episo
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_haptics_update_of_the_door_is_not_the_haptics_filter(name: str) -> None:
     """The shared prior carries the image: labelled as haptics, the update hides what haptics is worth."""
-    checkpoint = load_checkpoint(shipped("door", name))
+    checkpoint = load_checkpoint(pretrained_path("door", name))
     with open_dataset(sample_path("door")) as data:
         runs = [trace(checkpoint, data[i], i, particles=100) for i in data.held_out()[:4]]
 

@@ -22,7 +22,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.readers import episode_file
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import run as run_batch
 from beliefscope.inspect.diagnostics import particle_health
 from beliefscope.inspect.standalone import standalone
@@ -51,7 +51,7 @@ def episode() -> Episode:
 
 @pytest.fixture(scope="module", params=("crossmodal-ekf", "crossmodal-pf"))
 def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
-    return load_checkpoint(shipped("door", request.param))
+    return load_checkpoint(pretrained_path("door", request.param))
 
 
 def test_runs_over_one_episode_use_one_thread(checkpoint: Checkpoint, traced: Trace, episode: Episode) -> None:
@@ -181,7 +181,7 @@ def test_invalid_trace_files(traced: Trace, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="not a readable trace"):
         load_trace(truncated)
     with pytest.raises(BadInput, match="not a Beliefscope trace"):
-        load_trace(shipped("door", "crossmodal-pf"))
+        load_trace(pretrained_path("door", "crossmodal-pf"))
     with pytest.raises(BadInput, match=r"folder .* does not exist"):
         save_trace(traced, tmp_path / "no" / "folder.trace")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.trace", "whole.trace"]
@@ -200,7 +200,7 @@ def test_names_of_an_earlier_version(traced: Trace) -> None:
 @pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door-field/information-ekf", "push-field/information-ekf"])
 def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     task, filter_name = name.split("/")
-    checkpoint = load_checkpoint(shipped(task, filter_name))
+    checkpoint = load_checkpoint(pretrained_path(task, filter_name))
     with open_dataset(sample_path(task)) as dataset:
         episode = dataset[dataset.held_out()[0]]
     whole = trace(checkpoint, episode)
@@ -212,7 +212,7 @@ def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.
 
 
 def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     whole = trace(checkpoint, episode, particles=2000)
     monkeypatch.setattr(run_module, "PARTICLES_AT_ONCE", 7 * 2000)
     sample = trace(checkpoint, episode, particles=2000, particles_kept=200)
@@ -251,7 +251,7 @@ def test_trace_in_parts_has_the_same_bytes(name: str, tmp_path: Path, monkeypatc
         monkeypatch.setattr(module, "STEPS_PER_PART", 30)
     path = tmp_path / "long.h5"
     write_dataset(path, episode.task, [episode])
-    checkpoint = load_checkpoint(shipped(task, filter_name))
+    checkpoint = load_checkpoint(pretrained_path(task, filter_name))
     settings = {"seed": 3, "particles": 40, "particles_kept": 11}
     save_trace(trace(checkpoint, episode, 0, **settings), tmp_path / "whole.trace")
     progress: list[float] = []
@@ -285,7 +285,7 @@ def test_modified_parts_are_refused(episode: Episode, tmp_path: Path, monkeypatc
     write_dataset(path, episode.task, [episode])
     with h5py.File(path, "r+") as file:
         file["trajectory0/states"][40] += np.float32(0.1)
-    checkpoint = load_checkpoint(shipped("door", "haptics-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "haptics-ekf"))
     with open_dataset(path) as dataset:
         parts = dataset.in_parts(0)
         assert isinstance(parts, EpisodeParts)

@@ -19,7 +19,7 @@ from beliefscope.app.cli.main import main
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.trace import Trace, arrays_of, load_trace, save_trace, trace
 from beliefscope.recordings.export import export_trace
@@ -36,7 +36,7 @@ def run(request: pytest.FixtureRequest) -> Trace:
     task, name = request.param.split()
     with open_dataset(sample_path(task)) as data:
         faults = Faults.parse("blackout=0.3")
-        return trace(load_checkpoint(shipped(task, name)), data[9], 9, particles=40, faults=faults)
+        return trace(load_checkpoint(pretrained_path(task, name)), data[9], 9, particles=40, faults=faults)
 
 
 def array_of(trace_: Trace, name: str) -> Any:

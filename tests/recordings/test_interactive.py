@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, save_trace, trace
@@ -28,13 +28,13 @@ SIZE = 21
 @pytest.fixture(scope="module")
 def run_() -> Trace:
     with open_dataset(sample_path("door")) as data:
-        return trace(load_checkpoint(shipped("door", "crossmodal-ekf")), data[9], 9)
+        return trace(load_checkpoint(pretrained_path("door", "crossmodal-ekf")), data[9], 9)
 
 
 @pytest.fixture(scope="module")
 def page(run_: Trace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "run.html"
-    write_interactive(run_, path, load_checkpoint(shipped("door", "crossmodal-ekf")), SIZE)
+    write_interactive(run_, path, load_checkpoint(pretrained_path("door", "crossmodal-ekf")), SIZE)
     return path
 
 
@@ -65,7 +65,7 @@ def test_maps_equal_those_of_the_engine(run_: Trace, page: Path) -> None:
     data = np.frombuffer(base64.b64decode(maps["data"]), np.uint8).reshape(-1, *maps["shape"])
     assert len(data) == len(run_)
     assert data.size <= MAP_BYTES
-    engine = MapEngine(load_checkpoint(shipped("door", "crossmodal-ekf")), run_)
+    engine = MapEngine(load_checkpoint(pretrained_path("door", "crossmodal-ekf")), run_)
     for step in (0, 57):
         np.testing.assert_array_equal(data[step], engine.map(step, size=SIZE).normalised())
     assert maps["reach"] == pytest.approx([100.0 * run_.task.map_half_width] * 2)

@@ -19,7 +19,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader
 from beliefscope.inspect.traces.run import start_run
@@ -51,7 +51,7 @@ def episode() -> Episode:
 
 @pytest.fixture(params=["crossmodal-ekf", "crossmodal-pf"])
 def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
-    return load_checkpoint(shipped("door", request.param))
+    return load_checkpoint(pretrained_path("door", request.param))
 
 
 @torch.no_grad()
@@ -109,7 +109,7 @@ def test_layout_of_a_long_recording_uses_a_subset_of_steps(
     episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(write, "LAYOUT_STEPS", 10)
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     recorder = run_live(checkpoint, episode, tmp_path)
     reference = write_recording(trace(checkpoint, episode, 9, 3, 25, BLACKOUT), tmp_path / "reference.rrd")
     assert repr(content(recorder.path.with_suffix(".rrd"))) == repr(content(reference))

@@ -18,7 +18,7 @@ import pytest
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.sweep import Inputs, describe_checkpoint, summary
 from beliefscope.inspect.trace import trace
@@ -38,7 +38,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     with open_dataset(sample_path("door")) as sample:
         write_dataset(folder / "door.h5", sample.task, [sample[i] for i in sample.held_out()[:EPISODES]])
     for name in FILTERS:
-        shutil.copyfile(shipped("door", name), folder / f"{name}.safetensors")
+        shutil.copyfile(pretrained_path("door", name), folder / f"{name}.safetensors")
     (folder / f"{FILTERS[0]}.json").write_text('{"run": "https://tracker.example/7", "lr": 0.001}')
     checkpoints = tuple(folder / f"{name}.safetensors" for name in FILTERS)
     return Inputs(checkpoints, (folder / "door.h5",), ("", "blackout=0.4"), (0,), PARTICLES)
@@ -93,7 +93,7 @@ def test_phases_partition_the_steps(sweep: Path) -> None:
 
 def test_a_row_leads_to_its_trace(sweep: Path) -> None:
     experiments = Experiments([sweep])
-    checkpoint = load_checkpoint(shipped("door", "image-pf")).hash
+    checkpoint = load_checkpoint(pretrained_path("door", "image-pf")).hash
     rows = experiments.query(
         "SELECT * FROM results WHERE checkpoint = ? AND episode = 3 AND faults <> '' ORDER BY phase", [checkpoint]
     ).to_pylist()
@@ -146,7 +146,7 @@ def test_provenance_of_checkpoints(sweep: Path) -> None:
 
 def test_queries_find_any_text_of_the_provenance(tmp_path: Path) -> None:
     provenance = {"operator": "Müller", "broken": "\ud800", "path": "C:\\runs"}
-    path = Path(shutil.copy(shipped("door", "image-ekf"), tmp_path / "a.safetensors"))
+    path = Path(shutil.copy(pretrained_path("door", "image-ekf"), tmp_path / "a.safetensors"))
     path.with_suffix(".json").write_text(json.dumps(provenance))
     row = describe_checkpoint(path)
     assert "Müller" in row["provenance"]
@@ -249,7 +249,7 @@ def test_a_deleted_file_of_a_cell_or_checkpoint_is_named(inputs: Inputs, sweep: 
 def test_unusable_inputs(inputs: Inputs, run: Run, tmp_path: Path) -> None:
     code, _, error = run(f"sweep --checkpoints {tmp_path}/*.safetensors -o {tmp_path / 'sweep'}")
     assert (code, "no checkpoint (.safetensors) matches" in error) == (2, True)
-    push = shipped("push", "image-ekf")
+    push = pretrained_path("push", "image-ekf")
     code, _, error = run(f"sweep --checkpoints {push} --data {inputs.data[0]} -o {tmp_path / 'sweep'}")
     assert (code, "fit no checkpoint; their tasks are push" in error) == (2, True)
     assert not (tmp_path / "sweep").exists()
@@ -292,7 +292,7 @@ def test_low_coverage_is_the_worst(sweep: Path) -> None:
 def test_sweeps_of_different_tasks_are_joined(sweep: Path, tmp_path: Path) -> None:
     with open_dataset(sample_path("push")) as sample:
         write_dataset(tmp_path / "push.h5", sample.task, [sample[sample.held_out()[0]]])
-    run_sweep(Inputs((shipped("push", "image-ekf"),), (tmp_path / "push.h5",)).cells(), tmp_path / "push")
+    run_sweep(Inputs((pretrained_path("push", "image-ekf"),), (tmp_path / "push.h5",)).cells(), tmp_path / "push")
     rows = Experiments([sweep, tmp_path / "push"]).query(
         "SELECT task, max(hinge_x_cm) AS hinge, max(x_cm) AS puck FROM results GROUP BY task ORDER BY task"
     )
@@ -303,7 +303,7 @@ def test_sweeps_of_different_tasks_are_joined(sweep: Path, tmp_path: Path) -> No
 
 
 def test_rows_have_the_time_of_the_worst_step() -> None:
-    filter_ = load_checkpoint(shipped("door", "image-ekf"))
+    filter_ = load_checkpoint(pretrained_path("door", "image-ekf"))
     with open_dataset(sample_path("door")) as sample:
         episode = sample[0]
     times = np.linspace(0.0, 3.0, len(episode)) ** 2
@@ -320,7 +320,8 @@ def test_results_have_the_time_of_the_worst_step(sweep: Path, tmp_path: Path) ->
         episodes = [replace(episode, time=times), sample[1]]
         write_dataset(tmp_path / "timed.h5", sample.task, episodes)
     folder = tmp_path / "timed"
-    run_sweep(Inputs((shipped("door", "image-ekf"),), (tmp_path / "timed.h5",), all_episodes=True).cells(), folder)
+    filters, data = (pretrained_path("door", "image-ekf"),), (tmp_path / "timed.h5",)
+    run_sweep(Inputs(filters, data, all_episodes=True).cells(), folder)
     experiments = Experiments([folder])
     (row,) = experiments.overview().to_pylist()
     by_episode = experiments.episodes(row["checkpoint"], row["data"]).to_pylist()

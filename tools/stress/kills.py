@@ -39,7 +39,7 @@ from beliefscope.datasets.simulation.collect import collect
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.filters.catalog import architecture
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.module_selection import digest
@@ -77,7 +77,7 @@ class Kind:
 
 @cache
 def base_checkpoint() -> Checkpoint:
-    return load_checkpoint(shipped("door", "crossmodal-pf"))
+    return load_checkpoint(pretrained_path("door", "crossmodal-pf"))
 
 
 @cache

@@ -8,10 +8,10 @@ def demo(
     port: int = opt.option("N", "Port; 0 selects a free one.", 0, parser=opt.integer(0, 65535)),
     open_page: bool = opt.flag("Open the dashboard in a browser.", "--open/--no-open", default=True),
 ) -> None:
-    """Open the dashboard on the included example.
+    """Open the dashboard on an example.
 
-    Serves the included filters and episodes from a temporary workspace, which is deleted at the end, and opens the page
-    in a browser: the camera goes dark while a robot pushes a puck. Stop it with Ctrl-C. Your own filters and
+    Serves the pretrained filters and the sample data from a temporary workspace, which is deleted at the end, and opens
+    the page in a browser: the camera goes dark while a robot pushes a puck. Stop it with Ctrl-C. Your own filters and
     data: beliefscope serve.
 
     \b

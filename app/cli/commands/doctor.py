@@ -10,7 +10,7 @@ def doctor(
 ) -> console.Result:
     """Check the installation and suggest fixes.
 
-    Checks packages and their versions, PyTorch, the simulation and its camera, hashes of the built-in filters and
+    Checks packages and their versions, PyTorch, the simulation and its camera, hashes of the pretrained filters and
     data, files of the dashboard, the port, the workspace and free disk space. Exits with 1 if a required check fails.
     The JSON output is meant for bug reports and contains no user names.
 

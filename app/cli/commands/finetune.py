@@ -82,7 +82,7 @@ def finetune(
     output: Path = opt.CHECKPOINT,
     filter: str | None = opt.option(
         "NAME|FILE",
-        "Name of a built-in filter, .safetensors file, or build function of an external filter (FILE.py:NAME).",
+        "Name of a pretrained filter, .safetensors file, or build function of an external filter (FILE.py:NAME).",
         None,
     ),
     learning: Learning,

@@ -15,8 +15,8 @@ def mcp(
     """Answer an assistant's questions about runs.
 
     A server of the Model Context Protocol on standard input and output, started by the assistant. Its tools explain a
-    run, list the worst events, diagnose faults, read values and draw figures, for the included filters and data and
-    those given here. It only reads, and opens no network connection. Needs: pip install 'beliefscope[mcp]'.
+    run, list the worst events, diagnose faults, read values and draw figures, for the pretrained filters, the sample
+    data and those given here. It only reads, and opens no network connection. Needs: pip install 'beliefscope[mcp]'.
 
     \b
     Examples:

@@ -46,8 +46,8 @@ def serve(
 ) -> None:
     """Serve the dashboard: replay, maps and weights.
 
-    Serves the built-in filters and episodes and any others given. Prints the address once the server listens; stop it
-    with Ctrl-C. To use the dashboard from another machine, keep the default host and forward the port: ssh -L
+    Serves the pretrained filters and the sample data, and any others given. Prints the address once the server listens;
+    stop it with Ctrl-C. To use the dashboard from another machine, keep the default host and forward the port: ssh -L
     8000:127.0.0.1:8000 MACHINE. Alternatively, --host makes the server reachable directly; the printed address then
     contains the required token. Set BELIEFSCOPE_TOKEN in the environment to choose the token. Security:
     docs/security.md; long-running servers: docs/operations.md.
@@ -66,7 +66,7 @@ def serve(
     from beliefscope.app.runs.settings import Settings
     from beliefscope.app.server import logs
     from beliefscope.app.server.auth import Access, host_names, token_for
-    from beliefscope.app.workspace.studies import SHIPPED, Study
+    from beliefscope.app.workspace.studies import BUILT_IN, Study
 
     opt.check_workspace(workspace)
     access = Access(token_for(host, token, os.environ), read_only)
@@ -79,7 +79,7 @@ def serve(
         seed=seed,
         views=views,
         tasks=tuple(name for name in task or () if name not in opt.own_definitions(data or ())),
-        studies=short_names(study or (), {SHIPPED}),
+        studies=short_names(study or (), {BUILT_IN}),
         sweeps=short_names(sweep or ()),
     )
     for name, folder in settings.studies.items():

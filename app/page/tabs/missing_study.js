@@ -28,7 +28,7 @@ export function missingStudy(study, catalog, store) {
       button.addEventListener('click', () => store.set(firstRun(task, store.state)));
       return button;
     });
-  const source = study.name === 'shipped' ? 'included study' : `study ${study.name}`;
+  const source = study.name === 'shipped' ? 'built-in study' : `study ${study.name}`;
   return emptyNote({
     title: `No study of ${name} yet`,
     paragraphs: [

@@ -20,7 +20,7 @@ import { missingStudy } from './missing_study.js';
 import { blackoutLabel, failuresOf, startLabel, studyQuantities } from './study_quantities.js';
 import { StudyTable } from './study_table.js';
 
-const SHIPPED = 'shipped'; // name of the study that comes with the software
+const BUILT_IN = 'shipped'; // its name in files and addresses
 const LEGEND =
   'Bars: mean over the seeds ± standard deviation, in the order and colours of the table. Dots: seeds; a click opens the ringed one.';
 
@@ -130,7 +130,7 @@ export class Study {
     const { state } = this.#store;
     const picker = element('select', HTMLSelectElement, this.#host);
     const options = this.#studies.map(
-      ({ name }) => new Option(name === SHIPPED ? 'included study' : name, name),
+      ({ name }) => new Option(name === BUILT_IN ? 'built-in study' : name, name),
     );
     picker.replaceChildren(...options);
     picker.value = study.name;

@@ -33,7 +33,7 @@ FAULTS = "image_frozen=5"
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory: pytest.TempPathFactory) -> Settings:
-    """Of a server with the included filters, which have healthy records."""
+    """Of a server with the pretrained filters, which have healthy records."""
     return Settings(workspace=tmp_path_factory.mktemp("workspace"))
 
 

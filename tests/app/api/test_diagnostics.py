@@ -1,4 +1,4 @@
-"""Diagnostics over HTTP, with built-in filters and episodes."""
+"""Diagnostics over HTTP, with pretrained filters and sample data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import VIEWS
@@ -93,7 +93,7 @@ def test_fast_diagnostic_equals_function_result(server: TestClient) -> None:
     answer = poll(server, url("consistency"))
     assert answer.status_code == 200, answer.text
     result = answer.json()
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         run = trace(checkpoint, data[EPISODE], EPISODE)
     expected = DIAGNOSTICS["consistency"]([run], checkpoint).views()
@@ -162,7 +162,7 @@ def test_slow_diagnostic_is_a_job(server: TestClient) -> None:
     assert server.post(url("maps"), params=quick).json()["job"]["id"] == job["id"]
     answer = poll(server, url("maps"), **quick)
     assert answer.status_code == 200, answer.text
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         run = trace(checkpoint, data[EPISODE], EPISODE)
     assert answer.json()["verdict"] == DIAGNOSTICS["maps"]([run], checkpoint, size=5).verdict

@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.sweep import Inputs
 from beliefscope.recordings.sweep_table import Experiments, run_sweep
 
@@ -23,14 +23,14 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of a shipped filter over the sample set and three further episodes, and of one of the user's own."""
+    """Results of a pretrained filter over the sample set and three further episodes, and of one of the user's own."""
     folder = tmp_path_factory.mktemp("sweep")
     with open_dataset(sample_path("door")) as sample:
         write_dataset(folder / "own.h5", sample.task, [sample[i] for i in sample.held_out()[:3]])
-    base = load_checkpoint(shipped("door", "image-ekf"))
+    base = load_checkpoint(pretrained_path("door", "image-ekf"))
     next(base.filter.parameters()).data *= 1.001
     save_checkpoint(base.filter, base.name, base.record, folder / "mine.safetensors")
-    checkpoints = (shipped("door", "image-ekf"), folder / "mine.safetensors")
+    checkpoints = (pretrained_path("door", "image-ekf"), folder / "mine.safetensors")
     run_sweep(Inputs(checkpoints, (folder / "own.h5",), ("", "blackout=0.4")).cells(), folder)
     return folder
 
@@ -62,7 +62,7 @@ def test_results(settings: Settings, sweep: Path, open_client: Callable[..., Tes
 
 
 def info_hash(name: str) -> str:
-    return load_checkpoint(shipped("door", name)).hash
+    return load_checkpoint(pretrained_path("door", name)).hash
 
 
 def test_checkpoints_are_added_to_the_catalog_once(
@@ -107,7 +107,7 @@ def test_names_of_checkpoints_are_valid_in_another_server(
         assert problems == []
         assert client.get("/api/trace/door/mine-00000000/0").status_code == 400
     try:
-        save_checkpoint(load_checkpoint(shipped("door", "image-ekf")).filter, "image-ekf", {}, file)
+        save_checkpoint(load_checkpoint(pretrained_path("door", "image-ekf")).filter, "image-ekf", {}, file)
         with open_client(new_server) as client:
             filters, (problem,) = catalog(client)
             assert name not in filters

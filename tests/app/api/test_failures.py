@@ -17,7 +17,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.survey_json import MAX_EVENTS
 from beliefscope.inspect.slices.report import find_slices
@@ -119,7 +119,7 @@ def test_slices_are_those_of_the_command(client: TestClient) -> None:
     result = wait_for_failures(client, url)
     (score,) = (score for score in result["scores"] if score["name"] == "error")
     with open_dataset(sample_path("push-field")) as data:
-        report = find_slices(load_checkpoint(shipped("push-field", "information-ekf")), data, data.held_out())
+        report = find_slices(load_checkpoint(pretrained_path("push-field", "information-ekf")), data, data.held_out())
     assert report.slices
     assert score["slices"]["summary"] == report.summary
     rows = score["slices"]["rows"]

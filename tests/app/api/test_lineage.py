@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from beliefscope.app.runs.saved_filters import SavedFilter, save_filter
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.finetuning.choices import choices
 
 pytestmark = pytest.mark.slow
@@ -76,7 +76,7 @@ def test_saved_filter_has_its_catalog_name(settings: Settings, client: TestClien
 
 
 def test_module_tree_shows_changes_of_fine_tuning() -> None:
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     names = [name for name, _ in checkpoint.filter.named_parameters() if name.startswith("weight_model")]
     changes = {name: [0.5, 0.1, 2.0] for name in names}
     options = choices(replace(checkpoint, record={**checkpoint.record, "parts": changes}))

@@ -20,7 +20,7 @@ from beliefscope.app.protocol.trace_format import columns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.failures.events import failures_of
 from beliefscope.inspect.failures.step_scores import Survey
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_from_arrays
@@ -43,7 +43,7 @@ def part(run: Trace, first: int, last: int) -> Trace:
 
 @pytest.fixture(scope="module", params=["crossmodal-ekf", "crossmodal-pf"])
 def full_trace(request: pytest.FixtureRequest) -> Trace:
-    checkpoint = load_checkpoint(shipped("door", request.param))
+    checkpoint = load_checkpoint(pretrained_path("door", request.param))
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
     fields = {name: getattr(episode, name)[:STEPS] for name in ("states", "controls", "contact", "qpos")}
@@ -53,7 +53,7 @@ def full_trace(request: pytest.FixtureRequest) -> Trace:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    """Built-in filters and data."""
+    """Pretrained filters and sample data."""
     return Settings(tmp_path / "workspace")
 
 

@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.study_filters import all_studies
-from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
+from beliefscope.app.workspace.studies import BUILT_IN, FILE, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
@@ -66,7 +66,7 @@ def find_study(client: TestClient, name: str) -> dict[str, Any]:
 
 def test_built_in_study(settings: Settings, open_client: Callable[..., TestClient]) -> None:
     with open_client(replace(settings, checkpoints={}, data={})) as client:
-        study = find_study(client, SHIPPED)
+        study = find_study(client, BUILT_IN)
     assert [task["name"] for task in study["tasks"]] == ["door", "push"]
     for task in study["tasks"]:
         names = {f["name"]: [seed["catalog_name"] for seed in f["trained"]] for f in task["filters"]}
@@ -148,10 +148,10 @@ def test_order_of_studies(settings: Settings, folder: Path, open_client: Callabl
     (workspace / "broken").mkdir()
     (workspace / "broken" / FILE).write_text("{}")
     names = [study.name for study in all_studies({"mine": folder, "again": workspace / "later"}, workspace)]
-    assert names == ["mine", "again", "broken", SHIPPED], "studies are listed once"
+    assert names == ["mine", "again", "broken", BUILT_IN], "studies are listed once"
     with open_client(replace(settings, studies={"mine": folder})) as client:
         answer = client.get("/api/studies").json()
-    assert [s["name"] for s in answer["studies"]] == ["mine", "later", SHIPPED]
+    assert [s["name"] for s in answer["studies"]] == ["mine", "later", BUILT_IN]
     (problem,) = answer["problems"]
     assert "broken/study.json' does not contain the results of a study: preset" in problem
 

@@ -79,8 +79,8 @@ def test_unwritable_workspace_fails(place: Place) -> None:
 
 @pytest.mark.parametrize("folder", [PRETRAINED, sample_path("door").parent], ids=["weights", "samples"])
 def test_built_in_files_are_listed_with_their_hashes(folder: Path) -> None:
-    shipped = {path.name for path in folder.iterdir() if path.suffix in (".safetensors", ".h5")}
-    assert shipped == read_sums(folder).keys()
+    files = {path.name for path in folder.iterdir() if path.suffix in (".safetensors", ".h5")}
+    assert files == read_sums(folder).keys()
     assert changed_files(folder) == [], f"update the list: sha256sum * > {checks.SUMS}"
 
 

@@ -35,7 +35,7 @@ def test_json_document_with_permalinks(run: Run, line: list[object], base_settin
     query = {key: value for key, (value,) in parse_qs(event["link"].removeprefix("?")).items()}
     assert query == {
         "task": "door",
-        "filter": f"{folder}-crossmodal-pf",  # the bare name is the built-in filter
+        "filter": f"{folder}-crossmodal-pf",  # the bare name is the pretrained filter
         "data": "door",
         "episode": str(event["episode"]),
         "step": str(event["step"]),

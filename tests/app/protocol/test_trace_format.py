@@ -12,16 +12,16 @@ from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import Trace, trace
 
 Columns = dict[str, np.ndarray[Any, Any]]
 
 
-def shipped_run(name: str) -> tuple[Trace, Columns, dict[str, Any]]:
-    """A run of a built-in filter: trace, columns, header."""
+def pretrained_run(name: str) -> tuple[Trace, Columns, dict[str, Any]]:
+    """A run of a pretrained filter: trace, columns, header."""
     with open_dataset(sample_path("door")) as episodes:
-        run = trace(load_checkpoint(shipped("door", name)), episodes[9], particles=60)
+        run = trace(load_checkpoint(pretrained_path("door", name)), episodes[9], particles=60)
     return read(run)
 
 
@@ -36,7 +36,7 @@ def read(run: Trace) -> tuple[Trace, Columns, dict[str, Any]]:
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_nees_is_the_squared_error_over_the_covariance(name: str) -> None:
-    run, values, _ = shipped_run(name)
+    run, values, _ = pretrained_run(name)
     assert values["nees"].shape == (len(run), 3)
     for t in (0, 40, len(run) - 1):
         for layer in range(3):
@@ -49,7 +49,7 @@ def test_nees_is_the_squared_error_over_the_covariance(name: str) -> None:
 
 
 def test_innovation_is_measured_minus_predicted() -> None:
-    run, values, _ = shipped_run("crossmodal-ekf")
+    run, values, _ = pretrained_run("crossmodal-ekf")
     assert run.observation_mean is not None
     assert run.predicted_mean is not None
     assert run.observation_covariance is not None
@@ -62,7 +62,7 @@ def test_innovation_is_measured_minus_predicted() -> None:
 
 
 def test_unavailable_columns_are_omitted() -> None:
-    _, values, head = shipped_run("crossmodal-pf")
+    _, values, head = pretrained_run("crossmodal-pf")
     assert not {"innovation", "innovation_sigma"} & values.keys()
     assert head["nees_bounds"] is not None
     with open_dataset(sample_path("door")) as episodes:
@@ -73,7 +73,7 @@ def test_unavailable_columns_are_omitted() -> None:
 
 
 def test_nees_bounds_contain_95_percent_for_a_consistent_filter() -> None:
-    low, high = shipped_run("crossmodal-ekf")[2]["nees_bounds"]
+    low, high = pretrained_run("crossmodal-ekf")[2]["nees_bounds"]
     samples = (np.random.default_rng(0).normal(size=(20_000, 3)) ** 2).mean(axis=1)
     inside = ((samples > low) & (samples < high)).mean()
     assert inside == pytest.approx(0.95, abs=0.005)  # the standard deviation is 0.0015
@@ -90,7 +90,7 @@ def test_nees_bounds_contain_95_percent_for_a_consistent_filter() -> None:
     ],
 )
 def test_steps_with_injected_faults(faults: str, steps: tuple[int, int] | None) -> None:
-    run, _, _ = shipped_run("crossmodal-ekf")
+    run, _, _ = pretrained_run("crossmodal-ekf")
     _, values, _ = read(replace(run, faults=Faults.parse(faults)))
     if steps is None:
         assert "faulty" not in values

@@ -23,8 +23,8 @@ def test_every_example_exists_and_the_first_is_the_default(tmp_path: Path) -> No
     store = TraceStore(Settings(tmp_path))
     catalog = store.catalog()
     assert [example["link"] for example in catalog["examples"]] == [example.link for example in EXAMPLES]
-    included = [example for example in EXAMPLES if not example.setup]
-    for example in included:
+    available = [example for example in EXAMPLES if not example.setup]
+    for example in available:
         data = store.dataset(example.task, "")[1]
         faults = Faults.parse(parse_qs(example.link).get("faults", [""])[0])
         store.key(Selection(example.task, example.filter, data.held_out()[0], faults))  # raises for unknown names

@@ -21,16 +21,16 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.trace_worker import TraceWorker
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.push import PUSH
-from beliefscope.filters.checkpoint import shipped
+from beliefscope.filters.checkpoint import pretrained_path
 
 pytestmark = pytest.mark.slow
 
 
 def saved(workspace: Path, default: bool) -> SavedFilter:
-    """A copy of a shipped filter as the result of a run."""
+    """A copy of a pretrained filter as the result of a run."""
     path = workspace / "finetune" / "0123" / "finetuned.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copy(shipped(PUSH, "crossmodal-ekf"), path)
+    shutil.copy(pretrained_path(PUSH, "crossmodal-ekf"), path)
     return SavedFilter("push", "tuned", str(path), default)
 
 

@@ -16,7 +16,7 @@ from beliefscope.app.server.assistant import Assistant
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import trace
 
@@ -32,7 +32,8 @@ def assistant() -> Assistant:
 
 def test_answers_agree_with_the_trace(assistant: Assistant) -> None:
     with open_dataset(sample_path("door")) as data:
-        run = trace(load_checkpoint(shipped("door", "crossmodal-ekf")), data[9], 9, faults=Faults.parse("blackout=0.4"))
+        filter_ = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
+        run = trace(filter_, data[9], 9, faults=Faults.parse("blackout=0.4"))
     answer = assistant.explain_run(**RUN)
     error = 100.0 * measures.main_error(run)
     counted = measures.counted(run)

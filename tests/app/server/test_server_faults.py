@@ -34,7 +34,7 @@ from beliefscope.app.views.registry import Views
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.recordings.rerun_log.training_curves import tuning_curves
 from beliefscope.recordings.write import write_recording
@@ -71,14 +71,14 @@ def poll(client: TestClient, url: str) -> Any:
 @pytest.fixture(scope="module")
 def run() -> Trace:
     with open_dataset(sample_path("door")) as data:
-        return trace(load_checkpoint(shipped("door", "crossmodal-pf")), data[9], episode_index=9, particles=50)
+        return trace(load_checkpoint(pretrained_path("door", "crossmodal-pf")), data[9], episode_index=9, particles=50)
 
 
 WRITERS: dict[str, Callable[[Trace, Path], object]] = {
     "episodes": lambda run, path: write_dataset(path, DOOR, [run.episode]),
     "trace": lambda run, path: save_trace(run, path),
     "checkpoint": lambda run, path: save_checkpoint(
-        load_checkpoint(shipped("door", "crossmodal-pf")).filter, "crossmodal-pf", {}, path
+        load_checkpoint(pretrained_path("door", "crossmodal-pf")).filter, "crossmodal-pf", {}, path
     ),
 }
 
@@ -204,7 +204,7 @@ def test_job_that_cannot_start_does_not_block_others(tmp_path: Path, monkeypatch
 
 def test_folder_without_write_permission(run: Trace) -> None:
     """As user ``nobody`` if the tests run as root."""
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     writers = WRITERS | {"checkpoint": lambda run, path: save_checkpoint(checkpoint.filter, "f", {}, path)}
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o555)
@@ -260,7 +260,7 @@ def test_a_data_set_with_nan_in_its_first_episode_leaves_the_others_available(
 
 def add_scaled_filter(settings: Settings, path: Path, value: float) -> Settings:
     """The settings with a filter whose weights are multiplied by ``value``."""
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with torch.no_grad():
         for parameter in checkpoint.filter.parameters():
             parameter.mul_(value)

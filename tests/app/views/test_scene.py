@@ -15,7 +15,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.replay import replay, replay_model
 from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies, shapes
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.figures.scene_belief import DrawnBelief, camera_axis
 from beliefscope.inspect.figures.scene_shapes import LOG_RANGE, OUTLINE_EDGES, body_meshes, map_pixels
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 def run() -> Trace:
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
-    return trace(load_checkpoint(shipped("door", "crossmodal-pf")), episode, particles=60)
+    return trace(load_checkpoint(pretrained_path("door", "crossmodal-pf")), episode, particles=60)
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_layers_depend_on_the_trace(run: Trace) -> None:
 @pytest.mark.parametrize(("task", "name"), [("push", "crossmodal-ekf"), ("push-field", "information-ekf")])
 def test_the_start_view_contains_the_robot_and_the_camera_with_its_image(task: str, name: str) -> None:
     with open_dataset(sample_path(task)) as data:
-        run = trace(load_checkpoint(shipped(task, name)), data[9])
+        run = trace(load_checkpoint(pretrained_path(task, name)), data[9])
         motion = replay(data.task, data[9])
     camera = TASKS[task].camera
     assert motion is not None

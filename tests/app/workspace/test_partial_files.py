@@ -16,7 +16,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording
 
@@ -61,7 +61,7 @@ def test_writers_use_partial_file_names(tmp_path: Path, monkeypatch: pytest.Monk
         episode: Episode = data[9]
     write_dataset(tmp_path / "a.h5", DOOR, [episode])
     write_atomically(tmp_path / "b.json", b"{}")
-    write_recording(trace(load_checkpoint(shipped("door", "haptics-ekf")), episode), tmp_path / "c.rrd")
+    write_recording(trace(load_checkpoint(pretrained_path("door", "haptics-ekf")), episode), tmp_path / "c.rrd")
     assert len(sources) == 3
     for name, target in zip(sources, ("a.h5", "b.json", "c.rrd"), strict=True):
         assert name.startswith(f".{target}.")

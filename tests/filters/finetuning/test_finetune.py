@@ -14,7 +14,7 @@ import torch
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.finetuning.batch_mix import Mix
 from beliefscope.filters.finetuning.finetune import Callbacks, FineTuned, finetune
 from beliefscope.filters.finetuning.loop import FilterLoop, Validation, score
@@ -35,7 +35,7 @@ SMALL = FineTune(
 
 
 def base(name: str = "crossmodal-ekf") -> Checkpoint:
-    return load_checkpoint(shipped("push", name))
+    return load_checkpoint(pretrained_path("push", name))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_only_selected_parameters_change(
     episodes: list[Episode], name: str, train: str, scale: float, rate: float, tmp_path: Path
 ) -> None:
     before = base(name)
-    file = shipped("push", name).read_bytes()
+    file = pretrained_path("push", name).read_bytes()
     with torch.no_grad():
         for parameter in select_parameters(before.filter, [train]).values():
             parameter.mul_(scale)  # room for improvement
@@ -134,7 +134,7 @@ def test_only_selected_parameters_change(
     changed = {key for key in old if not torch.equal(old[key], new[key])}
     assert changed
     assert changed <= set(select_parameters(before.filter, [train]))
-    assert shipped("push", name).read_bytes() == file
+    assert pretrained_path("push", name).read_bytes() == file
     record = json.loads(json.dumps(result.record))
     assert record["base"]["hash"] == before.hash
     assert FineTune.from_json(record["base"]["settings"]) == settings

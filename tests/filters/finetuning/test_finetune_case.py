@@ -8,7 +8,7 @@ import pytest
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.settings import FineTune
@@ -37,7 +37,7 @@ def test_finetuning_repairs_a_failure_and_preserves_accuracy(tmp_path: Path) -> 
     def error(checkpoint: Checkpoint, faults: Faults) -> float:
         return evaluate(checkpoint.filter, held_out, faults=faults).rmse["position_cm"]
 
-    pretrained = load_checkpoint(shipped("push", "crossmodal-ekf"))
+    pretrained = load_checkpoint(pretrained_path("push", "crossmodal-ekf"))
     damaged = tune(pretrained, DAMAGE, "damaged.safetensors")
     assert error(damaged, DARK.faults) > 2.0 * error(pretrained, DARK.faults)
     repaired = tune(damaged, REPAIR, "repaired.safetensors")

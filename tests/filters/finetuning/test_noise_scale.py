@@ -10,7 +10,7 @@ import torch
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.noise_scale import calibrate_noise, noise_parameters
@@ -26,7 +26,7 @@ def episodes(short_episodes: Callable[..., list[Episode]]) -> list[Episode]:
 
 @pytest.mark.parametrize("name", ["image-ekf", "crossmodal-ekf"])
 def test_calibrated_nees_is_1_and_estimates_stay(episodes: list[Episode], name: str) -> None:
-    filter_ = copy.deepcopy(load_checkpoint(shipped("push", name)).filter)
+    filter_ = copy.deepcopy(load_checkpoint(pretrained_path("push", name)).filter)
     with torch.no_grad():
         for parameter in noise_parameters(filter_):
             parameter -= 0.7  # overconfident by a factor of 2 in the standard deviations
@@ -42,7 +42,7 @@ def test_calibrated_nees_is_1_and_estimates_stay(episodes: list[Episode], name: 
 
 @pytest.mark.long
 def test_fine_tuning_calibrates_on_validation_episodes(episodes: list[Episode]) -> None:
-    base = load_checkpoint(shipped("push", "crossmodal-ekf"))
+    base = load_checkpoint(pretrained_path("push", "crossmodal-ekf"))
     settings = FineTune(train=("noise-only",), length=6, windows=4, steps=2, check=2, calibrate=True)
     tuned = finetune(base, episodes, data_hash="-", settings=settings)
     assert tuned is not None
@@ -60,6 +60,6 @@ def test_fine_tuning_calibrates_on_validation_episodes(episodes: list[Episode]) 
 def test_calibration_that_cannot_be_done_is_refused(
     episodes: list[Episode], name: str, train: str, message: str
 ) -> None:
-    base = load_checkpoint(shipped("push", name))
+    base = load_checkpoint(pretrained_path("push", name))
     with pytest.raises(BadInput, match=message):
         finetune(base, episodes, data_hash="-", settings=FineTune(train=(train,), calibrate=True))

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
 from valid_files import episodes
 
 from beliefscope.filters.catalog import architecture
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.settings import FineTune
@@ -55,7 +55,7 @@ def trained(partial: Path | None) -> Filter:
 
 def tuned(partial: Path | None) -> Filter:
     settings = FineTune(train=("haptics-only",), length=8, windows=4, steps=6, check=1, patience=6, particles=8)
-    base = load_checkpoint(shipped("door", "crossmodal-pf"))
+    base = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     result = finetune(base, episodes(steps=20), data_hash="0", settings=settings, partial=partial)
     assert result is not None
     return result.filter

@@ -14,7 +14,7 @@ from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch, Steps
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.finetuning.slices import CLEAN, Slice, standard_slices
 from beliefscope.filters.rollout import first_belief, rollout
 
@@ -87,7 +87,7 @@ def test_contact_and_free_motion_partition_all_steps(window: Callable[..., Batch
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_single_modality_equals_one_hot_beta(name: str) -> None:
-    filter_ = load_checkpoint(shipped("door", name)).filter
+    filter_ = load_checkpoint(pretrained_path("door", name)).filter
     with open_dataset(sample_path("door")) as data:
         batch = Steps.from_episodes(filter_.task, [data[9]]).windows(torch.tensor([0]), 12)
 

@@ -17,7 +17,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build, filters_of
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.models.networks import ImageEncoder
 from beliefscope.filters.training.plan import PLANS, Plan
 from beliefscope.filters.training.stages import ALL_PARAMETERS, IMAGES, Trainer, seed_name
@@ -180,7 +180,7 @@ def test_data_without_training_episodes_are_rejected(episodes: list[Episode]) ->
 
 
 def test_invalid_checkpoint_files(tmp_path: Path) -> None:
-    source = shipped("door", "crossmodal-ekf")
+    source = pretrained_path("door", "crossmodal-ekf")
     with pytest.raises(BadInput, match="does not exist"):
         load_checkpoint(tmp_path / "none.safetensors")
     truncated = tmp_path / "truncated.safetensors"

@@ -21,7 +21,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.load import load_external
 from beliefscope.filters.filter import Filter
@@ -44,12 +44,12 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 
 @cache
 def ekf() -> Checkpoint:
-    return load_checkpoint(shipped("door", "crossmodal-ekf"))
+    return load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
 
 
 @cache
 def pf() -> Checkpoint:
-    return load_checkpoint(shipped("door", "crossmodal-pf"))
+    return load_checkpoint(pretrained_path("door", "crossmodal-pf"))
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +288,7 @@ def test_external_filters_are_compared(data: Dataset) -> None:
 
 def test_incomparable_checkpoints_are_refused(data: Dataset) -> None:
     with pytest.raises(BadInput, match="'door' and 'push'"):
-        compare_checkpoints(ekf(), load_checkpoint(shipped("push", "crossmodal-ekf")), data)
+        compare_checkpoints(ekf(), load_checkpoint(pretrained_path("push", "crossmodal-ekf")), data)
     with pytest.raises(BadInput, match="Available: image, haptics"):
         compare_checkpoints(ekf(), biased_ekf(), data, slices=[Slice("a", only=("touch",))])
 

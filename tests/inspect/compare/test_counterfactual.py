@@ -8,7 +8,7 @@ import pytest
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import ARRAYS, Trace, trace
@@ -17,7 +17,7 @@ from beliefscope.inspect.traces.replay import Edit, Replay
 
 @pytest.fixture(scope="module", params=("crossmodal-ekf", "crossmodal-pf"))
 def replay(request: pytest.FixtureRequest) -> Replay:
-    checkpoint = load_checkpoint(shipped("door", request.param))
+    checkpoint = load_checkpoint(pretrained_path("door", request.param))
     with open_dataset(sample_path("door")) as data:
         return Replay(checkpoint, trace(checkpoint, data[9], 9, seed=3, particles=100))
 

@@ -13,13 +13,13 @@ import torch
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.compare.lineage import export, lineage_of
 
 pytestmark = pytest.mark.slow
 
 Run = Callable[[str], tuple[int, str, str]]
-ROOT = shipped("door", "crossmodal-ekf")
+ROOT = pretrained_path("door", "crossmodal-ekf")
 
 
 def finetune(base_path: Path, path: Path, nudge: float, **record: object) -> str:
@@ -101,7 +101,7 @@ def test_export_is_complete(family: Path, tmp_path: Path) -> None:
     readme = (tmp_path / "copy" / "README.md").read_text()
     assert manifest["checkpoint"] in readme
     assert "with its 2 ancestors" in readme
-    again = lineage_of([tmp_path / "copy"], shipped=tmp_path)
+    again = lineage_of([tmp_path / "copy"], pretrained=tmp_path)
     assert set(again.members) == {m["hash"] for m in manifest["members"]}
     with pytest.raises(BadInput, match="exists; give the name of a new folder"):
         export(lineage, member.hash, tmp_path / "copy", "1.2.3")

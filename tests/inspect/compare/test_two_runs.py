@@ -10,7 +10,7 @@ import pytest
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.compare.two_runs import Comparison, compare_runs
 from beliefscope.inspect.diagnostics.consistency import consistency
 from beliefscope.inspect.statistics.measures import nees
@@ -20,7 +20,7 @@ FAULTS = "blackout=0.5"
 
 
 def run(filter_: str, faults: str = "", episode: int = 9) -> Trace:
-    checkpoint = load_checkpoint(shipped("door", filter_))
+    checkpoint = load_checkpoint(pretrained_path("door", filter_))
     with open_dataset(sample_path("door")) as data:
         return trace(checkpoint, data[episode], episode, particles=50, faults=Faults.parse(faults))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges, probability_text
 from beliefscope.inspect.diagnosis.conclusion import is_unused, next_action
@@ -242,7 +242,8 @@ def test_consecutive_episodes_are_ranges() -> None:
 
 def test_a_fault_of_an_unused_sensor_has_no_action_for_the_filter() -> None:
     """Unless the controls contain its readings: the dynamics of every filter use them."""
-    checkpoints = {name: load_checkpoint(shipped("door", f"{name}-ekf")) for name in ("haptics", "image", "crossmodal")}
+    names = ("haptics", "image", "crossmodal")
+    checkpoints = {name: load_checkpoint(pretrained_path("door", f"{name}-ekf")) for name in names}
     unused = {name: {c.name for c in CAUSES if is_unused(c, checkpoint)} for name, checkpoint in checkpoints.items()}
     assert unused["haptics"] == {f"image.{mechanism}" for mechanism in REQUIRED["image"]}
     sensors = ("force", "torque")

@@ -20,7 +20,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, explain_all, focus, observe
 from beliefscope.inspect.diagnosis.cause import SHOWN
@@ -35,7 +35,7 @@ from beliefscope.inspect.traces.batch import trace_all
 
 @cache
 def checkpoint() -> Checkpoint:
-    return load_checkpoint(shipped("push", "crossmodal-ekf"))
+    return load_checkpoint(pretrained_path("push", "crossmodal-ekf"))
 
 
 @cache
@@ -288,7 +288,7 @@ def test_external_filters_are_compared_with_a_measured_profile() -> None:
 
 
 def test_a_fault_of_an_unused_sensor_is_masked_before_it_is_undone() -> None:
-    filter_ = load_checkpoint(shipped("door", "haptics-ekf"))
+    filter_ = load_checkpoint(pretrained_path("door", "haptics-ekf"))
     with open_dataset(sample_path("door")) as data:
         run = next(iter(trace_all(filter_, {9: Faults.parse("image_frozen:from=10").apply(data[9])}, [9])))
     result = preliminary(filter_, run)

@@ -1,4 +1,4 @@
-"""Statistics of modules and equations against closed forms, on shipped filters with changed parameters."""
+"""Statistics of modules and equations against closed forms, on pretrained filters with changed parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.diagnosis.model_checks import (
@@ -34,7 +34,7 @@ def episode(task: str = "door") -> Episode:
 
 @cache
 def run(name: str, task: str = "door") -> tuple[Checkpoint, Trace]:
-    checkpoint = load_checkpoint(shipped(task, name))
+    checkpoint = load_checkpoint(pretrained_path(task, name))
     return checkpoint, trace(checkpoint, episode(task), particles=50)
 
 
@@ -154,7 +154,7 @@ def test_a_scaled_report_and_fusion_are_measured(name: str) -> None:
 
 def test_the_report_of_an_information_filter_is_compared_with_its_next_prediction() -> None:
     """Its belief also has biases, but the prediction of the state depends on the state's covariance only."""
-    checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
         original = trace(checkpoint, data[0], 0)
     assert equation_statistics(original, checkpoint) == {"reported variance//all": pytest.approx(0.0, abs=1e-3)}

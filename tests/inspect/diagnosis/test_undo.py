@@ -15,7 +15,7 @@ import pytest
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.diagnose import required_profile
@@ -32,7 +32,7 @@ from beliefscope.inspect.traces.batch import trace_all
 
 @cache
 def checkpoint(name: str) -> Checkpoint:
-    return load_checkpoint(shipped("door", name))
+    return load_checkpoint(pretrained_path("door", name))
 
 
 @cache
@@ -208,7 +208,7 @@ def test_the_contact_flag_is_restored_from_the_force(fault: str) -> None:
 
 def test_an_offset_of_the_hand_is_measured_by_commanded_positions() -> None:
     """The controls of field tasks are commanded positions, which the fault does not change."""
-    filter_ = load_checkpoint(shipped("push-field", "information-ekf"))
+    filter_ = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
         clean = data[data.held_out()[0]]
     faulty = Faults.parse("effector_offset=0.02:y=-0.01").apply(clean)

@@ -7,7 +7,7 @@ import pytest
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.cause import Recovery
 from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
@@ -57,7 +57,7 @@ def test_calibration_after_a_failed_undo_says_nothing() -> None:
 
 def test_ratios_are_those_of_all_steps_of_all_episodes() -> None:
     """Errors by unit and the NEES, pooled: not means of episodes, which short or easy ones would dominate."""
-    filter_ = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    filter_ = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         episodes = {index: data[index] for index in data.held_out()[:3]}
     faulty = {index: Faults.parse("blackout=0.9").apply(episode) for index, episode in episodes.items()}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import Trace, trace
 
 Array = NDArray[np.float64]
@@ -25,11 +25,12 @@ SCALE = np.array([0.01, 0.02, 0.05])
 
 @cache
 def real(filter_: str, steps: int = 60) -> Trace:
-    """A short trace of a built-in filter on a door episode, with 100 particles."""
+    """A short trace of a pretrained filter on a door episode, with 100 particles."""
     with open_dataset(sample_path("door")) as dataset:
         index = next(s.index for s in dataset.summaries if s.split == "test")
         episode = dataset[index]
-    return trace(load_checkpoint(shipped("door", filter_)), of_length(episode, steps), index, seed=7, particles=100)
+    checkpoint = load_checkpoint(pretrained_path("door", filter_))
+    return trace(checkpoint, of_length(episode, steps), index, seed=7, particles=100)
 
 
 def of_length(episode: Episode, steps: int) -> Episode:

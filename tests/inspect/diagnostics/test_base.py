@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.plotting import write_figure
@@ -81,7 +81,7 @@ def test_non_finite_numbers_become_none() -> None:
 
 
 def test_bands_of_map_statistics_include_warm_up_steps() -> None:
-    trace, checkpoint = plant.real("crossmodal-ekf"), load_checkpoint(shipped("door", "crossmodal-ekf"))
+    trace, checkpoint = plant.real("crossmodal-ekf"), load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     assert trace.episode.contact[:30].any()
     bands = DIAGNOSTICS["maps"]([trace], checkpoint, size=5).bands()
     np.testing.assert_array_equal(bands["contact"], trace.episode.contact)

@@ -243,7 +243,7 @@ def test_phases_of_few_steps_get_no_verdict(exact: Consistency) -> None:
     assert replace(entry, steps=10).inconsistent
 
 
-def test_a_shipped_filter_is_compared_with_its_healthy_record() -> None:
+def test_a_pretrained_filter_is_compared_with_its_healthy_record() -> None:
     run = plant.real("crossmodal-ekf")
     result = DIAGNOSTICS["consistency"]([run])
     assert isinstance(result, Consistency)

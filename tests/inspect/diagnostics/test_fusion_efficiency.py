@@ -12,7 +12,7 @@ import pytest
 
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.fusion_efficiency import FusionEfficiency, efficiency_of, fusion_efficiency
 from beliefscope.inspect.diagnostics.fusion_gaps import CALIBRATION, DRIFT, PRIOR, WEIGHTS, Reason, reasons_of
@@ -185,7 +185,7 @@ def test_weights_far_from_the_best_split() -> None:
 
 @pytest.fixture(scope="module")
 def doors() -> tuple[Checkpoint, list[Trace]]:
-    filter_ = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    filter_ = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         return filter_, [trace(filter_, data[index], index) for index in (9, 11)]
 

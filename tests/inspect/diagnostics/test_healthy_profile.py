@@ -1,4 +1,4 @@
-"""Healthy profiles: false alarms and power by simulation, the file format, and the shipped files."""
+"""Healthy profiles: false alarms and power by simulation, the file format, and the pretrained files."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_malformed_profiles_are_refused(change: dict[str, Any]) -> None:
         HealthyProfile.from_json(document | change)
 
 
-def test_shipped_profiles_belong_to_their_checkpoints() -> None:
+def test_pretrained_profiles_belong_to_their_checkpoints() -> None:
     paths = sorted(PRETRAINED.glob(f"*{SUFFIX}"))
     assert paths
     for path in paths:

@@ -17,7 +17,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.saliency import ENTRY, MIN_CHANGE, Saliency, saliency
@@ -42,7 +42,7 @@ def run(checkpoint: Checkpoint, faults: str = f"blackout:from={BLACK}:to={BLACK 
 
 @cache
 def builtin(name: str) -> Replay:
-    checkpoint = load_checkpoint(shipped("door", name))
+    checkpoint = load_checkpoint(pretrained_path("door", name))
     return Replay(checkpoint, run(checkpoint))
 
 
@@ -188,7 +188,7 @@ def test_position_of_the_log_likelihood() -> None:
     ],
 )
 def test_gradients_are_finite_differences(name: str, target: str) -> None:
-    checkpoint = load_checkpoint(shipped("door", name))  # a copy in double precision
+    checkpoint = load_checkpoint(pretrained_path("door", name))  # a copy in double precision
     replay = Replay(checkpoint, run(checkpoint))
     checkpoint.filter.double()
     belief = replay.beliefs[VISIBLE]

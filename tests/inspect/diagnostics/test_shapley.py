@@ -23,7 +23,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnostics import shapley
 from beliefscope.inspect.diagnostics.shapley import MAX_MODALITIES, members, run_subsets, shapley_weights
@@ -46,8 +46,8 @@ def episode(index: int = 9, steps: int = STEPS) -> Any:
 
 @cache
 def builtin(name: str) -> tuple[Checkpoint, Trace]:
-    """A built-in filter for the door task, and a run with image blackout."""
-    checkpoint = load_checkpoint(shipped("door", name))
+    """A pretrained filter for the door task, and a run with image blackout."""
+    checkpoint = load_checkpoint(pretrained_path("door", name))
     return checkpoint, trace(checkpoint, episode(), 9, seed=3, particles=60, faults=Faults.parse("blackout=0.3"))
 
 

@@ -11,7 +11,7 @@ import pytest
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.standalone_modalities import (
     PhaseErrors,
@@ -24,7 +24,7 @@ from beliefscope.inspect.trace import trace
 
 
 def test_errors_are_those_of_the_separate_runs() -> None:
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         run = trace(checkpoint, data[9], 9)
     shares: list[float] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, OF_COMPONENTS, OF_KINDS, OF_READINGS, unit_of
@@ -37,7 +37,7 @@ def test_unit(statistic: str, unit: str, factor: float) -> None:
 
 def test_kinds_with_units_exist_and_each_component_of_a_profile_has_a_unit() -> None:
     assert set(KINDS) >= OF_COMPONENTS | set(OF_KINDS) | set(OF_READINGS)
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     profile = required_profile(checkpoint)
     names = [name for name in profile.statistics if name.split("/")[0] in OF_COMPONENTS]
     assert len(names) > 10

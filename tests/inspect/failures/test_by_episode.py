@@ -11,7 +11,7 @@ import pytest
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.by_episode import POINTS, by_episode
@@ -23,7 +23,7 @@ EPISODES = (9, 19, 59)
 
 @pytest.fixture(scope="module")
 def checkpoint() -> Checkpoint:
-    return load_checkpoint(shipped("door", "crossmodal-ekf"))
+    return load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
@@ -28,7 +28,7 @@ CUT = 60  # steps; enough for all phases
 
 @pytest.fixture(scope="module")
 def checkpoint() -> Checkpoint:
-    return load_checkpoint(shipped("push", "crossmodal-pf"))
+    return load_checkpoint(pretrained_path("push", "crossmodal-pf"))
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +275,7 @@ def test_regret_equals_a_scan_over_weights(traces: list[Trace]) -> None:
 
 
 def test_angles_have_a_score_and_wrap() -> None:
-    door = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    door = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
         run = trace(door, shortened(data[9]), 9)
     turned = run.estimate_mean.copy()
@@ -290,7 +290,7 @@ def test_angles_have_a_score_and_wrap() -> None:
 
 
 def test_a_score_that_does_not_apply_is_refused_after_the_first_block() -> None:
-    feature = load_checkpoint(shipped("door", "feature-ekf"))
+    feature = load_checkpoint(pretrained_path("door", "feature-ekf"))
     progress: list[float] = []
     with open_dataset(sample_path("door")) as data, pytest.raises(BadInput, match="no failures by regret"):
         find_failures(feature, dict.fromkeys(range(40), shortened(data[9])), by="regret", progress=progress.append)
@@ -299,7 +299,7 @@ def test_a_score_that_does_not_apply_is_refused_after_the_first_block() -> None:
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[int, Episode], name: str) -> None:
-    filter_ = load_checkpoint(shipped("push", name))
+    filter_ = load_checkpoint(pretrained_path("push", name))
     members = episodes | {999: shortened(next(iter(episodes.values())), CUT // 2)}
     faults = Faults.parse("blackout=0.4,force_bias:x=5")
     survey = survey_of(filter_, members, members, faults=faults)
@@ -312,7 +312,7 @@ def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[i
 @pytest.mark.long
 @pytest.mark.slow
 def test_values_do_not_depend_on_the_number_of_processes() -> None:
-    filter_ = load_checkpoint(shipped("push", "crossmodal-ekf"))
+    filter_ = load_checkpoint(pretrained_path("push", "crossmodal-ekf"))
     with open_dataset(sample_path("push")) as data:
         serial, parallel = (survey_of(filter_, data, range(BLOCK + 1), workers=workers) for workers in (1, 2))
     assert serial.phases.keys() == parallel.phases.keys()

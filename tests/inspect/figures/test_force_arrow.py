@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.figures.force_arrow import MAX_RINGS, RING_DISTANCE, DrawnForce, ring_spacing
 from beliefscope.inspect.trace import trace
 
@@ -21,7 +21,7 @@ def test_the_rings_of_the_force_arrow_are_round_numbers() -> None:
 def test_the_arrow_of_a_step_ends_at_the_hand_and_has_the_length_of_its_rings() -> None:
     with open_dataset(sample_path("push")) as data:
         episode = data[9]
-    drawn = DrawnForce(trace(load_checkpoint(shipped("push", "crossmodal-ekf")), episode, 9))
+    drawn = DrawnForce(trace(load_checkpoint(pretrained_path("push", "crossmodal-ekf")), episode, 9))
     contact = np.flatnonzero(episode.contact)
     free = np.flatnonzero(~episode.contact.astype(bool))
     assert len(contact)

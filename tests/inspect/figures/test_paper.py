@@ -14,7 +14,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.maps.map_engine import MapEngine
@@ -26,7 +26,7 @@ SIZE = 21
 
 
 def run(name: str, task: str = "door") -> tuple[Checkpoint, Trace]:
-    checkpoint = load_checkpoint(shipped(task, name))
+    checkpoint = load_checkpoint(pretrained_path(task, name))
     with open_dataset(sample_path(task)) as data:
         return checkpoint, trace(checkpoint, data[9], 9, particles=30)
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Ellipse, Polygon
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.figures.top_view import draw_step, footprint, outline, scene_footprints
 from beliefscope.inspect.maps.map_engine import LikelihoodMap, MapEngine
@@ -26,12 +26,12 @@ STEP = 25
 def run() -> Trace:
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
-    return trace(load_checkpoint(shipped("door", "crossmodal-pf")), episode, episode_index=9, particles=60)
+    return trace(load_checkpoint(pretrained_path("door", "crossmodal-pf")), episode, episode_index=9, particles=60)
 
 
 @pytest.fixture(scope="module")
 def map_(run: Trace) -> LikelihoodMap:
-    return MapEngine(load_checkpoint(shipped("door", "crossmodal-pf")), run).map(STEP, size=41)
+    return MapEngine(load_checkpoint(pretrained_path("door", "crossmodal-pf")), run).map(STEP, size=41)
 
 
 def inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_footprint_matches_the_object(name: str) -> None:
     with open_dataset(sample_path(name)) as data:
         episode = data[9]
     assert task.outline is not None
-    run = trace(load_checkpoint(shipped(name, "crossmodal-ekf")), episode)
+    run = trace(load_checkpoint(pretrained_path(name, "crossmodal-ekf")), episode)
     corners = footprint(task.outline(episode.states[STEP]))
     x, y = corners.T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))

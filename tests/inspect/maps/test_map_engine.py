@@ -12,7 +12,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, update
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.map_engine import QUANTITIES, LikelihoodMap, MapEngine
@@ -23,7 +23,7 @@ from beliefscope.inspect.trace import trace
 def engine(name: str) -> MapEngine:
     with open_dataset(sample_path("door")) as dataset:
         episode = dataset[next(s.index for s in dataset.summaries if s.split == "test")]
-    checkpoint = load_checkpoint(shipped("door", name))
+    checkpoint = load_checkpoint(pretrained_path("door", name))
     return MapEngine(checkpoint, trace(checkpoint, episode, particles=50))
 
 

@@ -12,7 +12,7 @@ import pytest
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.simulation.door import DOOR, panel_outline
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnostics.likelihood_maps import ENTRY
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
@@ -109,8 +109,8 @@ def test_expected_ridge_is_along_the_panel() -> None:
 
 
 def test_ridge_of_a_simulated_door_is_along_the_panel_not_towards_the_gripper() -> None:
-    """Haptics map of the shipped PF in contact; the bar stands off the panel, so the two directions differ."""
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    """Haptics map of the pretrained PF in contact; the bar stands off the panel, so the two directions differ."""
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     with open_dataset(sample_path("door")) as data:
         index = data.held_out()[0]
         run = trace(checkpoint, data[index], index, particles=50)
@@ -122,7 +122,7 @@ def test_ridge_of_a_simulated_door_is_along_the_panel_not_towards_the_gripper() 
     off_gripper = result.numbers.axis[:, haptics] - np.arctan2(to_gripper[:, 1], to_gripper[:, 0])
     off_gripper = np.abs((off_gripper + np.pi / 2) % np.pi - np.pi / 2)
     off_panel = result.numbers.deviation[:, haptics]
-    # Properties of the built-in filter; a random axis is 45 degrees off in the median.
+    # Properties of the pretrained filter; a random axis is 45 degrees off in the median.
     assert np.degrees(np.median(off_panel[contact])) < 8.0
     assert np.median(off_panel[contact]) < 0.6 * np.median(off_gripper[contact])
     assert "the haptics likelihood is a ridge" in result.verdict
@@ -131,7 +131,7 @@ def test_ridge_of_a_simulated_door_is_along_the_panel_not_towards_the_gripper() 
 
 
 def test_push_expects_no_direction() -> None:
-    checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
+    checkpoint = load_checkpoint(pretrained_path("push", "crossmodal-pf"))
     with open_dataset(sample_path("push")) as data:
         index = data.held_out()[0]
         run = trace(checkpoint, data[index], index, particles=50)

@@ -12,7 +12,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Component, Task
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
 from beliefscope.inspect.maps.plane import plane_of, round_up
@@ -170,7 +170,7 @@ def test_particle_filter_over_an_angle_and_integrated() -> None:
     """The networks are evaluated at the same states whatever the axes, and the posterior has a marginal."""
     with open_dataset(sample_path("door")) as data:
         episode = data[next(s.index for s in data.summaries if s.split == "test")]
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     run = trace(checkpoint, episode, particles=50)
     maps = MapEngine(checkpoint, run)
     assert no_maps(checkpoint, run) is None

@@ -12,7 +12,7 @@ import pytest
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.slices.covariates import StepCovariate, covariates_of
 from beliefscope.inspect.slices.report import find_slices, slices_of
 from beliefscope.inspect.slices.search import Condition
@@ -25,7 +25,7 @@ EPISODES = 12
 
 @pytest.fixture(scope="module")
 def traces() -> list[Trace]:
-    checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
         return list(trace_all(checkpoint, data, range(EPISODES)))
 
@@ -134,7 +134,7 @@ def test_invalid_scores(traces: list[Trace]) -> None:
 
 
 def test_runs_of_a_data_set(traces: list[Trace]) -> None:
-    checkpoint = load_checkpoint(shipped("push-field", "information-ekf"))
+    checkpoint = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     shares: list[float] = []
     report = find_slices(
         checkpoint, [trace.episode for trace in traces], range(EPISODES), by="nees", progress=shares.append

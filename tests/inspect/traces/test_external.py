@@ -19,7 +19,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
@@ -72,7 +72,7 @@ class PlainFilter(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.filter = load_checkpoint(shipped("door", "crossmodal-ekf")).filter
+        self.filter = load_checkpoint(pretrained_path("door", "crossmodal-ekf")).filter
 
     def initialize_beliefs(self, *, mean: Tensor, covariance: Tensor) -> None:
         si = self.filter.statistics
@@ -102,7 +102,7 @@ class PlainFilter(nn.Module):
 
 
 def test_external_interface_reproduces_the_built_in_filter(episode: Episode, tmp_path: Path) -> None:
-    native = trace(load_checkpoint(shipped("door", "crossmodal-ekf")), episode)
+    native = trace(load_checkpoint(pretrained_path("door", "crossmodal-ekf")), episode)
     result = trace(external(PlainFilter()), episode)
     assert (result.kind, result.modalities) == ("external", native.modalities)
     for name in ("start_mean", "start_covariance", "estimate_mean", "estimate_covariance", "modality_mean", "weights"):
@@ -110,7 +110,7 @@ def test_external_interface_reproduces_the_built_in_filter(episode: Episode, tmp
         np.testing.assert_allclose(getattr(result, name), getattr(native, name), rtol=2e-3, atol=1e-5, err_msg=name)
     checkpoint = external(PlainFilter())
     assert no_maps(checkpoint, result) is None
-    native_maps = MapEngine(load_checkpoint(shipped("door", "crossmodal-ekf")), native)
+    native_maps = MapEngine(load_checkpoint(pretrained_path("door", "crossmodal-ekf")), native)
     expected = native_maps.map(50, size=41, quantity="posterior")
     engine = MapEngine(checkpoint, result)
     actual = engine.map(50, size=41)
@@ -134,7 +134,7 @@ def test_external_interface_reproduces_the_built_in_filter(episode: Episode, tmp
 
 
 def test_evaluation_equals_the_built_in_filter(episodes: list[Episode]) -> None:
-    native = evaluate(load_checkpoint(shipped("door", "crossmodal-ekf")).filter, episodes).to_dict()
+    native = evaluate(load_checkpoint(pretrained_path("door", "crossmodal-ekf")).filter, episodes).to_dict()
     result = evaluate(external(PlainFilter()), episodes).to_dict()
     assert result["rmse"] == pytest.approx(native["rmse"], rel=2e-3)
     assert result["nees"] == pytest.approx(native["nees"], rel=2e-3)

@@ -16,7 +16,7 @@ import pytest
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, save_trace, trace, trace_from_arrays
 from beliefscope.inspect.traces.live_file import MARKER, LiveFileReader, LiveFileWriter, load_live
 
@@ -56,7 +56,7 @@ def write(path: Path, run: Trace, blocks: list[int], end: bool = True) -> list[i
 def run(request: pytest.FixtureRequest) -> Trace:
     """30 steps; the trace of an LSTM has NaN covariances and no modalities."""
     name = request.param
-    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf" if name == "lstm" else name))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf" if name == "lstm" else name))
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
     episode = replace(

@@ -25,7 +25,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
@@ -50,7 +50,7 @@ TITLE = 'Doors <script>alert("1")</script> & 40 %'
 
 @pytest.fixture(scope="module")
 def checkpoint() -> Checkpoint:
-    return load_checkpoint(shipped("door", "crossmodal-ekf"))
+    return load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
 
 
 @pytest.fixture(scope="module")
@@ -327,7 +327,7 @@ def test_command_adds_permalinks(printed: tuple[Path, Any]) -> None:
 
 @pytest.mark.long
 def test_slices_are_searched_in_enough_episodes() -> None:
-    filter_ = load_checkpoint(shipped("push-field", "information-ekf"))
+    filter_ = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     with open_dataset(sample_path("push-field")) as data:
         traces = list(trace_all(filter_, data, data.held_out()[:8]))
     slices = compose(traces, filter_).results["slices"]

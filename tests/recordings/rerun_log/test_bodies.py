@@ -13,7 +13,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.figures.meshes import mesh_of
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.recordings.write import write_recording
@@ -21,7 +21,7 @@ from beliefscope.recordings.write import write_recording
 
 def traced(task: str, name: str) -> Trace:
     with open_dataset(sample_path(task)) as data:
-        return trace(load_checkpoint(shipped(task, name)), data[9], episode_index=9)
+        return trace(load_checkpoint(pretrained_path(task, name)), data[9], episode_index=9)
 
 
 @pytest.fixture(scope="module")

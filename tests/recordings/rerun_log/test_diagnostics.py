@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS, quick
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, ImagePanel, Plot, Table
@@ -37,7 +37,7 @@ Chunks = dict[str, dict[str, list[Any]]]
 
 
 def run_and_diagnostics(name: str) -> tuple[Trace, Mapping[str, Diagnostic]]:
-    checkpoint = load_checkpoint(shipped("door", name))
+    checkpoint = load_checkpoint(pretrained_path("door", name))
     with open_dataset(sample_path("door")) as data:
         run = trace(checkpoint, data[9], 9, particles=50, faults=Faults.parse("blackout=0.3"))
     return run, quick(run, checkpoint)
