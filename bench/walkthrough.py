@@ -53,7 +53,11 @@ SHOTS = (
         READY,
         "Compute",
     ),
-    Shot("walkthrough-edit", {"tab": "compare", "against": "from=30&to=76&weights=haptics=0"}, "#compare .verdict"),
+    Shot(
+        "walkthrough-intervention",
+        {"tab": "compare", "against": "from=30&to=76&weights=haptics=0"},
+        "#compare .verdict",
+    ),
 )
 
 

@@ -12,7 +12,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 checkpoint = load_checkpoint(pretrained_path("push", "crossmodal-pf"))
 with open_dataset(sample_path("push")) as data:
@@ -20,13 +20,13 @@ with open_dataset(sample_path("push")) as data:
     replay = Replay(checkpoint, trace(checkpoint, data[index], index))
 
 blackout = Faults.parse("blackout")
-edits = {
-    "image blackout": Edit(40, 60, blackout),
-    "image blackout with all weight on image": Edit(40, 60, blackout, {"image": 1.0}),
-    "clean image with all weight on haptics": Edit(40, 60, weights={"haptics": 1.0}),
+interventions = {
+    "image blackout": Intervention(40, 60, blackout),
+    "image blackout with all weight on image": Intervention(40, 60, blackout, {"image": 1.0}),
+    "clean image with all weight on haptics": Intervention(40, 60, weights={"haptics": 1.0}),
 }
-for title, edit in edits.items():
-    difference = compare(replay.original, replay.edited(edit), edit)
+for title, intervention in interventions.items():
+    difference = compare(replay.original, replay.with_intervention(intervention), intervention)
     print(f"\n{title.capitalize()}\n  {difference.verdict}")
 
 if len(sys.argv) > 1:

@@ -13,14 +13,14 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.external_replay import ExternalReplay, open_replay
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 Progress = Callable[[float], None]
 """Called with the completed fraction, 0..1. An exception that it raises ends the run."""
 
 
 class StoredRuns:
-    """Runs filters, one at a time. Keeps the replay of the run that was edited last."""
+    """Runs filters, one at a time. Keeps the replay of the run of the last intervention."""
 
     def __init__(self) -> None:
         self._replay: tuple[Path, Replay | ExternalReplay] | None = None
@@ -31,7 +31,7 @@ class StoredRuns:
         episode: Episode,
         *,
         path: Path,
-        edit: Edit | None,
+        intervention: Intervention | None,
         only: str,
         progress: Progress,
         **settings: Any,
@@ -40,17 +40,18 @@ class StoredRuns:
 
         Args:
             path: trace file of the run without intervention and with all modalities: read if possible, else written.
-            edit: intervention. only: the only modality to use, or empty. Traces with one of them are not stored.
+            intervention, only: the intervention, or the only modality to use, or neither. Traces with one of them are
+                not stored.
             settings: as for ``trace``.
         """
         if only:
             return standalone(checkpoint, _run_or_load(path, checkpoint, episode, progress, settings), only, progress)
-        if edit is None:
+        if intervention is None:
             return _run_or_load(path, checkpoint, episode, progress, settings)
         if self._replay is None or self._replay[0] != path:
             original = _run_or_load(path, checkpoint, episode, progress, settings)
             self._replay = path, open_replay(checkpoint, original, progress)
-        return self._replay[1].edited(edit)
+        return self._replay[1].with_intervention(intervention)
 
 
 def _run_or_load(

@@ -102,14 +102,14 @@ def test_counterfactual_outputs_agree(run: Run, folder: Path) -> None:
     code, out, _ = run(f"{line} --faults blackout --weights image=0.9 {outputs} --json -")
     document = json.loads(out)
     assert code == 0
-    assert document["edit"]["weights"] == {"image": 0.9}
-    assert (document["edit"]["from"], document["edit"]["to"]) == (40, 60)
-    edited = load_trace(folder / "edited.trace")
-    assert edited.settings["edits"] == [document["edit"]]
-    assert str(edited.faults) == "blackout:from=40:to=60"
-    assert edited.weights is not None
-    np.testing.assert_allclose(edited.weights[40:60, 0], 0.9, rtol=1e-6)  # float32, through a logarithm
-    np.testing.assert_array_equal(edited.estimate_mean, np.float32(document["edited"]))
+    assert document["intervention"]["weights"] == {"image": 0.9}
+    assert (document["intervention"]["from"], document["intervention"]["to"]) == (40, 60)
+    counterfactual = load_trace(folder / "edited.trace")
+    assert counterfactual.settings["edits"] == [document["intervention"]]
+    assert str(counterfactual.faults) == "blackout:from=40:to=60"
+    assert counterfactual.weights is not None
+    np.testing.assert_allclose(counterfactual.weights[40:60, 0], 0.9, rtol=1e-6)  # float32, through a logarithm
+    np.testing.assert_array_equal(counterfactual.estimate_mean, np.float32(document["counterfactual"]))
     assert (folder / "what.svg").read_text().startswith("<?xml")
     code, out, _ = run(f"{line} --faults blackout --weights image=0.9")
     title, *tables = out.split("\n\n")
@@ -118,7 +118,7 @@ def test_counterfactual_outputs_agree(run: Run, folder: Path) -> None:
     assert [table.splitlines()[0] for table in tables] == [
         "Mean over steps",
         "Largest difference of the estimates",
-        "Mean over the edited steps",
+        "Mean during the intervention",
     ]
 
 

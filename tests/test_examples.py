@@ -85,7 +85,7 @@ def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = example("02_counterfactual.py", tmp_path / "what.svg", capsys)
-    blackout, trusted, _ = re.findall(r"over the edited steps: ([\d.]+) -> ([\d.]+) cm", output)
+    blackout, trusted, _ = re.findall(r"during the intervention: ([\d.]+) -> ([\d.]+) cm", output)
     assert blackout[0] == trusted[0], "both are compared with the same run"
     assert float(blackout[1]) < float(trusted[1]), "trusting a blacked out image increases the error"
     assert (tmp_path / "what.svg").read_text().startswith("<?xml")

@@ -14,10 +14,10 @@ from beliefscope.inspect.compare.two_runs import compare_runs
 
 
 class Comparison(ResultViews):
-    """Comparison of two runs. edit: description of the intervention, or None."""
+    """Comparison of two runs. intervention: in words, or None."""
 
     names: tuple[str, str]
-    edit: str | None
+    intervention: str | None
 
 
 def routes(store: TraceStore) -> APIRouter:
@@ -28,20 +28,21 @@ def routes(store: TraceStore) -> APIRouter:
         other = selection.comparison(against)
         store.request(other)  # starts it
         run, other_run = finished_run(store, selection), finished_run(store, other)
-        names, edit = _names(selection, other), other.edit
-        if edit is None:
+        names, intervention = _names(selection, other), other.intervention
+        if intervention is None:
             views = compare_runs(run.trace, other_run.trace, names).views()
         else:
-            views = compare(run.trace, other_run.trace, edit).views()
-        return JSONResponse({"names": names, "edit": None if edit is None else str(edit), **views})
+            views = compare(run.trace, other_run.trace, intervention).views()
+        text = None if intervention is None else str(intervention)
+        return JSONResponse({"names": names, "intervention": text, **views})
 
     return router
 
 
 def _names(run: Selection, other: Selection) -> tuple[str, str]:
     """Names of the two runs that state their difference."""
-    if other.edit is not None:
-        return "original", "edited"
+    if other.intervention is not None:
+        return "original", "with intervention"
     if other.only:
         return "all modalities", f"{other.only} standalone"
     fault_names = [str(selection.faults) or "as recorded" for selection in (run, other)]

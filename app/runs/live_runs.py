@@ -136,7 +136,7 @@ class LiveRuns:
                 f"live run {run.name!r} is of task {run.task.name!r}, episode {run.template.episode_index}, "
                 f"not of {selection.task!r}, episode {selection.episode}"
             )
-        if (selection.filter, selection.faults, selection.edit, selection.only) != (name, NO_FAULTS, None, ""):
+        if (selection.filter, selection.faults, selection.intervention, selection.only) != (name, NO_FAULTS, None, ""):
             return None
         running = run.state == "running"
         with self._lock:

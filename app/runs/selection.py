@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 
 FILE_STEM_LENGTH = 150  # characters of task and filter in a file name
 
@@ -19,8 +19,8 @@ FILE_STEM_LENGTH = 150  # characters of task and filter in a file name
 class Selection:
     """One filter run.
 
-    data: name of the data set; empty for the first data set of the task. edit: intervention on some steps of the run.
-    only: the only modality that a standalone run uses; empty for all modalities.
+    data: name of the data set; empty for the first data set of the task. intervention: over some of its
+    steps. only: the only modality that a standalone run uses; empty for all modalities.
     """
 
     task: str
@@ -28,7 +28,7 @@ class Selection:
     episode: int
     faults: Faults = NO_FAULTS
     data: str = ""
-    edit: Edit | None = None
+    intervention: Intervention | None = None
     only: str = ""
 
     def describe(self, scope: str = "") -> str:
@@ -44,14 +44,16 @@ class Selection:
 
     def to_json(self) -> dict[str, Any]:
         """The selection as JSON values."""
-        edit = None if self.edit is None else self.edit.to_json()
-        return {**vars(self), "faults": self.faults.to_json(), "edit": edit}
+        values = {**vars(self), "faults": self.faults.to_json()}
+        intervention = values.pop("intervention")
+        return {**values, "edit": None if intervention is None else intervention.to_json()}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Inverse of ``to_json``."""
-        edit = None if values["edit"] is None else Edit.from_json(values["edit"])
-        return cls(**{**values, "faults": Faults.from_json(values["faults"]), "edit": edit})
+        rest = {key: value for key, value in values.items() if key != "edit"}
+        intervention = None if values["edit"] is None else Intervention.from_json(values["edit"])
+        return cls(**{**rest, "faults": Faults.from_json(values["faults"]), "intervention": intervention})
 
     def comparison(self, text: str) -> Selection:
         """The comparison run that ``text`` describes by its differences from this run.
@@ -66,7 +68,7 @@ class Selection:
         """
         parts = dict(parse_qsl(text, keep_blank_values=True))
         if parts.keys() & {"from", "to", "weights"}:
-            return replace(self, edit=Edit.parse(text))
+            return replace(self, intervention=Intervention.parse(text))
         if "only" in parts:
             if len(parts) > 1 or not parts["only"]:
                 raise BadInput(f"{text!r} is not only=MODALITY, without other parts of the comparison run")

@@ -312,9 +312,9 @@ class TraceStore:
         selection.faults.check(checkpoint.task, len(episode))
         seed, particles = self.settings.seed, self.settings.particles
         parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.faults)]
-        if selection.edit is not None:
-            selection.edit.faults.check(checkpoint.task)
-            parts.append(selection.edit.to_json())
+        if selection.intervention is not None:
+            selection.intervention.faults.check(checkpoint.task)
+            parts.append(selection.intervention.to_json())
         if selection.only:
             check_standalone(checkpoint, selection.only)
             parts.append(f"only {selection.only}")
@@ -356,7 +356,7 @@ class TraceStore:
             live = selection.data.startswith(LIVE_PREFIX)
             data = self.live.path(selection.data) if live else self.dataset(selection.task, selection.data)[1].path
             source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else str(checkpoint.path)
-            original = str(self._trace_file(replace(selection, edit=None, only="")))
+            original = str(self._trace_file(replace(selection, intervention=None, only="")))
             return RunRequest(
                 **vars(selection),
                 definition=json.dumps(task_to_json(checkpoint.task), sort_keys=True),

@@ -50,7 +50,7 @@ class RunRequest(Selection):
         """Arguments of ``StoredRuns.run``."""
         return {
             "path": Path(self.original),
-            "edit": self.edit,
+            "intervention": self.intervention,
             "only": self.only,
             "episode_index": self.episode,
             "seed": self.seed,

@@ -1,4 +1,4 @@
-"""Counterfactuals: the effect of edited sensors or fusion weights over a range of steps on the estimates."""
+"""Counterfactuals: the effect of sensor faults or manual fusion weights over a range of steps on the estimates."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from beliefscope.inspect.statistics.measures import (
     means,
 )
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 
 RECOVERED = 1.0
-"""The edited run has recovered once its estimate stays within this many standard deviations of the original."""
+"""The run has recovered once its estimate stays within this many standard deviations of the original."""
 
 MIN_INCREASE = 0.05
 """Minimum reported increase of an effective weight."""
@@ -35,80 +35,83 @@ MAX_OTHERS = 2
 
 @dataclass(frozen=True)
 class Counterfactual(Diagnostic):
-    """Comparison of an original run and an edited run with equal random numbers.
+    """Comparison of a run and the same run with an intervention, with equal random numbers.
 
     T steps, n components, K modalities; m and rad.
 
     Attributes:
         task, filter, modalities: of the traces.
-        edit: description of the edit.
-        first, to: first edited step, and first step after the edit.
-        truth, original, edited: (T, n) true states and the fused estimates of both runs.
+        intervention: in words.
+        first, to: first step of the intervention, and first step after it.
+        truth, original, counterfactual: (T, n) true states, and fused estimates without and with the intervention.
         distance: (T,) m, distance between the fused position estimates.
         modality_distance: (T, K) m, distance between the positions of the single-modality updates.
         sigmas: (T,) ``sqrt(d^T S^-1 d / n)`` for the difference d of the estimates and the covariance S of the original
             run; without a covariance, S is the mean squared error by component.
-        divergence: (T,) nats, Kullback-Leibler divergence of the original posterior from the edited one, as Gaussians;
-            NaN without a covariance.
-        error, edited_error: (T,) m, position errors.
-        effective_weights, edited_weights: (T, K) effective weights, averaged over components; None without fusion.
+        divergence: (T,) nats, Kullback-Leibler divergence of the original posterior from the counterfactual one, as
+            Gaussians; NaN without a covariance.
+        error, counterfactual_error: (T,) m, position errors.
+        effective_weights, counterfactual_weights: (T, K) effective weights, averaged over components; None without
+            fusion.
         contact: (T,) bool.
         time: (T,) s, times of the steps; None without timestamps.
-        recovery: first step after the edit from which ``sigmas`` stays at most ``RECOVERED``; None if there is none.
+        recovery: first step after the intervention from which ``sigmas`` stays at most ``RECOVERED``; None without
+            one.
     """
 
     task: Task
     filter: str
     modalities: tuple[str, ...]
-    edit: str
+    intervention: str
     first: int
     to: int
     truth: Array
     original: Array
-    edited: Array
+    counterfactual: Array
     distance: Array
     modality_distance: Array
     sigmas: Array
     divergence: Array
     error: Array
-    edited_error: Array
+    counterfactual_error: Array
     effective_weights: Array | None
-    edited_weights: Array | None
+    counterfactual_weights: Array | None
     contact: NDArray[np.bool_]
     time: Array | None
     recovery: int | None
 
     @property
     def during(self) -> slice:
-        """The edited steps."""
+        """The steps of the intervention."""
         return slice(self.first, self.to)
 
     @property
     def carrier(self) -> str | None:
-        """The modality whose effective weight increased most over the edited steps, by at least ``MIN_INCREASE``."""
-        if self.effective_weights is None or self.edited_weights is None:
+        """The modality whose effective weight increased most during the intervention, by at least ``MIN_INCREASE``."""
+        if self.effective_weights is None or self.counterfactual_weights is None:
             return None
-        increase = (self.edited_weights - self.effective_weights)[self.during].mean(0)
+        increase = (self.counterfactual_weights - self.effective_weights)[self.during].mean(0)
         return self.modalities[int(increase.argmax())] if increase.max() > MIN_INCREASE else None
 
     @property
     def verdict(self) -> str:
         if not self.distance.any() and not self.sigmas.any():
-            return f"With {self.edit}, nothing changed."
+            return f"With {self.intervention}, nothing changed."
         peak = int(self.distance.argmax())
         largest = self.task.main_error.text(self.distance[peak])
-        text = f"With {self.edit}, the estimate moved by up to {largest} ({self._at(peak)})"
+        text = f"With {self.intervention}, the estimate moved by up to {largest} ({self._at(peak)})"
         others = {name: peak for name, peak in self._peaks().items() if name not in self._main()}
         for name, (change, step, unit) in others.items() if len(others) <= MAX_OTHERS else ():
             text += f" and the {name} by up to {change:.3g} {unit} ({self._at(step)})"
         text = f"{text}: {self._recovery()}. "
         main = self.task.main_error
-        before, after = (main.factor * float(error[self.during].mean()) for error in (self.error, self.edited_error))
-        text += f"Mean {main.name} error over the edited steps: {before:.2f} -> {after:.2f} {main.unit}".rstrip()
+        errors = (self.error, self.counterfactual_error)
+        before, after = (main.factor * float(error[self.during].mean()) for error in errors)
+        text += f"Mean {main.name} error during the intervention: {before:.2f} -> {after:.2f} {main.unit}".rstrip()
         return f"{text}{self._weight_text()}."
 
     def _recovery(self) -> str:
-        """Largest difference in standard deviations, and when the edited run recovered."""
+        """Largest difference in standard deviations, and when the run with the intervention recovered."""
         largest = float(self.sigmas[self.first :].max())
         text = f"at most {largest:.1f} standard deviations of the original"
         if largest <= RECOVERED or self.to >= len(self.sigmas):
@@ -117,19 +120,19 @@ class Counterfactual(Diagnostic):
             return f"{text}, not recovered by the last step"
         delay = self.recovery - self.to
         if not delay:
-            return f"{text}, recovered immediately after the edit"
+            return f"{text}, recovered immediately after the intervention"
         seconds = "" if self.time is None else f" ({self.time[self.recovery] - self.time[self.to]:.2f} s)"
-        return f"{text}, recovered {delay} steps{seconds} after the edit"
+        return f"{text}, recovered {delay} steps{seconds} after the intervention"
 
     def _at(self, step: int) -> str:
         """A step, and its time where the data have timestamps."""
         return f"step {step}" if self.time is None else f"step {step}, {self.time[step]:.2f} s"
 
     def _weight_text(self) -> str:
-        """Effective weight of the dominant modality during the edit."""
-        if self.effective_weights is None or self.edited_weights is None:
+        """Effective weight of the dominant modality during the intervention."""
+        if self.effective_weights is None or self.counterfactual_weights is None:
             return ""
-        before, after = self.effective_weights[self.during].mean(0), self.edited_weights[self.during].mean(0)
+        before, after = self.effective_weights[self.during].mean(0), self.counterfactual_weights[self.during].mean(0)
         name = self.carrier or self.modalities[int(after.argmax())]
         k = self.modalities.index(name)
         change = f"effective weight of {name} {before[k]:.2f} -> {after[k]:.2f}"
@@ -145,7 +148,7 @@ class Counterfactual(Diagnostic):
         """Component -> largest difference in display units, step, unit."""
         task = self.task
         units, factors = display_units(task)
-        difference = np.abs(task.difference(self.edited, self.original)) * factors
+        difference = np.abs(task.difference(self.counterfactual, self.original)) * factors
         steps = difference.argmax(0)
         return {
             component.label: (float(difference[steps[i], i]), int(steps[i]), units[i])
@@ -154,18 +157,18 @@ class Counterfactual(Diagnostic):
 
     def tables(self) -> list[Table]:
         main = self.task.main_error
-        spans = {"edited steps": self.during, "after": slice(self.to, None), "all": slice(None)}
+        spans = {"intervention": self.during, "after": slice(self.to, None), "all": slice(None)}
         rows: list[tuple[Value, ...]] = []
         for name, span in spans.items():
             if not len(self.error[span]):
                 continue
             values = (
                 main.factor * self.error[span].mean(),
-                main.factor * self.edited_error[span].mean(),
+                main.factor * self.counterfactual_error[span].mean(),
                 main.factor * self.distance[span].mean(),
             )
             rows.append((name, *map(float, values), _number(self.divergence[span].mean())))
-        names = (f"{name}, {main.unit}".rstrip(", ") for name in ("error", "error edited", "distance"))
+        names = (f"{name}, {main.unit}".rstrip(", ") for name in ("error", "error with intervention", "distance"))
         columns = ("steps", *names, "divergence, nats")
         tables = [Table("Mean over steps", columns, tuple(rows))]
         peaks = tuple(
@@ -183,14 +186,14 @@ class Counterfactual(Diagnostic):
         columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}".rstrip(", "))
         change = main.factor * self.modality_distance[self.during].mean(0)
         rows: list[tuple[Value, ...]] = [(m, float(change[k])) for k, m in enumerate(self.modalities)]
-        if self.effective_weights is not None and self.edited_weights is not None:
-            columns = (*columns, "effective weight", "effective weight edited")
-            both = (self.effective_weights[self.during].mean(0), self.edited_weights[self.during].mean(0))
+        if self.effective_weights is not None and self.counterfactual_weights is not None:
+            columns = (*columns, "effective weight", "effective weight with intervention")
+            both = (self.effective_weights[self.during].mean(0), self.counterfactual_weights[self.during].mean(0))
             rows = [(*row, float(both[0][k]), float(both[1][k])) for k, row in enumerate(rows)]
-        return Table("Mean over the edited steps", columns, tuple(rows))
+        return Table("Mean during the intervention", columns, tuple(rows))
 
     def curves(self) -> list[Curve]:
-        chart = "Distance between original and edited estimates"
+        chart = "Distance between original and counterfactual estimates"
         main = self.task.main_error
         scale, unit = main.factor, main.unit
         curves = [Curve("fused", scale * self.distance, chart, unit, "fused")]
@@ -201,11 +204,12 @@ class Counterfactual(Diagnostic):
                 "fused", self.sigmas, "Distance in standard deviations of the original", "", "fused", (0.0, RECOVERED)
             )
         )
-        for layer_error, name in ((self.error, "original"), (self.edited_error, "edited")):
+        for layer_error, name in ((self.error, "original"), (self.counterfactual_error, "with intervention")):
             curves.append(Curve(name, scale * layer_error, "Error", unit, "fused"))
-        if self.effective_weights is not None and self.edited_weights is not None:
+        if self.effective_weights is not None and self.counterfactual_weights is not None:
             for k, m in enumerate(self.modalities):
-                for weights, name in ((self.effective_weights, m), (self.edited_weights, f"{m} edited")):
+                both = ((self.effective_weights, m), (self.counterfactual_weights, f"{m} with intervention"))
+                for weights, name in both:
                     curves.append(Curve(name, weights[:, k], "Effective weights", "", m))
         task = self.task
         units, factors = display_units(task)
@@ -213,50 +217,53 @@ class Counterfactual(Diagnostic):
             for values, name, layer in (
                 (self.truth, "truth", "truth"),
                 (self.original, "original", "fused"),
-                (self.edited, "edited", "fused"),
+                (self.counterfactual, "with intervention", "fused"),
             ):
                 curves.append(Curve(name, factors[i] * values[:, i], component.label, units[i], layer))
         return curves
 
     def bands(self) -> dict[str, NDArray[np.bool_]]:
         steps = np.arange(len(self.distance))
-        return {"contact": self.contact, "edit": (steps >= self.first) & (steps < self.to)}
+        return {"contact": self.contact, "intervention": (steps >= self.first) & (steps < self.to)}
 
 
-def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
-    """Compare the traces of an original and an edited run. Raises BadInput for traces of different length."""
-    if len(original) != len(edited):
-        raise BadInput(f"traces of {len(original)} and {len(edited)} steps are not from one episode")
+def compare(original: Trace, counterfactual: Trace, intervention: Intervention) -> Counterfactual:
+    """Compare the traces of a run and of the same run with an intervention.
+
+    Raises BadInput for traces of different length.
+    """
+    if len(original) != len(counterfactual):
+        raise BadInput(f"traces of {len(original)} and {len(counterfactual)} steps are not from one episode")
     task = original.task
-    difference = task.difference(means(edited), means(original))
+    difference = task.difference(means(counterfactual), means(original))
     on_map = task.main_error.norm(difference)
     fused = difference[:, -1]
     weights = [
         None if trace.effective_weights is None else trace.effective_weights.mean(-1, dtype=np.float64)
-        for trace in (original, edited)
+        for trace in (original, counterfactual)
     ]
     sigmas = _mahalanobis(original, fused)
     return Counterfactual(
         task=task,
         filter=original.filter,
         modalities=original.modalities,
-        edit=str(edit),
-        first=edit.first,
-        to=edit.to,
+        intervention=str(intervention),
+        first=intervention.first,
+        to=intervention.to,
         truth=original.episode.states.astype(np.float64),
         original=original.estimate_mean.astype(np.float64),
-        edited=edited.estimate_mean.astype(np.float64),
+        counterfactual=counterfactual.estimate_mean.astype(np.float64),
         distance=on_map[:, -1],
         modality_distance=on_map[:, :-1],
         sigmas=sigmas,
-        divergence=_divergence(original, edited, fused),
+        divergence=_divergence(original, counterfactual, fused),
         error=main_error(original)[:, -1],
-        edited_error=main_error(edited)[:, -1],
+        counterfactual_error=main_error(counterfactual)[:, -1],
         effective_weights=weights[0],
-        edited_weights=weights[1],
+        counterfactual_weights=weights[1],
         contact=original.episode.contact.astype(bool),
         time=original.episode.time,
-        recovery=_recovery_step(sigmas, edit.to),
+        recovery=_recovery_step(sigmas, intervention.to),
     )
 
 
@@ -270,17 +277,17 @@ def _mahalanobis(original: Trace, difference: Array) -> Array:
     return np.sqrt(np.maximum(np.einsum("tn,tn->t", difference, white) / difference.shape[-1], 0.0))
 
 
-def _divergence(original: Trace, edited: Trace, difference: Array) -> Array:
+def _divergence(original: Trace, counterfactual: Trace, difference: Array) -> Array:
     """(T,) nats: ``KL(N(m, S) || N(m', S')) = (tr S'^-1 S + d^T S'^-1 d - n + ln det S' - ln det S) / 2``."""
     if not original.has_covariance:
         return np.full(len(original), np.nan)
-    s, s_edited = covariances(original)[:, -1], covariances(edited)[:, -1]
+    s, s_counterfactual = covariances(original)[:, -1], covariances(counterfactual)[:, -1]
     both = np.concatenate([s, difference[..., None]], axis=-1)
-    solved = np.linalg.solve(s_edited, both)
+    solved = np.linalg.solve(s_counterfactual, both)
     n = s.shape[-1]
     trace_term = np.einsum("tii->t", solved[..., :n])
     quadratic = np.einsum("tn,tn->t", difference, solved[..., n])
-    volume = np.linalg.slogdet(s_edited).logabsdet - np.linalg.slogdet(s).logabsdet
+    volume = np.linalg.slogdet(s_counterfactual).logabsdet - np.linalg.slogdet(s).logabsdet
     return 0.5 * (trace_term + quadratic - n + volume)
 
 

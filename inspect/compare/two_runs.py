@@ -1,6 +1,6 @@
 """Comparison of two runs over one episode: different filters or different sensor faults.
 
-For edits over a range of steps see ``inspect/compare/counterfactual.py``.
+For interventions over a range of steps see ``inspect/compare/counterfactual.py``.
 """
 
 from __future__ import annotations

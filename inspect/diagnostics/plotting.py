@@ -50,7 +50,7 @@ FORMATS: dict[str, dict[str, Any]] = {
 BANDS = {
     "contact": {"facecolor": COLOURS["contact"], "alpha": 0.2},
     "blackout": {"facecolor": "#000000", "alpha": 0.12},
-    "edit": {"facecolor": "#0072B2", "alpha": 0.12},
+    "intervention": {"facecolor": "#0072B2", "alpha": 0.12},
 }
 OTHER_BAND = {"facecolor": "#999999", "alpha": 0.25}
 

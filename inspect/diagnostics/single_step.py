@@ -19,7 +19,7 @@ from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.filters.models.sequence import SequenceModel
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.views import Array
-from beliefscope.inspect.traces.replay import Edit, Replay, repeat_belief
+from beliefscope.inspect.traces.replay import Intervention, Replay, repeat_belief
 
 CHANNEL_UNITS = {"effector_position": ("cm", 100.0), "force": ("N", 1.0), "torque": ("N m", 1.0)}
 """Observation key -> display unit of its channels and the conversion factor."""
@@ -92,8 +92,9 @@ class SingleStep:
         truth, estimate = replay.batch.states[step, 0], replay.original.estimate_mean[step]
         place = truth if at == "truth" else torch.from_numpy(estimate)
         self.place = filter_.statistics.standardise("state", place)
-        edits = map(Edit.from_json, replay.original.settings.get("edits", []))
-        self._edits = [Edit(0, 1, weights=e.weights) for e in edits if e.weights and e.first <= step < e.to]
+        given = map(Intervention.from_json, replay.original.settings.get("edits", []))
+        manual = (intervention.weights for intervention in given if intervention.first <= step < intervention.to)
+        self._interventions = [Intervention(0, 1, weights=weights) for weights in manual if weights]
         self.targets = {target.name: target for target in self._targets()}
 
     def target(self, name: str) -> Target:
@@ -135,8 +136,8 @@ class SingleStep:
                 present=None if batch.present is None else expand(batch.present),
             )
         )[-1:]
-        for edit in self._edits:
-            evidence = self.replay.apply_weights(evidence, edit)
+        for intervention in self._interventions:
+            evidence = self.replay.apply_weights(evidence, intervention)
         belief = repeat_belief(self.replay.beliefs[self.step], count)
         _, trace = self.filter.step(belief, evidence[0], self.replay.generator(self.step, Common))
         return trace, evidence[0]

@@ -282,7 +282,7 @@ class MapEngine:
         assert trace.log_likelihood is not None
         prior, particle_likelihood = trace.prior_log_weights[step], trace.log_likelihood[step]
         scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(particle_likelihood)[None])[0]
-        # The trace's weights: they may have been edited.
+        # The trace's weights: they may be manual.
         log_weights = None if trace.weights is None else torch.from_numpy(trace.weights[step]).log()
         values = torch.cat([unimodal, mixture(unimodal - scale, log_weights).unsqueeze(0)])
         if quantity == "posterior":

@@ -1,4 +1,4 @@
-"""Repeated runs of external filters: with edited sensors, and with some of their modalities only."""
+"""Repeated runs of external filters: with interventions in sensors, and with some of their modalities only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import ARRAYS, Trace
 from beliefscope.inspect.traces.external import run_external
-from beliefscope.inspect.traces.replay import Edit, Replay, equal
+from beliefscope.inspect.traces.replay import Intervention, Replay, equal
 
 Progress = Callable[[float], None] | None
 
@@ -56,8 +56,8 @@ class ExternalReplay:
         if not 0 <= step < len(self.original):
             raise BadInput(f"step {step} is not in this trace: it has steps 0 to {len(self.original) - 1}")
 
-    def edited(self, edit: Edit) -> Trace:
-        """Trace of the edited run, with the original's initial state and random numbers, as ``Replay.edited``.
+    def with_intervention(self, intervention: Intervention) -> Trace:
+        """Trace of the run with an intervention, with the original's initial state and random numbers, as ``Replay``.
 
         All steps are run again, since only the filter knows which of them an input changes: a smoother also revises
         earlier ones.
@@ -65,12 +65,12 @@ class ExternalReplay:
         Raises BadInput for weights, unknown sensors, and steps outside the trace.
         """
         original = self.original
-        edit.check(self._external, len(original))
-        episode = edit.timed_faults.apply(original.episode, original.seed)
-        edits = [*original.settings.get("edits", []), edit.to_json()]
+        intervention.check(self._external, len(original))
+        episode = intervention.timed_faults.apply(original.episode, original.seed)
+        interventions = [*original.settings.get("edits", []), intervention.to_json()]
         provenance = {name: getattr(original, name) for name in PROVENANCE} | {
-            "faults": original.faults + edit.timed_faults,
-            "settings": {**original.settings, "edits": edits},
+            "faults": original.faults + intervention.timed_faults,
+            "settings": {**original.settings, "edits": interventions},
         }
         if self._state is not None:
             self._external.restore(self._state)

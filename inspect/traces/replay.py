@@ -1,4 +1,4 @@
-"""Replay of a traced run from any step, unchanged or with sensor faults or fusion weights edited."""
+"""Replay of a traced run from any step, unchanged or with interventions: sensor faults or manual fusion weights."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from beliefscope.inspect.traces.run import assemble_trace, step_arrays, with_few
 
 
 @dataclass(frozen=True)
-class Edit:
+class Intervention:
     """An intervention over steps ``first`` to ``to - 1``.
 
     Attributes:
         first: first step.
-        to: first step after the edit.
-        faults: sensor faults to inject in addition to those of the run. They use the edit's steps; a fault with its
-            own steps is rejected.
+        to: first step after the intervention.
+        faults: sensor faults to inject in addition to those of the run. They use the intervention's steps; a fault
+            with its own steps is rejected.
         weights: modality -> beta, 0 to 1, replacing the network output in all components. Other modalities share the
             remainder in the network's proportions; if all modalities are given, the values sum to one.
 
@@ -49,17 +49,18 @@ class Edit:
 
     def __post_init__(self) -> None:
         if not 0 <= self.first < self.to:
-            raise BadInput(f"an edit from step {self.first} to {self.to} has no steps: 'to' is the first step after it")
+            span = f"from step {self.first} to {self.to}"
+            raise BadInput(f"an intervention {span} has no steps: 'to' is the first step after it")
         for fault in self.faults:
             if fault.from_ != 0 or fault.to is not None:
-                raise BadInput(f"{fault} has its own steps; faults of an edit use the steps of the edit")
+                raise BadInput(f"{fault} has its own steps; faults of an intervention use its steps")
         total = sum(self.weights.values())
         if not all(0.0 <= beta <= 1.0 for beta in self.weights.values()) or total > 1.0 + 1e-6:
             text = ", ".join(f"{name}={beta:g}" for name, beta in self.weights.items())
             raise BadInput(f"weights {text}: each weight and their sum must be between 0 and 1")
 
     @classmethod
-    def parse(cls, text: str) -> Edit:
+    def parse(cls, text: str) -> Intervention:
         """Parse URL syntax: ``from=20&to=40&faults=blackout&weights=image=0.9``.
 
         Raises BadInput for invalid text, and if it has neither faults nor weights.
@@ -67,30 +68,30 @@ class Edit:
         values = dict(parse_qsl(text, keep_blank_values=True))
         keys = ("from", "to", "faults", "weights")
         for key in values:
-            check_name("part of an edit", key, keys)
-        edit = cls(
+            check_name("part of an intervention", key, keys)
+        intervention = cls(
             _step(text, values, "from"),
             _step(text, values, "to"),
             Faults.parse(values.get("faults", "")),
             parse_weights(values.get("weights", "")),
         )
-        if not edit.faults and not edit.weights:
-            raise BadInput(f"edit {text!r} is empty: give faults, weights or both")
-        return edit
+        if not intervention.faults and not intervention.weights:
+            raise BadInput(f"intervention {text!r} is empty: give faults, weights or both")
+        return intervention
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Edit:
+    def from_json(cls, value: Mapping[str, Any]) -> Intervention:
         """Inverse of ``to_json``; earlier versions wrote ``faults`` as ``recipe``."""
         faults = value["faults"] if "faults" in value else value["recipe"]
         return cls(value["from"], value["to"], Faults.from_json(faults), value["weights"])
 
     @property
     def timed_faults(self) -> Faults:
-        """The faults, restricted to the edited steps."""
+        """The faults, restricted to the steps of the intervention."""
         return Faults(tuple(replace(fault, from_=self.first, to=self.to) for fault in self.faults))
 
     def check(self, checkpoint: Checkpoint, steps: int) -> None:
-        """Raise BadInput if the edit does not fit a filter and an episode of that many steps."""
+        """Raise BadInput if the intervention does not fit a filter and an episode of that many steps."""
         if self.first >= steps:
             raise BadInput(f"step {self.first} is not in this episode: it has steps 0 to {steps - 1}")
         if self.to > steps:
@@ -103,7 +104,8 @@ class Edit:
         if not self.weights:
             return
         if isinstance(checkpoint, ExternalFilter):
-            raise BadInput(f"{checkpoint.name} is an external filter: its fusion weights cannot be set; edit a sensor")
+            name = checkpoint.name
+            raise BadInput(f"{name} is an external filter: its fusion weights cannot be set; use sensor faults")
         names = checkpoint.filter.names
         for name in self.weights:
             check_name(f"modality of filter {checkpoint.name!r}", name, names)
@@ -114,7 +116,7 @@ class Edit:
             raise BadInput(f"weights of all modalities sum to {total:g}; they must sum to 1")
 
     def mask(self, steps: int) -> NDArray[np.bool_]:
-        """(T,) mask of the edited steps."""
+        """(T,) mask of the steps of the intervention."""
         index = np.arange(steps)
         return (index >= self.first) & (index < self.to)
 
@@ -151,7 +153,7 @@ def parse_weights(text: str) -> dict[str, float]:
 def _step(text: str, values: Mapping[str, str], key: str) -> int:
     value = values.get(key, "")
     if not (value.isascii() and value.isdigit() and len(value) < 10):
-        raise BadInput(f"{key!r} of edit {text!r} must be a step, an integer from 0, not {value!r}")
+        raise BadInput(f"{key!r} of intervention {text!r} must be a step, an integer from 0, not {value!r}")
     return int(value)
 
 
@@ -179,8 +181,8 @@ class Replay:
         self.batch = Steps.from_episodes(filter_.task, [trace.episode]).episode(0)
         self.evidence = filter_.encode(self.batch)
         self._standalone = trace.settings.get("standalone", "")
-        for edit in trace.settings.get("edits", []):
-            self.evidence = self.apply_weights(self.evidence, Edit.from_json(edit))
+        for intervention in trace.settings.get("edits", []):
+            self.evidence = self.apply_weights(self.evidence, Intervention.from_json(intervention))
         if self._standalone:
             self.evidence = standalone_evidence(filter_, self.batch, self.evidence, self._standalone)
         self.start = first_belief(filter_, self.batch)
@@ -215,36 +217,36 @@ class Replay:
 
     @one_thread()
     @torch.no_grad()
-    def edited(self, edit: Edit) -> Trace:
-        """Trace of the edited run, from the belief before step ``edit.first`` with the original's random numbers.
+    def with_intervention(self, intervention: Intervention) -> Trace:
+        """Trace from the belief before step ``intervention.first``, with the original's random numbers.
 
-        The number of random draws per step does not depend on the observation, so an edit without effect reproduces
-        the original bit for bit. The faults of the result are the original's followed by the edit's, which are injected
-        into the observations of the original run. ``settings`` lists the ``edits``.
+        The number of random draws per step does not depend on the observation, so an intervention without effect
+        reproduces the original bit for bit. The faults of the result are the original's followed by the intervention's,
+        which are injected into the observations of the original run. ``settings`` lists the interventions as ``edits``.
 
         Raises BadInput for an unknown sensor or modality, weights for a filter without a weight model, and steps
         outside the trace.
         """
-        edit.check(self.checkpoint, len(self.beliefs))
+        intervention.check(self.checkpoint, len(self.beliefs))
         filter_, original = self.checkpoint.filter, self.original
-        episode = edit.timed_faults.apply(original.episode, original.seed)
+        episode = intervention.timed_faults.apply(original.episode, original.seed)
         evidence = self.evidence
-        if edit.faults:
+        if intervention.faults:
             batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
             evidence = filter_.encode(batch)
             if self._standalone:
                 evidence = standalone_evidence(filter_, batch, evidence, self._standalone)
-        edits = [*original.settings.get("edits", []), edit.to_json()]
-        for values in edits:
-            evidence = self.apply_weights(evidence, Edit.from_json(values))
-        belief, generator = self.beliefs[edit.first], self.generator(edit.first)
-        steps = self.steps[: edit.first]
-        for t in range(edit.first, len(self.beliefs)):
+        interventions = [*original.settings.get("edits", []), intervention.to_json()]
+        for values in interventions:
+            evidence = self.apply_weights(evidence, Intervention.from_json(values))
+        belief, generator = self.beliefs[intervention.first], self.generator(intervention.first)
+        steps = self.steps[: intervention.first]
+        for t in range(intervention.first, len(self.beliefs)):
             belief, step = filter_.step(belief, evidence[t], generator)
             steps.append(step)
         provenance = self._provenance | {
-            "faults": original.faults + edit.timed_faults,
-            "settings": {**original.settings, "edits": edits},
+            "faults": original.faults + intervention.timed_faults,
+            "settings": {**original.settings, "edits": interventions},
         }
         return self._trace(episode, evidence, steps, provenance)
 
@@ -254,20 +256,20 @@ class Replay:
         arrays = with_fewer_particles(step_arrays(self.checkpoint, evidence, steps), self._kept)
         return assemble_trace(self.checkpoint, episode, self.start, arrays, **provenance)
 
-    def apply_weights(self, evidence: Evidence, edit: Edit) -> Evidence:
-        """Replace beta in the evidence by the weights of an edit."""
-        if not edit.weights:
+    def apply_weights(self, evidence: Evidence, intervention: Intervention) -> Evidence:
+        """Replace beta in the evidence by the weights of an intervention."""
+        if not intervention.weights:
             return evidence
-        edit.check_weights(self.checkpoint)
+        intervention.check_weights(self.checkpoint)
         if self._standalone:
             raise BadInput(f"{self._standalone} standalone has no fusion weights: it uses one modality")
         assert evidence.log_weights is not None
         names = self.checkpoint.filter.names
-        span = slice(edit.first, edit.to)
+        span = slice(intervention.first, intervention.to)
         beta = evidence.log_weights[span].exp()
-        manual = torch.tensor([edit.weights.get(name, torch.nan) for name in names]).unsqueeze(-1)
+        manual = torch.tensor([intervention.weights.get(name, torch.nan) for name in names]).unsqueeze(-1)
         automatic = manual.isnan()
-        remainder = max(0.0, 1.0 - sum(edit.weights.values()))
+        remainder = max(0.0, 1.0 - sum(intervention.weights.values()))
         others = (beta * automatic).sum(-2, keepdim=True).clamp_min(torch.finfo(beta.dtype).tiny)  # 0 if absent
         log_weights = evidence.log_weights.clone()
         log_weights[span] = torch.where(automatic, remainder * beta / others, manual).log()

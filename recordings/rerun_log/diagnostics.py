@@ -25,7 +25,7 @@ NEUTRAL_COLOUR = "#9A9A9A"
 TAB_HEIGHT, TEXT_HEIGHT, AXIS_HEIGHT, LANE_HEIGHT, CHART_HEIGHT = 800.0, 230.0, 56.0, 41.0, 110.0
 """Points: of a tab in a typical window, its text, the axis and each lane of the bands, and a chart at least."""
 
-BAND_COLOURS = {"contact": "#CC79A7", "blackout": "#808080", "edit": "#0072B2"}
+BAND_COLOURS = {"contact": "#CC79A7", "blackout": "#808080", "intervention": "#0072B2"}
 
 
 def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, name: str, trace: Trace) -> None:

@@ -29,13 +29,13 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
     form.get_by_role("button", name="Compare").click()
     assert "The intervention is empty" in form.locator(".error").text_content()
-    form.locator("[name=edit_faults]").select_option("blackout=0.8")
+    form.locator("[name=intervention_faults]").select_option("blackout=0.8")
     form.get_by_role("button", name="Compare").click()
     page.until(READY)
     assert page.state["against"] == "from=45&to=56&faults=blackout=0.8"
     assert "over steps 45 to 55" in verdict(page)
     assert difference(page) > 0.0  # at the last step of the intervention
-    assert page.page.locator("#comparison-key").text_content().strip() == "edited"
+    assert page.page.locator("#comparison-key").text_content().strip() == "with intervention"
     for _ in range(11):
         keyboard.press("ArrowLeft")
     page.until("() => beliefscope.state().step === 44 && document.querySelector('#readout b').textContent[0] === '4'")
@@ -47,7 +47,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     second.until(READY)
     assert second.state == page.state
     assert verdict(second) == verdict(page)
-    second.screenshot("compare-edit")
+    second.screenshot("compare-intervention")
 
     keyboard.press("Control+z")
     page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")

@@ -33,7 +33,7 @@ from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.sweep import summary
 from beliefscope.inspect.trace import Trace, trace
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.report.compose import compose, write_report
@@ -207,8 +207,8 @@ def test_columns_of_a_component_without_a_unit_name_none() -> None:
     filter_ = ExternalFilter(Adapter(Kalman(), modalities=("thermometer",), initial_std=(0.3,)), plain, "kalman")
     run = trace(filter_, episode(plain, 0))
     results, _ = run_diagnostics([run], filter_, {name: {} for name in DIAGNOSTICS}, True)
-    edited = replace(run, estimate_mean=run.estimate_mean + 0.1)
-    compared = [compare_runs(run, edited), compare(run, edited, Edit(5, 9))]
+    counterfactual = replace(run, estimate_mean=run.estimate_mean + 0.1)
+    compared = [compare_runs(run, counterfactual), compare(run, counterfactual, Intervention(5, 9))]
     for table in (table for result in (*results.values(), *compared) for table in result.tables()):
         cells = [*table.columns, *(cell for row in table.rows for cell in row if isinstance(cell, str))]
         assert not [text for text in cells if "()" in text or text != text.strip(", ")], table.title

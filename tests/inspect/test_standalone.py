@@ -24,7 +24,7 @@ from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import ARRAYS, Trace, load_trace, save_trace, trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "filters" / "models"))
 import linear_system as linear
@@ -111,8 +111,8 @@ def test_other_observations_and_weights_have_no_effect(name: str, episode: Episo
     assert equal(result, standalone(checkpoint, other, "haptics"), ("estimate_mean", "estimate_covariance"))
     assert not equal(result, run, ("estimate_mean",))
     if run.weights is not None:
-        edited = Replay(checkpoint, run).edited(Edit(0, STEPS, weights={"haptics": 0.0}))
-        assert equal(result, standalone(checkpoint, edited, "haptics"))
+        counterfactual = Replay(checkpoint, run).with_intervention(Intervention(0, STEPS, weights={"haptics": 0.0}))
+        assert equal(result, standalone(checkpoint, counterfactual, "haptics"))
     if len(run.modalities) == 2:
         assert result.modalities == ("haptics",)
         np.testing.assert_allclose(result.modality_mean[:, 0], result.estimate_mean, atol=1e-6)
@@ -144,8 +144,8 @@ def test_standalone_trace_is_saved_and_replayed_exactly(episode: Episode, tmp_pa
     replay = Replay(checkpoint, loaded)
     assert replay.exact
     with pytest.raises(BadInput, match="image standalone has no fusion weights"):
-        replay.edited(Edit(3, 5, weights={"image": 0.5}))
-    darkened = replay.edited(Edit(3, 5, faults=Faults.parse("blackout=1")))
+        replay.with_intervention(Intervention(3, 5, weights={"image": 0.5}))
+    darkened = replay.with_intervention(Intervention(3, 5, faults=Faults.parse("blackout=1")))
     assert np.array_equal(darkened.estimate_mean[:3], loaded.estimate_mean[:3])
     assert darkened.modalities == ("image",)
 

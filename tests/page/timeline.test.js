@@ -255,7 +255,7 @@ function shaded(shading) {
     bbox: { left: 0, top: 0, width: 1000, height: 80 },
     valToPos: (step) => 10 * step,
   };
-  shadeIntervals(plot, { contact: [], blackout: [], edits: [], ...shading }, true);
+  shadeIntervals(plot, { contact: [], blackout: [], interventions: [], ...shading }, true);
   return { texts, rows };
 }
 

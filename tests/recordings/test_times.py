@@ -28,7 +28,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.slices.covariates import _step_columns
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 from beliefscope.recordings.export import as_parquet
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.live_episode import record_steps
@@ -192,13 +192,13 @@ def test_figures_are_drawn_over_the_times(run: Trace, episode: Episode) -> None:
 
 
 def test_tables_name_the_times(run: Trace, episode: Episode) -> None:
-    edited = replace(run, estimate_mean=run.estimate_mean + np.where(np.arange(60) == 9, 0.5, 0.0)[:, None])
-    edited = replace(edited, estimate_mean=edited.estimate_mean.astype(np.float32))
-    result = compare(run, edited, Edit(5, 9, Faults.parse("sensor_bias=range:offset=1")))
+    counterfactual = replace(run, estimate_mean=run.estimate_mean + np.where(np.arange(60) == 9, 0.5, 0.0)[:, None])
+    counterfactual = replace(counterfactual, estimate_mean=counterfactual.estimate_mean.astype(np.float32))
+    result = compare(run, counterfactual, Intervention(5, 9, Faults.parse("sensor_bias=range:offset=1")))
     assert f"(step 9, {episode.times[9]:.2f} s)" in result.verdict
     table = next(table for table in result.tables() if table.title == "Largest difference of the estimates")
     assert (table.columns[-1], table.rows[0][-2:]) == ("time s", (9, episode.times[9]))
-    assert f"(step 9, {episode.times[9]:.2f} s)" in compare_runs(run, edited).verdict
+    assert f"(step 9, {episode.times[9]:.2f} s)" in compare_runs(run, counterfactual).verdict
     assert event_table(run, 9, None).title == f"Step 9 ({episode.times[9]:.2f} s) of episode 0"
     plain = replace(run, episode=replace(episode, time=None))
     assert event_table(plain, 9, None).title == "Step 9 of episode 0"

@@ -35,25 +35,25 @@ def counterfactual(
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.trace import save_trace, trace
     from beliefscope.inspect.traces.external_replay import open_replay
-    from beliefscope.inspect.traces.replay import Edit, parse_weights
+    from beliefscope.inspect.traces.replay import Intervention, parse_weights
 
     if output is not None:
         figure_format(output)
     checkpoint, faults = run.open()
-    edit = Edit(first, to, faults, parse_weights(weights))
-    if not edit.faults and not edit.weights:
+    intervention = Intervention(first, to, faults, parse_weights(weights))
+    if not intervention.faults and not intervention.weights:
         raise BadInput("no intervention: give --faults, --weights or both")
     recorded, index = run.read_episode(checkpoint.task)
-    edit.check(checkpoint, len(recorded))
+    intervention.check(checkpoint, len(recorded))
     with console.progress("Filtering") as advance:
         original = trace(checkpoint, recorded, index, run.seed, run.particles)
         replay = open_replay(checkpoint, original, progress=advance)
-        edited = replay.edited(edit)
-    result = compare(replay.original, edited, edit)
+        counterfactual = replay.with_intervention(intervention)
+    result = compare(replay.original, counterfactual, intervention)
     if output is not None:
         write_figure(result.plot(result.time), output)
     if trace_path is not None:
-        save_trace(edited, trace_path)
+        save_trace(counterfactual, trace_path)
     document = {
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
@@ -62,6 +62,6 @@ def counterfactual(
         "checkpoint_hash": checkpoint.hash,
         "data_hash": original.data_hash,
         **result.to_dict(),
-        "edit": edit.to_json(),
+        "intervention": intervention.to_json(),
     }
     return console.Result(document, "\n\n".join([result.verdict, *console.grids(result.tables())]))

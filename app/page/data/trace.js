@@ -227,7 +227,7 @@ export class Trace {
   }
 
   /** First and last step of each intervention. @returns {[number, number][]} */
-  get edits() {
+  get interventions() {
     return (this.header.settings?.edits ?? []).map(({ from, to }) => [from, to - 1]);
   }
 

@@ -116,7 +116,7 @@ export class ComparisonTab {
       const other = await api.loadTrace(task, selection, progress, signal);
       const result = await api.comparison(selection, signal);
       const label = result.names[1];
-      this.#setOther(other, label, result.edit ? 'the run with the intervention' : label);
+      this.#setOther(other, label, result.intervention ? 'the run with the intervention' : label);
       this.#show(result);
       setPanelState(this.#result, 'ready');
     } catch (error) {

@@ -10,14 +10,14 @@ import { fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
 
-/** @typedef {'filter' | 'faults' | 'only' | 'edit'} Kind of comparison */
+/** @typedef {'filter' | 'faults' | 'only' | 'intervention'} Kind of comparison */
 
 /** @type {[Kind, string][]} */
 const KINDS = [
   ['filter', 'another filter'],
   ['faults', 'other sensor faults'],
   ['only', 'one modality'],
-  ['edit', 'an intervention'],
+  ['intervention', 'an intervention'],
 ];
 const DEFAULT_SPAN = 20; // steps of an intervention
 
@@ -36,7 +36,7 @@ const joined = (pairs) =>
  * @returns {Kind}
  */
 function kindOf(against) {
-  if (against.has('from')) return 'edit';
+  if (against.has('from')) return 'intervention';
   if (against.has('only')) return 'only';
   return against.has('faults') && !against.has('filter') ? 'faults' : 'filter';
 }
@@ -83,8 +83,8 @@ export class ComparisonForm {
       choose: (faults) => ((this.#faults = faults), this.#setError('')),
       check: async (faults) => faults && check(joined([['faults', faults]])),
     });
-    const editSelect = element('[name=edit_faults]', HTMLSelectElement, form);
-    this.#showEditFaults = faultPicker(editSelect, dialog, {
+    const interventionSelect = element('[name=intervention_faults]', HTMLSelectElement, form);
+    this.#showEditFaults = faultPicker(interventionSelect, dialog, {
       none: 'unchanged',
       selected: () => this.#editFaults,
       choose: (faults) => ((this.#editFaults = faults), this.#setError('')),
@@ -120,7 +120,7 @@ export class ComparisonForm {
     for (const modality of this.#manual.keys())
       if (!trace.modalities.includes(modality)) this.#manual.delete(modality);
     if (against) this.#read(new URLSearchParams(against));
-    else if (!others.length && this.#kind === 'filter') this.#kind = 'edit';
+    else if (!others.length && this.#kind === 'filter') this.#kind = 'intervention';
     this.#clearButton.disabled = !against;
     const presets = task?.fault_presets ?? [];
     if (!against && this.#faults === faults)
@@ -142,7 +142,7 @@ export class ComparisonForm {
     if (end === 'from') [first, last] = [step, last < step ? step + DEFAULT_SPAN - 1 : last];
     else [first, last] = [first > step ? Math.max(0, step - DEFAULT_SPAN + 1) : first, step];
     this.#setSpan(first, last);
-    this.#kind = 'edit';
+    this.#kind = 'intervention';
     this.#showKind();
     this.#showBetas();
   }
@@ -158,7 +158,7 @@ export class ComparisonForm {
       this.#filter.value = filter;
     if (this.#kind === 'only') this.#only.value = against.get('only') ?? '';
     if (this.#kind === 'faults') this.#faults = against.get('faults') ?? '';
-    if (this.#kind !== 'edit') return;
+    if (this.#kind !== 'intervention') return;
     this.#setSpan(Number(against.get('from')), Number(against.get('to')) - 1);
     this.#editFaults = against.get('faults') ?? '';
     const weights = (against.get('weights') ?? '').split(',').filter(Boolean);
@@ -243,7 +243,7 @@ export class ComparisonForm {
     const parts = this.#form.querySelectorAll('[data-kind]');
     for (const part of parts) part.hidden = part.dataset.kind !== this.#kind;
     const isExternal = this.#trace?.header.kind === 'external';
-    html('[data-kind="edit"] > .why-not', this.#form).textContent = isExternal
+    html('[data-kind="intervention"] > .why-not', this.#form).textContent = isExternal
       ? 'Interventions on the page need a built-in filter. For an external filter, use beliefscope counterfactual.'
       : '';
     const noInputs = !this.#only.options.length;
@@ -252,10 +252,10 @@ export class ComparisonForm {
       ? 'This filter has no separate modalities to run standalone.'
       : 'The same filter and random numbers, without the observations of all other modalities.';
     html('.betas', this.#form).hidden = isExternal;
-    const fields = this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)');
+    const fields = this.#form.querySelectorAll('[data-kind="intervention"] :is(input, select)');
     for (const field of fields) field.toggleAttribute('disabled', isExternal);
     element('.run', HTMLButtonElement, this.#form).disabled =
-      (this.#kind === 'edit' && isExternal) ||
+      (this.#kind === 'intervention' && isExternal) ||
       (this.#kind === 'only' && noInputs) ||
       (this.#kind === 'filter' && this.#filter.disabled);
   }
@@ -319,7 +319,7 @@ export class ComparisonForm {
   }
 
   /**
-   * Returns a modality and the mean of its weight over the edited steps, for the first component.
+   * Returns a modality and the mean of its weight over the steps of the intervention, for the first component.
    * @param {string} modality
    * @returns {[string, number]}
    */

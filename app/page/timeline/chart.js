@@ -31,7 +31,7 @@ import { STEPS } from './step_axis.js';
  * @property {string} [note] text in place of a chart
  *
  * @typedef {[first: number, last: number]} Interval of steps
- * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[], failure?: Interval[], repair?: Interval[], faulty?: Interval[], label?: string, faultLabel?: string}} Shading faulty: with injected faults; label: of the shaded steps
+ * @typedef {{contact: Interval[], blackout: Interval[], interventions: Interval[], failure?: Interval[], repair?: Interval[], faulty?: Interval[], label?: string, faultLabel?: string}} Shading faulty: with injected faults; label: of the shaded steps
  *
  * @typedef {object} Frame
  * @property {number} width px
@@ -283,7 +283,7 @@ function extremesOf({ name, values, sigma }, first, last) {
  * @param {StepAxis} [axis]
  */
 export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
-  const { contact, blackout, edits, failure = [], repair = [], faulty = [] } = shading;
+  const { contact, blackout, interventions, failure = [], repair = [], faulty = [] } = shading;
   const { ctx, bbox } = plot;
   /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] @param {number} [top] */
   const shade = (intervals, fill, height = bbox.height, top = bbox.top) => {
@@ -297,7 +297,7 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
   };
   const line = LINE_HEIGHT * devicePixelRatio;
   ctx.save();
-  shade(edits, translucent(colour('accent'), 0.12));
+  shade(interventions, translucent(colour('accent'), 0.12));
   if (hasAreas) {
     const strip = STRIP_HEIGHT * devicePixelRatio;
     const bottom = bbox.top + bbox.height - strip;

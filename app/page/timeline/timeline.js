@@ -47,7 +47,7 @@ export class Timeline {
   /** @type {Track[]} */
   #tracks = [];
   /** @type {Shading} */
-  #shading = { contact: [], blackout: [], edits: [] };
+  #shading = { contact: [], blackout: [], interventions: [] };
   /** @type {Chart[]} */
   #charts = [];
   /** @type {ValueCell[]} */
@@ -402,7 +402,7 @@ export class Timeline {
       blackout: intervals(this.#trace.blackout),
       faulty: intervals(this.#trace.faulty),
       faultLabel: this.#trace.faultLabel,
-      edits: this.#activeComparison?.edits ?? [],
+      interventions: this.#activeComparison?.interventions ?? [],
     });
   }
 

@@ -41,7 +41,7 @@ export interface components {
         };
         /**
          * Comparison
-         * @description Comparison of two runs. edit: description of the intervention, or None.
+         * @description Comparison of two runs. intervention: in words, or None.
          */
         Comparison: {
             /** Verdict */
@@ -63,8 +63,8 @@ export interface components {
                 string,
                 string
             ];
-            /** Edit */
-            edit: string | null;
+            /** Intervention */
+            intervention: string | null;
         };
         /**
          * Component

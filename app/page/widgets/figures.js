@@ -113,7 +113,7 @@ export class Figures {
     const shading = {
       contact: intervals(bands.contact ?? []),
       blackout: intervals(bands.blackout ?? []),
-      edits: intervals(bands.edit ?? []),
+      interventions: intervals(bands.intervention ?? []),
     };
     const hiddenLabels = {
       ticks: { show: false },

@@ -18,7 +18,7 @@ from beliefscope.app.server.main import create_app
 from beliefscope.app.views.scene import Scene
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.figures.scene_shapes import OUTLINE_EDGES, dashed
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 
 pytestmark = pytest.mark.slow
 
@@ -61,15 +61,15 @@ def estimate(client: TestClient, run: str = EKF, **query: Any) -> np.ndarray[Any
 @pytest.mark.parametrize("filter_", ["crossmodal-ekf", "crossmodal-pf"])
 def test_intervention_does_not_affect_earlier_steps(server: TestClient, filter_: str) -> None:
     run = f"door/{filter_}/{EPISODE}"
-    original, edited = estimate(server, run), estimate(server, run, against=EDIT)
-    assert np.array_equal(original[:40], edited[:40])
-    assert (original[40:60] != edited[40:60]).any(axis=1).all()
+    original, counterfactual = estimate(server, run), estimate(server, run, against=EDIT)
+    assert np.array_equal(original[:40], counterfactual[:40])
+    assert (original[40:60] != counterfactual[40:60]).any(axis=1).all()
     result = compare(server, EDIT, run)
-    assert result["names"] == ["original", "edited"]
+    assert result["names"] == ["original", "with intervention"]
     distance = np.array(next(c["values"] for c in result["curves"] if c["name"] == "fused"))
     assert not distance[:40].any()
     assert distance[40:60].all()
-    assert [t for t, edit in enumerate(result["bands"]["edit"]) if edit] == list(range(40, 60))
+    assert [t for t, intervention in enumerate(result["bands"]["intervention"]) if intervention] == list(range(40, 60))
     assert "haptics" in result["verdict"]
 
 
@@ -125,12 +125,12 @@ def test_compare_with_another_filter_or_other_faults(
         ("only=touch", "Modality 'touch' is not in this filter. Available: image, haptics."),
         ("only=image&filter=crossmodal-pf", "the comparison run"),
         ("from=40&to=60", "is empty: give faults"),
-        ("from=40&faults=blackout", "'to' of edit"),
+        ("from=40&faults=blackout", "'to' of intervention"),
         ("from=60&to=40&faults=blackout", "has no steps"),
         ("from=40&to=5000&faults=blackout", "after the last step of this episode"),
         ("from=40&to=60&weights=touch=1", "touch"),
         ("from=40&to=60&weights=image=2", "must be between 0 and 1"),
-        ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part of an edit"),
+        ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part of an intervention"),
         ("from=40&to=60&faults=blackout:from=2", "has its own steps"),
     ],
 )
@@ -143,9 +143,13 @@ def test_invalid_comparison_is_reported(server: TestClient, against: str, messag
 
 def test_selection_of_comparison_run() -> None:
     selection = Selection("door", "crossmodal-ekf", EPISODE)
-    edited = selection.comparison("from=40&to=60&faults=blackout&weights=image=0.5")
-    assert edited == replace(selection, edit=Edit(40, 60, Faults.parse("blackout"), {"image": 0.5}))
-    assert len({selection, edited, selection.comparison("from=40&to=60&faults=blackout&weights=image=0.6")}) == 3
+    counterfactual = selection.comparison("from=40&to=60&faults=blackout&weights=image=0.5")
+    expected = Intervention(40, 60, Faults.parse("blackout"), {"image": 0.5})
+    assert counterfactual == replace(selection, intervention=expected)
+    assert Selection.from_json(counterfactual.to_json()) == counterfactual
+    assert "edit" in counterfactual.to_json(), "the key of stored jobs"
+    other = selection.comparison("from=40&to=60&faults=blackout&weights=image=0.6")
+    assert len({selection, counterfactual, other}) == 3
 
 
 @pytest.mark.parametrize("shape", OUTLINE_EDGES)

@@ -44,7 +44,7 @@ EDIT = ("counterfactual", "door", "--faults", "blackout", "--from", 40)
     [
         ((*EDIT, "--to", 900), "step 900 is after the last step of this episode, 99"),
         ((*EDIT[:-1], 900, "--to", 901), "step 900 is not in this episode: it has steps 0 to 99"),
-        ((*EDIT, "--to", 60, "--weights", "image=0.2"), "its fusion weights cannot be set; edit a sensor"),
+        ((*EDIT, "--to", 60, "--weights", "image=0.2"), "its fusion weights cannot be set; use sensor faults"),
         ((*EDIT, "--to", 60, "--episode", 9999), "Episode 9999 is not in"),
         (("figure", "maps", "door", "-o", "new.svg", "--step", 900), "step 900 is not in this episode"),
         (("figure", "maps", "door", "-o", "new.svg", "--step", 0, "--step", 1), "steps 0 and 1 are both in"),

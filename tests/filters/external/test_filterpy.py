@@ -16,7 +16,7 @@ from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.external_replay import open_replay
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 
 sys.path.insert(0, str(Path(__file__).parent))
 import vehicle_filters as vehicle
@@ -88,4 +88,5 @@ def test_runs_are_repeatable() -> None:
     filter_ = load_external(f"{SOURCE}:ensemble", vehicle.TASK)
     replay = open_replay(filter_, trace(filter_, vehicle.drive(3), seed=5))
     assert replay.exact
-    np.testing.assert_array_equal(replay.edited(Edit(0, 1)).estimate_mean, replay.original.estimate_mean)
+    again = replay.with_intervention(Intervention(0, 1))
+    np.testing.assert_array_equal(again.estimate_mean, replay.original.estimate_mean)

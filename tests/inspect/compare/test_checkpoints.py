@@ -32,7 +32,7 @@ from beliefscope.inspect.compare.modules import module_outputs
 from beliefscope.inspect.statistics.episode_sums import measures_of, sample_steps
 from beliefscope.inspect.statistics.measures import main_error
 from beliefscope.inspect.trace import trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 pytestmark = pytest.mark.slow
 
@@ -172,9 +172,9 @@ def test_single_modality_event_equals_the_edit_of_its_link(data: Dataset) -> Non
     event = comparison(True).events[0]
     episode = episode_of(data, event.episode, 60)
     replay = Replay(biased_ekf(), trace(biased_ekf(), episode, event.episode))
-    edited = replay.edited(Edit(0, event.last + 1, weights={event.only[0]: 1.0}))
+    counterfactual = replay.with_intervention(Intervention(0, event.last + 1, weights={event.only[0]: 1.0}))
     # A one-hot beta equals a single modality up to rounding.
-    assert main_error(edited)[event.step, -1] == pytest.approx(event.after, rel=1e-3)
+    assert main_error(counterfactual)[event.step, -1] == pytest.approx(event.after, rel=1e-3)
 
 
 def test_frozen_modules_are_verified_by_hash() -> None:

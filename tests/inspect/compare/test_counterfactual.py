@@ -1,4 +1,4 @@
-"""Counterfactuals: edits without effect are bit-identical, and edits with faults equal runs with faults."""
+"""Counterfactuals: interventions without effect are bit-identical, and those with faults equal runs with faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import ARRAYS, Trace, trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 
 @pytest.fixture(scope="module", params=("crossmodal-ekf", "crossmodal-pf"))
@@ -31,59 +31,59 @@ def different(run: Trace, other_run: Trace) -> list[str]:
 @pytest.mark.parametrize("first", [0, 40, 99])
 def test_empty_edit_is_bit_identical(replay: Replay, first: int) -> None:
     assert replay.exact
-    edit = Edit(first, 100)
-    again = replay.edited(edit)
+    intervention = Intervention(first, 100)
+    again = replay.with_intervention(intervention)
     assert not different(replay.original, again)
-    assert compare(replay.original, again, edit).verdict.endswith(", nothing changed.")
+    assert compare(replay.original, again, intervention).verdict.endswith(", nothing changed.")
 
 
 def test_edit_equals_faults_over_its_steps(replay: Replay) -> None:
-    edit = Edit(40, 60, Faults.parse("blackout"))
-    edited, original = replay.edited(edit), replay.original
+    intervention = Intervention(40, 60, Faults.parse("blackout"))
+    counterfactual, original = replay.with_intervention(intervention), replay.original
     faults = Faults.parse("blackout:from=40:to=60")
     faulty = trace(replay.checkpoint, original.episode, 9, seed=3, particles=100, faults=faults)
-    assert not different(faulty, edited)
-    assert edited.faults == faults
-    result = compare(original, edited, edit)
+    assert not different(faulty, counterfactual)
+    assert counterfactual.faults == faults
+    result = compare(original, counterfactual, intervention)
     assert not result.distance[:40].any()
     assert result.distance[40:60].all()
     assert result.carrier == "haptics"
 
 
 def test_the_sentence_has_the_name_of_a_fault_as_it_is(replay: Replay) -> None:
-    edit = Edit(40, 60, Faults.parse("force_bias=5"))
-    verdict = compare(replay.original, replay.edited(edit), edit).verdict
+    intervention = Intervention(40, 60, Faults.parse("force_bias=5"))
+    verdict = compare(replay.original, replay.with_intervention(intervention), intervention).verdict
     assert verdict.startswith("With force_bias=5 over steps 40 to 59, the estimate moved by up to ")
 
 
-def test_edited_beta(replay: Replay) -> None:
-    edited = replay.edited(Edit(40, 60, weights={"image": 0.25}))
-    assert edited.weights is not None
-    np.testing.assert_allclose(edited.weights[40:60, 0], 0.25, atol=1e-6)
-    np.testing.assert_allclose(edited.weights[40:60, 1], 0.75, atol=1e-6)
-    assert Replay(replay.checkpoint, edited).exact
+def test_manual_beta(replay: Replay) -> None:
+    counterfactual = replay.with_intervention(Intervention(40, 60, weights={"image": 0.25}))
+    assert counterfactual.weights is not None
+    np.testing.assert_allclose(counterfactual.weights[40:60, 0], 0.25, atol=1e-6)
+    np.testing.assert_allclose(counterfactual.weights[40:60, 1], 0.75, atol=1e-6)
+    assert Replay(replay.checkpoint, counterfactual).exact
 
 
-def test_invalid_edits(replay: Replay) -> None:
+def test_invalid_interventions(replay: Replay) -> None:
     with pytest.raises(BadInput, match="has no steps"):
-        Edit(60, 40)
+        Intervention(60, 40)
     with pytest.raises(BadInput, match="has its own steps"):
-        Edit(40, 60, Faults.parse("blackout:from=3"))
+        Intervention(40, 60, Faults.parse("blackout:from=3"))
     with pytest.raises(BadInput, match="must be between 0 and 1"):
-        Edit(40, 60, weights={"image": 1.5})
+        Intervention(40, 60, weights={"image": 1.5})
     with pytest.raises(BadInput, match="after the last step of this episode"):
-        replay.edited(Edit(40, 101))
+        replay.with_intervention(Intervention(40, 101))
     with pytest.raises(BadInput, match="'touch' does not exist"):
-        replay.edited(Edit(40, 60, weights={"touch": 0.5}))
+        replay.with_intervention(Intervention(40, 60, weights={"touch": 0.5}))
 
 
 @pytest.mark.parametrize("replay", ["crossmodal-pf", "crossmodal-ekf"], indirect=True)
-def test_maps_use_edited_beta(replay: Replay) -> None:
-    edited = replay.edited(Edit(20, 40, weights={"image": 1.0}))
+def test_maps_use_manual_beta(replay: Replay) -> None:
+    counterfactual = replay.with_intervention(Intervention(20, 40, weights={"image": 1.0}))
     step, size = 25, 21
-    image, haptics, fused = MapEngine(replay.checkpoint, edited).map(step, size=size).log_likelihood
+    image, haptics, fused = MapEngine(replay.checkpoint, counterfactual).map(step, size=size).log_likelihood
     # The mixture subtracts a constant from each map; a one-hot beta leaves a single map.
     np.testing.assert_allclose(fused - fused.max(), image - image.max(), rtol=1e-4, atol=1e-4)
     assert np.abs((fused - fused.max()) - (haptics - haptics.max())).max() > 1.0
-    same = (MapEngine(replay.checkpoint, run).map(step - 10, size=size) for run in (edited, replay.original))
+    same = (MapEngine(replay.checkpoint, run).map(step - 10, size=size) for run in (counterfactual, replay.original))
     np.testing.assert_array_equal(*(run.log_likelihood for run in same))

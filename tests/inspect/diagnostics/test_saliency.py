@@ -24,7 +24,7 @@ from beliefscope.inspect.diagnostics.saliency import ENTRY, MIN_CHANGE, Saliency
 from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 pytestmark = pytest.mark.slow
 
@@ -256,10 +256,10 @@ def test_blacked_out_image_has_no_attribution_relative_to_black() -> None:
     assert result.means["image"].std() == 0.0
 
 
-def test_edited_beta_has_no_attribution() -> None:
+def test_manual_beta_has_no_attribution() -> None:
     replay = builtin("crossmodal-pf")
-    edited = replay.edited(Edit(VISIBLE, VISIBLE + 3, weights={"image": 0.25}))
-    result = saliency([edited], replay.checkpoint, target="beta:image", step=VISIBLE + 1)
+    counterfactual = replay.with_intervention(Intervention(VISIBLE, VISIBLE + 3, weights={"image": 0.25}))
+    result = saliency([counterfactual], replay.checkpoint, target="beta:image", step=VISIBLE + 1)
     assert result.value == pytest.approx(0.25)
     for x in result.attributions:
         assert not any(values.any() for values in x.integrated.values())

@@ -29,7 +29,7 @@ from beliefscope.inspect.diagnostics import shapley
 from beliefscope.inspect.diagnostics.shapley import MAX_MODALITIES, members, run_subsets, shapley_weights
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 sys.path.insert(0, str(Path(__file__).parent))
 import planted_traces as plant
@@ -121,8 +121,8 @@ def test_values_sum_to_the_total_change(name: str) -> None:
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_modality_with_zero_beta_has_zero_value(name: str) -> None:
     checkpoint, run = builtin(name)
-    edited = Replay(checkpoint, run).edited(Edit(0, STEPS, weights={"haptics": 0.0}))
-    result = shapley.shapley([edited], checkpoint)
+    counterfactual = Replay(checkpoint, run).with_intervention(Intervention(0, STEPS, weights={"haptics": 0.0}))
+    result = shapley.shapley([counterfactual], checkpoint)
     np.testing.assert_allclose(result.estimate_values[:, 1], 0.0, atol=1e-7)  # float32
     assert np.abs(result.estimate_values[:, 0]).max() > 1e-3
     assert result.phases[0].shapley[1] == pytest.approx(0.0, abs=1e-7)

@@ -27,7 +27,7 @@ from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import ARRAYS, trace
 from beliefscope.inspect.traces.external_replay import open_replay
-from beliefscope.inspect.traces.replay import Edit
+from beliefscope.inspect.traces.replay import Intervention
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "filters" / "external"))
 import vehicle_filters as vehicle
@@ -49,19 +49,19 @@ def test_counterfactual_changes_only_later_steps_and_its_own_sensors(door: list[
     filter_ = load_external(EXAMPLE)
     replay = open_replay(filter_, trace(filter_, door[0], 3))
     assert replay.exact
-    edited = replay.edited(Edit(20, 40, Faults.parse("effector_offset=5")))
-    before, after = replay.original.estimate_mean, edited.estimate_mean
+    counterfactual = replay.with_intervention(Intervention(20, 40, Faults.parse("effector_offset=5")))
+    before, after = replay.original.estimate_mean, counterfactual.estimate_mean
     np.testing.assert_array_equal(before[:20], after[:20])
     assert np.abs(before[20:] - after[20:]).max() > 1e-3
-    verdict = compare(replay.original, edited, Edit(20, 40, Faults.parse("effector_offset=5"))).verdict
+    verdict = compare(replay.original, counterfactual, Intervention(20, 40, Faults.parse("effector_offset=5"))).verdict
     assert "the estimate moved by up to" in verdict
-    blind = replay.edited(Edit(20, 40, Faults.parse("blackout")))  # the filter uses no image
+    blind = replay.with_intervention(Intervention(20, 40, Faults.parse("blackout")))  # the filter uses no image
     np.testing.assert_array_equal(before, blind.estimate_mean)
-    assert open_replay(filter_, edited).exact  # of an edited run
+    assert open_replay(filter_, counterfactual).exact  # of a run with an intervention
     with pytest.raises(BadInput, match="fusion weights cannot be set"):
-        replay.edited(Edit(20, 40, weights={"image": 0.5}))
+        replay.with_intervention(Intervention(20, 40, weights={"image": 0.5}))
     with pytest.raises(BadInput, match="step 101 is after the last step"):
-        replay.edited(Edit(20, 101, Faults.parse("blackout")))
+        replay.with_intervention(Intervention(20, 101, Faults.parse("blackout")))
 
 
 class Noisy(vehicle.NumpyKalman):
@@ -81,9 +81,9 @@ def test_filters_with_their_own_generator_keep_their_random_numbers() -> None:
     run = trace(filter_, vehicle.drive(1))
     replay = open_replay(filter_, run)
     assert not replay.exact  # the generator went on
-    edited = replay.edited(Edit(0, 1))  # without effect
+    counterfactual = replay.with_intervention(Intervention(0, 1))  # without effect
     for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(replay.original, name), getattr(edited, name))
+        np.testing.assert_array_equal(getattr(replay.original, name), getattr(counterfactual, name))
 
 
 def test_standalone_runs_see_one_sensor() -> None:

@@ -10,7 +10,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.trace import ARRAYS, trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Intervention, Replay
 
 
 @pytest.mark.long
@@ -22,12 +22,12 @@ def test_empty_edit_is_bit_identical(name: str) -> None:
     with open_dataset(sample_path("door")) as data:
         replay = Replay(checkpoint, trace(checkpoint, data[9], 9, seed=3, particles=50))
     assert replay.exact
-    again = replay.edited(Edit(40, 100))
+    again = replay.with_intervention(Intervention(40, 100))
     for array in ARRAYS:
         np.testing.assert_array_equal(getattr(again, array), getattr(replay.original, array), err_msg=array)
 
 
 def test_edit_of_an_earlier_version() -> None:
-    edit = Edit(3, 5, Faults.parse("blackout"))
-    values = edit.to_json()
-    assert Edit.from_json({**values, "recipe": values.pop("faults")}) == edit
+    intervention = Intervention(3, 5, Faults.parse("blackout"))
+    values = intervention.to_json()
+    assert Intervention.from_json({**values, "recipe": values.pop("faults")}) == intervention
