@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
@@ -10,8 +9,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-warnings.filterwarnings("ignore", "Initializing zero-element tensors")  # the first layer of no controls
 
 Pooling = Literal["flatten", "spatial-softmax", "mean"]
 Networks = Literal["default", "authors"]
@@ -112,9 +109,18 @@ class Stack(nn.Sequential):
         return x
 
 
+class NoInputs(nn.Linear):
+    """A linear layer of a vector without entries, such as no controls: its bias, initially 0."""
+
+    def reset_parameters(self) -> None:
+        """As ``nn.Linear``, with the same random draws, but without its warning that there are no weights."""
+        nn.init.uniform_(self.bias, 0.0, 0.0)
+
+
 def vector_stack(inputs: int, units: int) -> Stack:
     """Three layers from ``inputs`` to ``units``."""
-    return Stack(nn.Linear(inputs, units), nn.ReLU(inplace=True), Residual(units))
+    first = nn.Linear(inputs, units) if inputs else NoInputs(0, units)
+    return Stack(first, nn.ReLU(inplace=True), Residual(units))
 
 
 class VectorEncoder(nn.Module):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 from torch import nn
 
 from beliefscope.filters.models.dynamics import Dynamics
-from beliefscope.filters.models.networks import Encoders, Residual, Stack
+from beliefscope.filters.models.networks import Encoders, Residual, Stack, vector_stack
 from beliefscope.filters.models.resampling import effective_sample_size, multinomial, resample, soft, systematic
 
 
@@ -136,3 +138,14 @@ def test_encoded_images_have_the_same_bits_in_any_batch(stride: int) -> None:
         together = encoder({"image": images})
         for count in (1, 2, 3):  # 100, 200 and 300 images are no multiples of a block
             assert torch.equal(encoder({"image": images[:, :count]}), together[:, :count])
+
+
+def test_a_stack_without_inputs_has_the_initial_values_of_torch_and_no_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        torch.manual_seed(5)
+        values = vector_stack(0, 8).state_dict()
+    torch.manual_seed(5)
+    with pytest.warns(UserWarning, match="zero-element"):
+        expected = Stack(nn.Linear(0, 8), nn.ReLU(), Residual(8)).state_dict()
+    torch.testing.assert_close(values, expected, rtol=0.0, atol=0.0)
