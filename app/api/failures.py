@@ -1,12 +1,11 @@
 """Routes under ``/api/failures``: failure events of a filter over a data set, found by a job."""
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
 from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
@@ -18,7 +17,6 @@ from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.filters.legacy_names import SCORE, rename_keys
 from beliefscope.inspect.failures import by_episode
 from beliefscope.inspect.failures.events import Event, PhaseStatistics
 from beliefscope.inspect.slices.report import ErrorSlice
@@ -131,7 +129,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def get_failures(request: RequestedSurvey) -> Response:
         if request.data.startswith(LIVE_PREFIX):
             return _live_failures(store, request)
-        return _present_keys(result_or_job(jobs, "failures", _arguments(store, request)))
+        return result_or_job(jobs, "failures", _arguments(store, request))
 
     @router.post("/api/failures/{task}/{filter}", status_code=202)
     def find_failures(request: RequestedSurvey) -> JobReply:
@@ -144,14 +142,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return JobReply(job=jobs.submit("failures", title, arguments, link=link))
 
     return router
-
-
-def _present_keys(response: Response) -> Response:
-    """The response with present keys if it is a result that was stored with earlier ones."""
-    if not isinstance(response, FileResponse) or b'"shown"' not in (content := Path(response.path).read_bytes()):
-        return response
-    document = json.loads(content)
-    return JSONResponse(document | {"scores": [rename_keys(score, SCORE) for score in document["scores"]]})
 
 
 def found_failures(store: TraceStore, jobs: Jobs, selection: Selection) -> Path | None:

@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -274,3 +275,14 @@ def test_record_of_an_earlier_version(folder: Path, open_jobs: OpenJobs) -> None
     record = {"id": "a", "kind": "add", "title": "Add", "state": "done", "asked": 5.0}
     (folder / "a" / "job.json").write_text(json.dumps(record))
     assert open_jobs()["a"].submitted == 5.0
+
+
+@pytest.mark.parametrize("result", ['["shown"]', '{"shown": 1}', '{"scores": ["shown"]}', '{"scores": "shown'])
+def test_a_damaged_result_of_an_earlier_version_does_not_stop_the_server(
+    folder: Path, open_jobs: OpenJobs, result: str
+) -> None:
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / "job.json").write_text(json.dumps(asdict(Job("a", "failures", "Failures", "done"))))
+    (folder / "a" / "result.json").write_text(result)
+    assert [job.id for job in open_jobs().all()] == ["a"]
+    assert (folder / "a" / "result.json").read_text() == result
