@@ -102,9 +102,8 @@ def test_a_slow_or_failed_load_is_reported(open_page: Any, server: Any) -> None:
 
     page.page.route("**/tabs/tabs.js", lambda route: waiting.append(route))
     page.page.goto(f"{server.url}?tab=experiments")
+    page.page.locator("#tabs-state").filter(has_text="Loading …").wait_for()
     note = page.page.locator("#experiments .note")
-    page.until("() => document.querySelector('#experiments').dataset.state === 'loading'")
-    note.filter(has_text="Loading …").wait_for()
     failure = {"status": 500, "json": {"error": "The table is on a broken disk"}}
     page.page.route("**/api/experiments", lambda route: route.fulfill(**failure))
     answer("**/tabs/tabs.js")

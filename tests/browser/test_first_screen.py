@@ -156,3 +156,25 @@ def test_names_of_tabs_have_space_beside_their_dividers(
     assert space >= 4.0
     assert lines == 1
     assert hidden == 0
+
+
+@pytest.mark.parametrize("module", ["tabs", "scatter"])
+def test_tabs_that_fail_to_load_say_so_and_are_tried_again(open_page: Any, server: Any, module: str) -> None:
+    """Of a server that fails while the run is displayed; the run and the scene stay usable."""
+    page = open_page()
+    page.page.route(f"**/tabs/{module}.js", lambda route: route.abort())
+    page.page.goto(f"{server.url}?tab=study")
+    note = page.page.locator("#tabs-state > .note")
+    note.filter(has_text="The tabs cannot be loaded").wait_for()
+    for tab in ("Recordings", "Diagnosis"):
+        page.page.get_by_role("tab", name=tab).click()
+        note.wait_for(state="visible")
+    page.page.get_by_role("tab", name="Scene").click()
+    note.wait_for(state="hidden")
+    page.page.get_by_role("tab", name="Study").click()
+    page.page.unroute(f"**/tabs/{module}.js")
+    note.get_by_role("button", name="Try again").click()
+    page.page.locator("#study .top, #study .note").first.wait_for()
+    page.until("() => document.documentElement.classList.contains('with-tabs')")
+    assert note.is_hidden()
+    page.errors[:] = [line for line in page.errors if "ERR_FAILED" not in line]

@@ -24,7 +24,7 @@ import { FaultDialog } from '../widgets/fault_dialog.js';
 import { FindingBar } from '../widgets/finding_bar.js';
 import { Intro } from '../widgets/intro.js';
 import { Jobs } from '../widgets/jobs.js';
-import { setPanelState } from '../widgets/panel_state.js';
+import { setPanelError, setPanelState } from '../widgets/panel_state.js';
 import { choice, connectPickers } from '../widgets/pickers.js';
 import { ReportDialog } from '../widgets/report_dialog.js';
 import { connectSaveButton } from '../widgets/save_button.js';
@@ -169,13 +169,15 @@ export class Page {
   #loadTabs() {
     this.#loadingTabs ??= this.#createTabs().catch((error) => {
       this.#loadingTabs = null;
-      this.#messages.show('tabs', `The tabs cannot be loaded: ${messageOf(error)}`);
+      const reason = `The tabs cannot be loaded: ${messageOf(error)}`;
+      setPanelError(html('#tabs-state'), reason, () => this.#loadTabs());
       return null;
     });
     return this.#loadingTabs;
   }
 
   async #createTabs() {
+    setPanelState(html('#tabs-state'), 'loading', 'Loading …');
     const { Tabs } = await import('../tabs/tabs.js');
     const tabs = new Tabs(this.#catalog, this.#store, {
       jobs: this.jobs,
