@@ -113,3 +113,43 @@ export const FUSION = {
   effective_weights: { shape: [2, 2, 3], values: [0.7, 0.6, 0.5, 0.3, 0.4, 0.5, 1, 1, 1, 0, 0, 0] },
   contact: { shape: [2], values: [0, 1] },
 };
+
+/** A row of the Experiments tab. */
+export const ROW = {
+  name: 'run-1',
+  filter: 'crossmodal-ekf',
+  task: 'door',
+  faults: 'blackout=0.4',
+  episodes: 3,
+  steps: 90,
+  error: 0.5,
+  unit: 'cm',
+  nees: 2.5,
+  coverage95: 0.9,
+  worst: 1.5,
+  worst_episode: 2,
+  worst_step: 40,
+  worst_time: 4,
+  checkpoint: 'a'.repeat(64),
+  data: 'b'.repeat(64),
+  training: '{}',
+  provenance: '{"lr": 0.001}',
+  catalog_name: null,
+  data_name: null,
+};
+
+/** Checkpoints with provenance of several forms, as JSON that is stored with escapes. */
+export const RECORDED = [
+  { seed: 0, lr: '1e-3', operator: 'S\u00f8ren', 'model.weird key': 'a b', debug: true, note: 'x' },
+  { seed: 1, lr: 3e-4, operator: 'Mu\u0308ller', 'model.weird key': 'c', debug: false },
+  { seed: 10, lr: 'auto', operator: 'M\u00fcller', RMSE: 'own' },
+].map((provenance, i) => ({
+  ...ROW,
+  name: `run-${i}`,
+  error: 3 + i,
+  checkpoint: String(i).repeat(64),
+  provenance: JSON.stringify(provenance).replace(
+    /[^\x20-\x7e]/g,
+    (letter) => `\\u${letter.charCodeAt(0).toString(16).padStart(4, '0')}`,
+  ),
+}));

@@ -3,7 +3,7 @@ import { test } from 'node:test';
 
 import './browser.js';
 import { ServerError } from '../../app/page/data/server_error.js';
-import { isTrainable, recoveredText } from '../../app/page/tabs/diagnosis.js';
+import { isTrainable, recoveredText } from '../../app/page/tabs/diagnosis_cause.js';
 import { JobResults } from '../../app/page/widgets/job_results.js';
 
 const { signal } = new AbortController();

@@ -3,26 +3,18 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
-/** @import { Catalog, Diagnosis as Result, DiagnosisCause, DiagnosisEvidence, HealthyRecord } from '../types/server.js' */
+/** @import { Catalog, Diagnosis as Result, HealthyRecord } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { SHOWN } from '../core/constants.js';
 import { create, html } from '../core/dom.js';
-import {
-  displayName,
-  fixed,
-  percent,
-  probabilityText,
-  sentence,
-  stepLabel,
-  typeset,
-} from '../core/units.js';
+import { displayName, percent, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
-import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
 import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
+import { causeItem, evidenceItem, isTrainable, withCode } from './diagnosis_cause.js';
 import { Repair } from './repair.js';
 
 /** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
@@ -39,7 +31,6 @@ const WITHIN =
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MEASURE = 'Measure a healthy record';
 const MAX_RESULTS = 24; // in the cache
-const PRESENT = 'Probability that this cause is present, alone or together with another one';
 const LISTED = 3; // statistics that were not measured
 const SETTLING = 500; // ms until the job of a selection starts
 
@@ -209,11 +200,16 @@ export class Diagnosis {
     if (result === this.#listed) return;
     this.#listed = result;
     const causes = (result?.causes ?? []).filter(({ probability }) => probability >= SHOWN);
-    const rows = causes.map((cause, i) => this.#row(cause, !i));
+    const openStep = (/** @type {number} */ episode, /** @type {number} */ step) =>
+      this.#store.set({ episode, step, playing: false });
+    const rows = causes.map((cause, i) => {
+      const canTrain = this.#starts && !i && isTrainable(cause);
+      return causeItem(cause, openStep, canTrain ? [this.#finetuneButton()] : []);
+    });
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
-    const items = deviations.map((deviation) => this.#evidence(deviation));
+    const items = deviations.map((deviation) => evidenceItem(deviation, openStep));
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';
     html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;
@@ -291,51 +287,6 @@ export class Diagnosis {
     button.addEventListener('click', () => this.#store.set({ tab: 'finetune', run: '' }));
     return button;
   }
-
-  /**
-   * @param {DiagnosisCause} cause
-   * @param {boolean} isFirst
-   */
-  #row(cause, isFirst) {
-    const { probability, recovered, evidence, steps } = cause;
-    const bar = create('meter', { min: 0, max: 1, value: probability });
-    bar.setAttribute('aria-label', `Probability of ${cause.title}`);
-    const where = [`${plural('episode', cause.episodes)} ${cause.episodes.join(', ')}`];
-    if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
-    /** @type {HTMLElement[]} */
-    const lines = [
-      create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
-      create('ul', {}, ...evidence.map((item) => this.#evidence(item))),
-    ];
-    if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
-    lines.push(nextAction(cause.next));
-    if (this.#starts && isFirst && isTrainable(cause)) lines.push(this.#finetuneButton());
-    return create(
-      'li',
-      {},
-      create('h4', { textContent: cause.title, title: cause.cause }),
-      bar,
-      create('output', {
-        textContent: `probability ${probabilityText(probability)}`,
-        title: PRESENT,
-      }),
-      create('div', { className: 'details' }, ...lines),
-    );
-  }
-
-  /** @param {DiagnosisEvidence} evidence */
-  #evidence({ text, episode, step, time }) {
-    const item = create('li', { textContent: typeset(sentence(text)) });
-    if (episode === null) return item;
-    const label =
-      step === null ? `episode ${episode}` : `episode ${episode}, ${stepLabel(step, time)}`;
-    const link = create('button', { type: 'button', className: 'text quiet', textContent: label });
-    link.addEventListener('click', () =>
-      this.#store.set({ episode, step: step ?? 0, playing: false }),
-    );
-    item.append(' ', link);
-    return item;
-  }
 }
 
 /**
@@ -346,12 +297,6 @@ function findingOf({ state, masked, miscalibrated }) {
   if (state === 'healthy') return miscalibrated ? 'miscalibrated' : state;
   return masked ? 'masked' : state;
 }
-
-/**
- * Whether the next action of a cause is a fine-tuning, unlike that of a sensor that must be repaired.
- * @param {Pick<DiagnosisCause, 'next'>} cause
- */
-export const isTrainable = ({ next }) => next.includes('`beliefscope finetune ');
 
 /**
  * The state of a diagnosis that is not ready.
@@ -393,42 +338,3 @@ const wholeOptions = (text) =>
   text
     .split(/(--[\w-]+)/)
     .map((part, i) => (i % 2 ? create('span', { className: 'option', textContent: part }) : part));
-
-/** @param {NonNullable<DiagnosisCause['recovered']>} recovered */
-export function recoveredText({ error, low, high, nll, measure }) {
-  const change = (nll ?? 0) < 0 ? 'increases' : 'decreases';
-  const size = nll === null ? '?' : fixed(Math.abs(nll), 2);
-  const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
-  if (error === null) return `If undone, ${likelihood}.`;
-  const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
-  if (error < 0)
-    return `Undoing it increases the ${measure} error by ${percent(-error)}; ${likelihood}.`;
-  return `Undoing it recovers ${percent(error)}${range} of the ${measure} error; ${likelihood}.`;
-}
-
-/**
- * The next action; its commands, between backticks, can be copied.
- * @param {string} text
- */
-function nextAction(text) {
-  const line = create('p', { className: 'next' }, 'Next: ', ...withCode(text));
-  for (const { textContent } of line.querySelectorAll('code'))
-    line.append(
-      ' ',
-      copyButton('Copy', 'Copy the command', () => textContent ?? ''),
-    );
-  return line;
-}
-
-/**
- * Parts of a text; those between backticks are code.
- * @param {string} text
- */
-const withCode = (text) =>
-  text.split('`').map((part, i) => (i % 2 ? create('code', { textContent: part }) : part));
-
-/**
- * @param {string} noun
- * @param {readonly unknown[]} list
- */
-const plural = (noun, list) => (list.length === 1 ? noun : `${noun}s`);

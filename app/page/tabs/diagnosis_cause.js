@@ -1,0 +1,102 @@
+/** A cause in the Diagnosis tab: its probability, evidence, the effect of undoing it and the next action. */
+
+/** @import { DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
+
+import { create } from '../core/dom.js';
+import { fixed, percent, probabilityText, sentence, stepLabel, typeset } from '../core/units.js';
+import { copyButton } from '../widgets/copy_button.js';
+
+/** @typedef {(episode: number, step: number) => void} OpenStep */
+
+const PRESENT = 'Probability that this cause is present, alone or together with another one';
+
+/**
+ * @param {DiagnosisCause} cause
+ * @param {OpenStep} open
+ * @param {HTMLElement[]} actions after the next action
+ */
+export function causeItem(cause, open, actions) {
+  const { probability, recovered, evidence, steps } = cause;
+  const bar = create('meter', { min: 0, max: 1, value: probability });
+  bar.setAttribute('aria-label', `Probability of ${cause.title}`);
+  const where = [`${plural('episode', cause.episodes)} ${cause.episodes.join(', ')}`];
+  if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
+  /** @type {HTMLElement[]} */
+  const lines = [
+    create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
+    create('ul', {}, ...evidence.map((item) => evidenceItem(item, open))),
+  ];
+  if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
+  lines.push(nextAction(cause.next), ...actions);
+  return create(
+    'li',
+    {},
+    create('h4', { textContent: cause.title, title: cause.cause }),
+    bar,
+    create('output', {
+      textContent: `probability ${probabilityText(probability)}`,
+      title: PRESENT,
+    }),
+    create('div', { className: 'details' }, ...lines),
+  );
+}
+
+/**
+ * @param {DiagnosisEvidence} evidence
+ * @param {OpenStep} open
+ */
+export function evidenceItem({ text, episode, step, time }, open) {
+  const item = create('li', { textContent: typeset(sentence(text)) });
+  if (episode === null) return item;
+  const label =
+    step === null ? `episode ${episode}` : `episode ${episode}, ${stepLabel(step, time)}`;
+  const link = create('button', { type: 'button', className: 'text quiet', textContent: label });
+  link.addEventListener('click', () => open(episode, step ?? 0));
+  item.append(' ', link);
+  return item;
+}
+
+/**
+ * Whether the next action of a cause is a fine-tuning, unlike that of a sensor that must be repaired.
+ * @param {Pick<DiagnosisCause, 'next'>} cause
+ */
+export const isTrainable = ({ next }) => next.includes('`beliefscope finetune ');
+
+/** @param {NonNullable<DiagnosisCause['recovered']>} recovered */
+export function recoveredText({ error, low, high, nll, measure }) {
+  const change = (nll ?? 0) < 0 ? 'increases' : 'decreases';
+  const size = nll === null ? '?' : fixed(Math.abs(nll), 2);
+  const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
+  if (error === null) return `If undone, ${likelihood}.`;
+  const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
+  if (error < 0)
+    return `Undoing it increases the ${measure} error by ${percent(-error)}; ${likelihood}.`;
+  return `Undoing it recovers ${percent(error)}${range} of the ${measure} error; ${likelihood}.`;
+}
+
+/**
+ * The next action; its commands, between backticks, can be copied.
+ * @param {string} text
+ */
+function nextAction(text) {
+  const line = create('p', { className: 'next' }, 'Next: ', ...withCode(text));
+  for (const { textContent } of line.querySelectorAll('code'))
+    line.append(
+      ' ',
+      copyButton('Copy', 'Copy the command', () => textContent ?? ''),
+    );
+  return line;
+}
+
+/**
+ * Parts of a text; those between backticks are code.
+ * @param {string} text
+ */
+export const withCode = (text) =>
+  text.split('`').map((part, i) => (i % 2 ? create('code', { textContent: part }) : part));
+
+/**
+ * @param {string} noun
+ * @param {readonly unknown[]} list
+ */
+const plural = (noun, list) => (list.length === 1 ? noun : `${noun}s`);
