@@ -11,7 +11,7 @@ from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
 from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
-from beliefscope.inspect.diagnostics.healthy_profile import included_reference
+from beliefscope.inspect.diagnostics.healthy_profile import pretrained_reference
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import profile_of, sensor_record
 
@@ -59,7 +59,7 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
         report(0.0, "measuring the sensors")
         episodes = [data[index] for index in arguments["episodes"]]
         is_sample = arguments["data"] not in store.settings.data
-        images = included_reference(checkpoint.task) if is_sample else None  # of the same camera
+        images = pretrained_reference(checkpoint.task) if is_sample else None  # of the same camera
         sensors = sensor_record(episodes, images)
         profile = profile_of(
             checkpoint,

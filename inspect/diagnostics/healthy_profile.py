@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
-from beliefscope.filters.checkpoint import Checkpoint, pretrained_path
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.inspect.statistics.reference_images import Reference
 
@@ -99,7 +99,7 @@ def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: 
     return _beside_pretrained(task, filter_, checkpoint_hash) or own
 
 
-def included_reference(task: Task) -> Reference | None:
+def pretrained_reference(task: Task) -> Reference | None:
     """Healthy images of a task with pretrained filters; None without any."""
     image = _sensors_of_pretrained(task.name)["reference"]
     return None if image is None else Reference.from_json(image)
@@ -113,12 +113,9 @@ def _beside_pretrained(task: str, filter_: str, checkpoint_hash: str) -> dict[st
 
 @lru_cache(maxsize=4)  # files of pretrained filters do not change; reading one takes 2 ms
 def _file_beside_pretrained(task: str, filter_: str) -> dict[str, Any] | None:
-    try:
-        path = pretrained_path(task, filter_)
-    except BadInput:
-        return None
-    path = path.with_name(path.stem + SUFFIX)
-    if not path.is_file():
+    name = f"{task}-{filter_}{SUFFIX}"
+    path = next((path for path in PRETRAINED.iterdir() if path.name == name), None)  # the name may be a path
+    if path is None:
         return None
     document, sensors = json.loads(path.read_text()), _sensors_of_pretrained(task)
     profile = document["healthy_profile"]

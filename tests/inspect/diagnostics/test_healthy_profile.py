@@ -12,11 +12,17 @@ import pytest
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
-from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_checkpoint
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
-from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile, included_reference
+from beliefscope.inspect.diagnostics.healthy_profile import (
+    SUFFIX,
+    HealthyProfile,
+    find_profile,
+    pretrained_reference,
+    profile_document,
+)
 from beliefscope.inspect.healthy import measure_profile, sensor_record
 from beliefscope.inspect.statistics.reference_images import measure_reference
 
@@ -217,14 +223,14 @@ def test_included_images_replace_those_of_the_episodes() -> None:
     """They are of the same camera: statistics of new episodes agree with those compared with the episodes' own."""
     with open_dataset("datasets/samples/push.h5") as data:
         task, episodes = data.task, [data[i] for i in range(140, 152)]
-    images = included_reference(task)
+    images = pretrained_reference(task)
     assert images is not None
     own, included = (sensor_record(episodes, reference) for reference in (None, images))
     assert included.reference is images
     for name in ("shift/image x/all", "hand offset/image x/all", "brightness/image/all"):  # pixels; ratio
         a, b = (np.array([row[name] for row in record.rows]) for record in (own, included))
         assert np.nanmean(a) == pytest.approx(np.nanmean(b), abs=0.25)  # of 9 episodes, and of 120
-    assert included_reference(replace(task, name="unknown")) is None
+    assert pretrained_reference(replace(task, name="unknown")) is None
 
 
 def test_the_loss_of_all_readings_is_an_alarm_although_healthy_episodes_lose_many() -> None:
@@ -236,3 +242,11 @@ def test_the_loss_of_all_readings_is_an_alarm_although_healthy_episodes_lose_man
     assert bool(lost.alarms)
     assert not many.alarms
     assert lost.deviations[0].t > 3.0 * many.deviations[0].t, "the last readings count most"
+
+
+@pytest.mark.parametrize("name", ["missing", "crossmodal-ekf/../crossmodal-ekf", "../pretrained/door-crossmodal-ekf"])
+def test_only_names_of_pretrained_filters_have_a_file(name: str) -> None:
+    """Names come from files of other programs."""
+    hash_ = load_checkpoint(pretrained_path("door", "crossmodal-ekf")).hash
+    assert profile_document("door", "crossmodal-ekf", hash_, None) is not None
+    assert profile_document("door", name, hash_, None) is None
