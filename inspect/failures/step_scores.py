@@ -139,11 +139,6 @@ class Survey:
             effective_weights=columns.get("effective_weights"),
         )
 
-    @classmethod
-    def from_traces(cls, traces: Iterable[Trace]) -> Survey:
-        """As ``from_episodes``, of traces, which are not kept."""
-        return cls.from_episodes(map(EpisodeScores.from_trace, traces))
-
     def time_of(self, index: int) -> float | None:
         """s from the first step of its episode to one of the S steps; None without timestamps."""
         return None if self.time is None or np.isnan(self.time[index]) else float(self.time[index])

@@ -27,7 +27,7 @@ from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.compare.two_runs import compare_runs
 from beliefscope.inspect.failures.events import find_failures
-from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of, scores_of
+from beliefscope.inspect.failures.step_scores import OTHER, EpisodeScores, Survey, phases_of, scores_of
 from beliefscope.inspect.figures.paper import maps_figure, steps_by_contact
 from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.statistics import measures
@@ -250,7 +250,7 @@ def test_phases_of_failures_are_groups_of_declared_covariates(runs: list[Trace])
     values = {"lit": (steps < 150).astype(np.float32), "stage": (steps >= 20).astype(np.float32)}
     declared = replace(task(), covariates=covariates)
     traces = [replace(run, episode=replace(run.episode, task=declared, covariates=values)) for run in runs]
-    survey = Survey.from_traces(traces)
+    survey = Survey.from_episodes(map(EpisodeScores.from_trace, traces))
     assert [*survey.phases][3:] == ["heat", "no lit", "lit", "hold", OTHER]
     assert sorted(survey.phases) == sorted(phases_of(declared))
     phase = np.array([*survey.phases])[survey.phase_index].reshape(len(runs), STEPS)

@@ -178,10 +178,6 @@ def check_recordings(folder: Path) -> None:
         assert same(read_recording(path), traced(0)), "incomplete recording"
 
 
-def recording_result(folder: Path) -> Result:
-    return {"same": same(read_recording(folder / "run.rrd"), traced(0))}
-
-
 # A study.
 
 

@@ -22,7 +22,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.failures.events import failures_of
-from beliefscope.inspect.failures.step_scores import Survey
+from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_from_arrays
 from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
 from beliefscope.inspect.traces.sensors import camera_images
@@ -312,7 +312,8 @@ def test_failures_of_an_ended_run(client: TestClient, writer: LiveFileWriter, fu
     failures = client.get(f"/api/failures/door/{full_trace.filter}?data=live:run").json()
     assert (failures["data"], failures["steps"], failures["faults"]) == ("live:run", STEPS, "")
     by_error = next(score for score in failures["scores"] if score["name"] == "error")
-    events = failures_of(Survey.from_traces([full_trace]), "error").events
+    survey = Survey.from_episodes([EpisodeScores.from_trace(full_trace)])
+    events = failures_of(survey, "error").events
     assert [(e["step"], e["value"]) for e in by_error["events"]] == [(e.step, e.score) for e in events]
     assert {e["episode"] for e in by_error["events"]} == {9}
     assert "data=live%3Arun" in by_error["events"][0]["link"]

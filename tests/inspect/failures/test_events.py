@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -17,7 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrain
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
-from beliefscope.inspect.failures.step_scores import Survey, disagreement, phases_of, scores_of
+from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey, disagreement, phases_of, scores_of
 from beliefscope.inspect.failures.survey import BLOCK, survey_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
@@ -37,6 +38,10 @@ def episodes() -> dict[int, Episode]:
         return {index: shortened(data[index]) for index in data.held_out()[:EPISODES]}
 
 
+def survey_over(traces: Iterable[Trace]) -> Survey:
+    return Survey.from_episodes(map(EpisodeScores.from_trace, traces))
+
+
 def shortened(episode: Episode, steps: int = CUT) -> Episode:
     arrays = {name: getattr(episode, name)[:steps] for name in ("states", "controls", "contact", "qpos")}
     return replace(episode, **arrays, observations={k: v[:steps] for k, v in episode.observations.items()})
@@ -49,7 +54,7 @@ def traces(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> list[Trace]:
 
 @pytest.fixture(scope="module")
 def survey(traces: list[Trace]) -> Survey:
-    return Survey.from_traces(traces)
+    return survey_over(traces)
 
 
 def with_contact(run: Trace, contact: np.ndarray) -> Trace:
@@ -68,7 +73,7 @@ def test_planted_error_is_the_worst_event(traces: list[Trace]) -> None:
     contact = np.zeros(CUT, dtype=bool)
     contact[40:] = True
     shifted_trace = shifted(with_contact(traces[2], contact), 37, 47, 1.0)
-    failures = failures_of(Survey.from_traces([*traces[:2], shifted_trace, *traces[3:]]))
+    failures = failures_of(survey_over([*traces[:2], shifted_trace, *traces[3:]]))
     worst = failures.events[0]
     assert (worst.episode, worst.first, worst.last, worst.step) == (shifted_trace.episode_index, 37, 47, 42)
     assert worst.phase == "contact made"
@@ -76,7 +81,7 @@ def test_planted_error_is_the_worst_event(traces: list[Trace]) -> None:
     assert f"step 42 of episode {shifted_trace.episode_index}" in failures.verdict
     assert measures.UPDATES_NOTE not in failures.verdict
     assert measures.UPDATES_NOTE in replace(failures, by="disagreement").verdict
-    release = failures_of(Survey.from_traces([shifted(with_contact(traces[2], ~contact), 37, 47, 1.0)]))
+    release = failures_of(survey_over([shifted(with_contact(traces[2], ~contact), 37, 47, 1.0)]))
     assert release.events[0].phase == "contact lost"
 
 
@@ -88,7 +93,7 @@ def test_injected_faults_are_found_in_their_episode_and_phase(
     faulty = trace(checkpoint, episodes[index], index, particles=50, faults=faults)
     steady = with_contact(faulty, np.ones(CUT, dtype=bool))
     others = [replace(run, faults=faults) for k, run in enumerate(traces) if k != 1]
-    failures = failures_of(Survey.from_traces([steady, *others]))
+    failures = failures_of(survey_over([steady, *others]))
     worst = failures.events[0]
     assert worst.episode == index
     assert 35 <= worst.step <= 55
@@ -130,7 +135,7 @@ def longest_run(gaps: np.ndarray) -> int:
 @pytest.mark.parametrize("by", ["error", "nees", "ess", "disagreement", "regret"])
 def test_order_of_episodes_is_irrelevant(traces: list[Trace], survey: Survey, by: str) -> None:
     order = np.random.default_rng(1).permutation(len(traces))
-    assert failures_of(Survey.from_traces(traces[i] for i in order), by).to_dict() == failures_of(survey, by).to_dict()
+    assert failures_of(survey_over(traces[i] for i in order), by).to_dict() == failures_of(survey, by).to_dict()
 
 
 @pytest.mark.parametrize("by", ["error", "nees", "ess", "disagreement", "regret"])
@@ -177,7 +182,7 @@ def test_regret_in_the_warm_up_is_no_failure(survey: Survey) -> None:
 def test_contact_changes_last_half_a_second(traces: list[Trace]) -> None:
     contact = np.zeros(CUT, dtype=bool)
     contact[20:30] = True
-    phases = Survey.from_traces([with_contact(traces[0], contact)]).phases
+    phases = survey_over([with_contact(traces[0], contact)]).phases
     assert traces[0].episode.dt == 0.1
     assert np.flatnonzero(phases["contact made"]).tolist() == [20, 21, 22, 23, 24]
     assert np.flatnonzero(phases["contact lost"]).tolist() == [30, 31, 32, 33, 34]
@@ -196,16 +201,16 @@ def test_timestamps_give_events_and_phases_their_times(traces: list[Trace]) -> N
     duration[26] = 3.0
     times = np.cumsum(duration) - duration[0]
     shifted_trace = shifted(with_contact(traces[0], contact), 37, 47, 1.0)
-    survey = Survey.from_traces([timed(shifted_trace, times)])
-    assert Survey.from_traces([shifted_trace]).time is None
+    survey = survey_over([timed(shifted_trace, times)])
+    assert survey_over([shifted_trace]).time is None
     assert np.flatnonzero(survey.phases["contact made"]).tolist() == [20, 21, 22, 23, 24]
     contact[20:25], contact[25:45] = False, True
     brief = timed(with_contact(traces[0], contact), times)
-    assert np.flatnonzero(Survey.from_traces([brief]).phases["contact made"]).tolist() == [25]  # then 3 s have passed
-    lost = Survey.from_traces([brief]).phases["contact lost"]
+    assert np.flatnonzero(survey_over([brief]).phases["contact made"]).tolist() == [25]  # then 3 s have passed
+    lost = survey_over([brief]).phases["contact lost"]
     assert np.flatnonzero(lost).tolist() == list(range(45, CUT))  # 15 steps of 0.02 s
-    before = failures_of(Survey.from_traces([shifted_trace, *traces[1:]]))
-    after = failures_of(Survey.from_traces([timed(shifted_trace, times), *traces[1:]]))
+    before = failures_of(survey_over([shifted_trace, *traces[1:]]))
+    after = failures_of(survey_over([timed(shifted_trace, times), *traces[1:]]))
     worst = after.events[0]
     assert (worst.first, worst.last, worst.step) == (37, 47, 42)
     assert (before.events[0].time, before.events[0].first_time) == (None, None)
@@ -221,13 +226,13 @@ def test_timestamps_give_events_and_phases_their_times(traces: list[Trace]) -> N
 
 def test_regular_timestamps_change_no_event(traces: list[Trace]) -> None:
     regular = [timed(run, run.episode.dt * np.arange(CUT)) for run in traces]
-    plain, with_times = (failures_of(Survey.from_traces(runs)) for runs in (traces, regular))
+    plain, with_times = (failures_of(survey_over(runs)) for runs in (traces, regular))
     spans = [
         [(event.episode, event.first, event.last, event.step, event.phase, event.score) for event in failures.events]
         for failures in (plain, with_times)
     ]
     assert spans[0] == spans[1]
-    mixed = failures_of(Survey.from_traces([*traces[:2], *regular[2:]]))
+    mixed = failures_of(survey_over([*traces[:2], *regular[2:]]))
     without = {event.episode for event in mixed.events if event.time is None}
     assert without <= {run.episode_index for run in traces[:2]}
     assert mixed.timed
@@ -280,13 +285,13 @@ def test_angles_have_a_score_and_wrap() -> None:
         run = trace(door, shortened(data[9]), 9)
     turned = run.estimate_mean.copy()
     turned[50, 2] += 2 * np.pi - 0.5
-    failures = failures_of(Survey.from_traces([replace(run, estimate_mean=turned)]), "angle")
+    failures = failures_of(survey_over([replace(run, estimate_mean=turned)]), "angle")
     assert failures.events[0].step == 50
     assert failures.events[0].score == pytest.approx(0.5, abs=0.1)
     assert failures.unit == "rad"
     assert "deg at step 50" in failures.verdict
     with pytest.raises(BadInput, match="no failures by ess: this filter has no particles"):
-        failures_of(Survey.from_traces([run]), "ess")
+        failures_of(survey_over([run]), "ess")
 
 
 def test_a_score_that_does_not_apply_is_refused_after_the_first_block() -> None:
@@ -304,7 +309,7 @@ def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[i
     faults = Faults.parse("blackout=0.4,force_bias:x=5")
     survey = survey_of(filter_, members, members, faults=faults)
     for index, episode in members.items():
-        single = Survey.from_traces([trace(filter_, episode, index, faults=faults)])
+        single = survey_over([trace(filter_, episode, index, faults=faults)])
         np.testing.assert_allclose(survey.error[survey.episode == index], single.error, rtol=1e-3, atol=1e-6)
         np.testing.assert_allclose(survey.nees[survey.episode == index], single.nees, rtol=1e-2)  # float32 covariances
 
@@ -345,7 +350,7 @@ def test_figures_and_tables(survey: Survey) -> None:
 
 def test_the_table_of_a_filter_without_weights_has_none(traces: list[Trace]) -> None:
     runs = [replace(run, weights=None, effective_weights=None) for run in traces]
-    table = failures_of(Survey.from_traces(runs), "error").tables()[-1]
+    table = failures_of(survey_over(runs), "error").tables()[-1]
     assert not [name for name in table.columns if "weight" in name]
     assert {len(row) for row in table.rows} == {len(table.columns)}
 
@@ -360,7 +365,7 @@ def test_the_table_of_a_filter_without_weights_has_none(traces: list[Trace]) -> 
 )
 def test_inconsistent_traces_are_refused(traces: list[Trace], change, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(BadInput, match=message):
-        Survey.from_traces(change(traces))
+        survey_over(change(traces))
 
 
 def test_unknown_names_list_the_available_ones(checkpoint: Checkpoint, survey: Survey) -> None:
@@ -382,7 +387,7 @@ def test_faults_after_all_steps_are_refused(checkpoint: Checkpoint, episodes: di
 
 def test_exact_estimates_have_no_events(traces: list[Trace]) -> None:
     exact = replace(traces[0], estimate_mean=traces[0].episode.states)
-    failures = failures_of(Survey.from_traces([exact]))
+    failures = failures_of(survey_over([exact]))
     assert failures.events == ()
     assert failures.verdict == f"No events in 1 episode, {CUT} steps, by position error."
     assert failures.tables()[0].rows[0][2] == 0
