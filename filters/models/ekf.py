@@ -105,9 +105,18 @@ class ExtendedKalmanFilter(Filter):
         if architecture.fusion in WEIGHTED:
             self.weight_model = WeightModel(self.task, architecture, self.n)
 
+    def sense(self, name: str, observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """z and the square root of R's diagonal of one virtual sensor, (T, N, n), standardised.
+
+        Args:
+            observations: standardised, of consecutive steps.
+        """
+        z, noise = self.virtual_sensors[name](observations)
+        return z, noise
+
     def encode(self, batch: Batch) -> Evidence:
         observations = self.observations(batch)
-        z, noise = zip(*(self.virtual_sensors[m](observations) for m in self.names), strict=True)
+        z, noise = zip(*(self.sense(name, observations) for name in self.names), strict=True)
         evidence = Evidence(
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(z, dim=2),

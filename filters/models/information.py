@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from beliefscope.filters.batch import Batch, position_channels
+from beliefscope.filters.batch import position_channels
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import Architecture
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, VirtualSensor
@@ -125,17 +125,6 @@ class InformationFilter(ExtendedKalmanFilter):
         """Position of a scalar observation in a modality's vector."""
         keys = self.task.modalities[name]
         return sum(self.task.observations[k][0] for k in keys[: keys.index(key)])
-
-    def encode(self, batch: Batch) -> Evidence:
-        observations = self.observations(batch)
-        z, noise = zip(*(self.sense(name, observations) for name in self.names), strict=True)
-        evidence = Evidence(
-            control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
-            observation=torch.stack(z, dim=2),
-            noise=torch.stack(noise, dim=2),
-            log_weights=self.log_weights(observations),
-        )
-        return self.with_readings(evidence, batch)
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
         """The joint Gaussian (N, n (1 + K)) of the state and the biases, which are independent of it."""
