@@ -38,7 +38,8 @@ SPELLINGS = {
 ELEMENTS = re.compile(r"(.*)\[(\d{1,9}(?:,\d{1,9})*)\]")
 """``NAME[I]`` or ``NAME[I,J,...]``: elements of the rows of an array."""
 
-KEYS = ("task", "dt", "time", "clock", "episode", "control", "contact", "state", "sensors", "covariates", "estimate")
+NAMES = ("time", "clock", "episode", "contact")
+KEYS = ("task", "dt", *NAMES, "control", "state", "sensors", "modalities", "covariates", "estimate")
 VALUES = ("mean", "std", "covariance", "particles")
 ESTIMATE = ("filter", *VALUES, "weights")
 
@@ -92,8 +93,9 @@ class ColumnMap:
         time: column in s, or timeline of a Rerun recording.
         episode: column that numbers or names the episodes; empty for a single one.
         state: component -> its column. control: columns. contact: column that is not zero in contact.
-        sensors: modality -> columns, or one column of images. covariates: name -> column.
-        valid: modality -> column that is not zero at the steps with a reading of it.
+        sensors: name -> columns, or one column of images. covariates: name -> column.
+        valid: sensor -> column that is not zero at the steps with a reading of it.
+        modalities: name -> its sensors.
         estimate: recorded estimate: ``filter``: its name; ``mean``; ``std`` or ``covariance``; or ``particles``
             (rows of M n numbers) in their place; ``weights``: modality -> column. Empty for a log without estimates.
     """
@@ -108,6 +110,7 @@ class ColumnMap:
     contact: str = ""
     sensors: Mapping[str, References] = field(default_factory=dict)
     valid: Mapping[str, str] = field(default_factory=dict)
+    modalities: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     covariates: Mapping[str, CovariateColumn] = field(default_factory=dict)
     estimate: Mapping[str, Any] = field(default_factory=dict)
 
@@ -171,7 +174,7 @@ def read_map(path: Path) -> ColumnMap:
     state = {name: _component(name, value) for name, value in _table(values, "state", path).items()}
     if not state:
         raise BadInput(f'[state] of {path.name} has no components, expected one or more: name = "column"')
-    names = {key: values.get(key, "") for key in ("time", "clock", "episode", "contact")}
+    names = {key: values.get(key, "") for key in NAMES}
     control = values.get("control", [])
     lists = [("control", control), *sensors.items(), *((key, estimate[key]) for key in VALUES if key in estimate)]
     for key, value in (*names.items(), *lists, *_table(estimate, "weights", path).items()):
@@ -179,8 +182,9 @@ def read_map(path: Path) -> ColumnMap:
             raise BadInput(f"{key} in {path.name} is {value!r:.100}, expected the name of a column or a list of names")
     covariates = {name: _covariate(name, value) for name, value in _table(values, "covariates", path).items()}
     task = values.get("task", path.stem)
-    columns = {"control": control, "sensors": sensors, "valid": valid, "covariates": covariates}
-    return ColumnMap(task, state, dt, estimate=estimate, **columns, **names)
+    modalities = _modalities(_table(values, "modalities", path), sensors, path)
+    columns = {"control": control, "sensors": sensors, "valid": valid, "modalities": modalities}
+    return ColumnMap(task, state, dt, covariates=covariates, estimate=estimate, **columns, **names)
 
 
 def _table(values: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:
@@ -188,6 +192,19 @@ def _table(values: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any
     if not isinstance(table, dict):
         raise BadInput(f"{name} in {path.name} is {table!r:.100}, expected a table: [{name}]")
     return table
+
+
+def _modalities(table: Mapping[str, Any], sensors: Mapping[str, Any], path: Path) -> dict[str, tuple[str, ...]]:
+    for name, keys in table.items():
+        if not _texts(keys) or not keys:
+            raise BadInput(f"modality {name!r} in {path.name} is {keys!r:.100}, expected a list of sensors")
+        for key in keys:
+            check_name(f"sensor of modality {name!r}", key, sensors)
+    grouped = [key for keys in table.values() for key in keys]
+    own = {name: (name,) for name in sensors if name not in grouped}
+    if both := own.keys() & table:
+        raise BadInput(f"{min(both)!r} in {path.name} is a modality and a sensor of no modality; rename one of them")
+    return own | {name: tuple(keys) for name, keys in table.items()}
 
 
 def _component(name: str, value: Any) -> StateColumn:

@@ -146,7 +146,7 @@ def _value(component: str, reference: str) -> str:
 
 
 def _sensors(names: Sequence[str], flat: Sequence[str]) -> dict[str, str | list[str]]:
-    """Modality -> columns; single numbers such as gps_x and gps_y are the channels of one modality."""
+    """Sensor -> columns; single numbers such as gps_x and gps_y are the channels of one sensor."""
     groups: dict[str, list[str]] = {}
     for name in names:
         channel = CHANNEL.fullmatch(name) if name in flat else None
@@ -161,7 +161,7 @@ def _sections(state: Mapping[str, str], sensors: Mapping[str, str | list[str]]) 
     """Lines of [state] and [sensors]."""
     lines = ["[state]  # true values: component = column in m, or {column = NAME, unit = cm, rad, deg, or any}"]
     lines += [f"{component} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
-    lines += ["[sensors]  # modality = column or list of columns"]
+    lines += ["[sensors]  # sensor = column or list of columns; each is a modality unless [modalities] groups them"]
     return lines + [f"{key} = {_text(n) if isinstance(n, str) else _texts(n)}" for key, n in sensors.items()]
 
 

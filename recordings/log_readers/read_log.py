@@ -373,7 +373,7 @@ def _task(
         name=mapping.task,
         components=components,
         observations={name: array.shape[1:] for name, array in sensors.items()},
-        modalities={name: (name,) for name in sensors},
+        modalities=mapping.modalities,
         control_size=controls,
         dt=dt,
         map_components=tuple(component.name for component in components[:2]),

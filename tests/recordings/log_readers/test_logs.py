@@ -99,6 +99,16 @@ def test_arrays_of_an_archive(tmp_path: Path) -> None:
     np.testing.assert_allclose(trace.estimate_covariance, expected, atol=1e-5)
 
 
+def test_modalities_group_sensors(tmp_path: Path) -> None:
+    sensors = '[sensors]\nforce = ["gps_x", "gps_y"]\ntorque = "sd_x"\nspeed = "sd_y"\n'
+    text = MAP.replace(
+        '[sensors]\ngps = ["gps_x", "gps_y"]\n', f'{sensors}[modalities]\nhaptics = ["force", "torque"]\n'
+    )
+    episode = read_log(table(), read_map(map_file(tmp_path, text)), "log")[0]
+    assert episode.task.modalities == {"speed": ("speed",), "haptics": ("force", "torque")}
+    assert episode.task.observations == {"force": (2,), "torque": (1,), "speed": (1,)}
+
+
 def test_covariates_define_groups(tmp_path: Path) -> None:
     text = MAP.replace(
         "[estimate]",
@@ -225,6 +235,9 @@ def test_times_of_the_log_are_kept(tmp_path: Path) -> None:
         ("[estimate]", '[estimate]\nweights = "sd_x"', "expected a table"),
         ("[estimate]", "[estimate]\nweights = {gps = 1}", "gps in map.toml is 1"),
         ("[estimate]", '[covariates]\nv = {column = "t", cuts = [2, 1]}\n[estimate]', "covariate 'v'"),
+        ("[estimate]", '[modalities]\nradio = ["gps", "imu"]\n[estimate]', "'imu' does not exist. Available: gps"),
+        ("[estimate]", '[modalities]\nradio = "gps"\n[estimate]', "modality 'radio' .* expected a list of sensors"),
+        ("[sensors]", '[modalities]\ngps = ["imu"]\n[sensors]\nimu = "gps_x"', "'gps' .* rename one"),
     ],
 )
 def test_wrong_maps_name_the_value(tmp_path: Path, old: str, new: str, message: str) -> None:
