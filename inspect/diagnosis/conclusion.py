@@ -16,7 +16,7 @@ from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
-from beliefscope.inspect.diagnosis.sensor_checks import localise
+from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
@@ -189,11 +189,10 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:
         return f"{first.cause.title} or {_lower(similar[0].cause.title)}, not separable; try: {first.next}"
-    since = _since(case, first)
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"
-    text = f"{title}{since}{where}, probability {probability_text(first.probability)}"
+    text = f"{title}{_when(case, first)}{where}, probability {probability_text(first.probability)}"
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
         text += f"; and {_lower(second.cause.title)}, probability {probability_text(second.probability)}"
     if masked:
@@ -219,13 +218,22 @@ def _lower(title: str) -> str:
     return title if title[:2].isupper() else title[0].lower() + title[1:]
 
 
-def _since(case: Case, candidate: Candidate) -> str:
-    """The first step of a cause and its time; empty without steps, and for causes of the whole episode."""
-    if candidate.steps is None or candidate.steps[0] <= 0:
+def _when(case: Case, candidate: Candidate) -> str:
+    """The steps of a cause: all; or the first and, if it ends before the episodes, the last one, with their times.
+
+    Empty if they are unknown, and if the cause occurs from the first to the last step, but not at all steps.
+    """
+    if candidate.steps is None:
         return ""
-    step = candidate.steps[0]
-    episodes = [t.episode for t in case.traces if t.episode_index in candidate.episodes[:1]] or [case.traces[0].episode]
-    return f" from step {step} ({episodes[0].times[step]:.1f} s)"
+    first, last = candidate.steps[0], candidate.steps[1] - 1
+    episodes = [trace.episode for trace in case.traces if trace.episode_index in candidate.episodes]
+    statistic = symptoms_of(candidate.cause, case.alarms)[0].statistic
+    if all(covers_episode(statistic, episode) for episode in episodes):
+        return " at all steps"
+    longest = max(episodes, key=len)
+    if last < len(longest) - 1:
+        return f" from step {first} to {last} ({longest.times[first]:.1f} to {longest.times[last]:.1f} s)"
+    return f" from step {first} ({longest.times[first]:.1f} s)" if first > 0 else ""
 
 
 def _provenance(case: Case) -> dict[str, Any]:

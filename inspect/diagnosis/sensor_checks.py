@@ -75,6 +75,22 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
     return None if values is None or not np.isfinite(values).any() else deviating_windows(values)
 
 
+def covers_episode(statistic: str, episode: Episode) -> bool:
+    """Whether all readings of an episode are lost images, or the same reading, if a statistic counts such readings."""
+    kind, subject, _ = statistic.split("/")
+    key, _, axis = subject.partition(" ")
+    if key not in episode.observations:
+        return False
+    readings = episode.observations[key][episode.present(key)]
+    match kind:
+        case "black" | "losses":
+            return bool(lost_images(readings).all())
+        case "frozen" | "stuck":
+            chosen = readings[:, axis_index(axis)] if axis else readings
+            return bool((chosen == chosen[:1]).all())
+    return False
+
+
 def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | None:
     """(T,) affected steps of a statistic that counts steps; None for others."""
     readings, present = episode.observations[key], episode.present(key)

@@ -88,26 +88,28 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
 
 
 @pytest.mark.parametrize(
-    ("faults", "cause"),
+    ("faults", "cause", "steps"),
     [
-        ("image_frozen:from=30", "image.frozen"),
-        ("force_bias=3", "force.bias"),
-        ("force_bias=8:from=30", "force.bias"),
-        ("force_drift=2", "force.drift"),
+        ("image_frozen:from=30", "image.frozen", " from step 31 (3.1 s)"),
+        ("image_frozen", "image.frozen", " at all steps"),
+        ("blackout:from=20:to=40", "image.blackout", " from step 20 to 39 (2.0 to 3.9 s)"),
+        ("force_stuck", "force.stuck", " at all steps"),
+        ("force_bias=3", "force.bias", ""),
+        ("force_bias=8:from=30", "force.bias", " from step 30 (3.0 s)"),
+        ("force_drift=2", "force.drift", ""),
     ],
 )
-def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
+def test_a_planted_sensor_fault_is_named_with_its_steps(faults: str, cause: str, steps: str) -> None:
     progress: list[float] = []
     result = diagnose(checkpoint(), faulty(faults), profile=profile(), progress=progress.append)
     first = result.causes[0]
     assert (result.state, first.cause.name) == ("fault", cause)
     assert first.evidence[0].value > first.evidence[0].high
-    assert first.cause.title in result.headline
+    assert result.headline.startswith(f"{first.cause.title}{steps}, probability ")
     assert progress == sorted(progress)
     assert progress[-1] == pytest.approx(1.0)
-    if cause == "image.frozen":
-        assert first.steps is not None
-        assert 28 <= first.steps[0] <= 32
+    if faults == "image_frozen:from=30":
+        assert first.steps == (31, 60)
 
 
 def test_a_healthy_diagnosis_states_what_was_compared() -> None:
