@@ -24,6 +24,7 @@ from pyarrow import csv
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import read_faults
 from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.notebook_html import html_paragraph, html_table
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.filters.engine import Engine, run_all
@@ -178,6 +179,9 @@ OVERVIEW = {
 DOCUMENTS = ["training", "provenance"]
 """Columns of the overview with JSON documents, which a table for reading leaves out."""
 
+SHOWN = 20
+"""Rows of the overview in a notebook."""
+
 KEYS = {
     RESULTS: "checkpoint, data, faults, seed, particles, episode, phase",
     CHECKPOINTS: "checkpoint",
@@ -268,6 +272,20 @@ class Experiments:
         except duckdb.Error:
             self._check_files()
             raise
+
+    def __repr__(self) -> str:
+        """One line: size of the table of results, number of checkpoints and data sets, and folders."""
+        ((rows, checkpoints, sets),) = self._rows(f"SELECT {', '.join(f'(SELECT count() FROM {t})' for t in TABLES)}")
+        columns = len(self._database.table(RESULTS).columns)
+        counts = f"{rows} rows of {columns} columns, checkpoints: {checkpoints}, data sets: {sets}"
+        return f"<Experiments: {counts}, in {', '.join(map(str, self.folders))}>"
+
+    def _repr_html_(self) -> str:
+        """That line and the first ``SHOWN`` rows of the overview, in a notebook."""
+        rows = self.overview().drop_columns([*DOCUMENTS, "checkpoint", "data"]).slice(0, SHOWN)
+        return html_paragraph(repr(self)[1:-1], strong=True) + html_table(
+            f"Largest errors, at most {SHOWN} rows", rows.column_names, [row.values() for row in rows.to_pylist()]
+        )
 
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
         """The result of a query. Raises BadInput with the message of the database, or with a deleted file."""

@@ -91,6 +91,16 @@ def test_phases_partition_the_steps(sweep: Path) -> None:
     assert by_phase["contact"] + by_phase["free motion"] == by_phase["all"]
 
 
+def test_representations(sweep: Path) -> None:
+    table, results = Experiments([sweep]), pq.read_table(sweep / f"{RESULTS}.parquet")
+    size = f"{results.num_rows} rows of {results.num_columns} columns"
+    assert repr(table) == f"<Experiments: {size}, checkpoints: 2, data sets: 1, in {sweep}>"
+    html = table._repr_html_()
+    assert html.count("<tr>") == 1 + len(table.overview())
+    assert "image-pf" in html
+    assert table.overview()["checkpoint"][0].as_py() not in html
+
+
 def test_a_row_leads_to_its_trace(sweep: Path) -> None:
     experiments = Experiments([sweep])
     checkpoint = load_checkpoint(pretrained_path("door", "image-pf")).hash
