@@ -102,7 +102,7 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
         elongation=elongation,
         expected=expected,
         deviation=deviation,
-        shape=classify(area50, size * len(y), elongation, rings),
+        shape=classify(area50, size * len(y), elongation, rings, log_peak - log.min(axis=(2, 3))),
         ring_centre=rings.centre,
         ring_radius=rings.radius,
         ring_spread=rings.spread,

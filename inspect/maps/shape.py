@@ -18,6 +18,10 @@ ROUND = 1.3
 FLAT = 0.4
 """Part of the square that the 50 % region of a flat map covers at least; 0.5 if uniform."""
 
+FLAT_RANGE = 2.0
+"""nats; a map without ring and ridge whose logarithm varies by less is flat: a 95 % likelihood interval of one
+component (1.92 nats) has all of the square."""
+
 MAX_SPREAD, MIN_COVERAGE = 0.3, 0.6
 """Limits of a ring. A round peak has a spread of at least 0.35, that of a uniform disc; a straight ridge, or an arc of
 less than half a circle, a coverage below 0.6."""
@@ -80,9 +84,14 @@ def fit_rings(share: Array, region: NDArray[np.bool_], x: Array, y: Array) -> Ri
     return Rings(centre, radius, spread / np.maximum(radius, 1e-12), np.exp(entropy) / SECTORS)
 
 
-def classify(area50: Array, square: float, elongation: Array, rings: Rings) -> NDArray[np.int64]:
-    """(B, L) index in ``SHAPES``. area50: area of the 50 % region, in the units of ``square``, the area of the map."""
+def classify(area50: Array, square: float, elongation: Array, rings: Rings, log_range: Array) -> NDArray[np.int64]:
+    """(B, L) index in ``SHAPES``.
+
+    Args:
+        area50: (B, L) area of the 50 % region, in the units of ``square``, the area of the map.
+        log_range: (B, L) nats, difference between the largest and the smallest value of the map.
+    """
     ring = (rings.spread <= MAX_SPREAD) & (rings.coverage >= MIN_COVERAGE)
-    conditions = [area50 >= FLAT * square, ring, elongation >= ROUND]
-    shapes = [SHAPES.index(name) for name in ("flat", "ring", "ridge")]
+    conditions = [area50 >= FLAT * square, ring, elongation >= ROUND, log_range < FLAT_RANGE]
+    shapes = [SHAPES.index(name) for name in ("flat", "ring", "ridge", "flat")]
     return np.select(conditions, shapes, SHAPES.index("round")).astype(np.int64)

@@ -317,6 +317,9 @@ test('measures as text', () => {
   );
   const { description } = layerMeasures(maps, 2, false);
   assert.match(description, /around \+3\.0, −1\.0 cm from the truth, over 90 % of the circle/);
+  const flat = layerMeasures({ ...maps, shape: ['flat', 'flat', 'flat'] }, 1, false);
+  assert.equal(flat.cells[4], 'flat');
+  assert.match(flat.description, /; flat: the likelihood hardly varies over the map$/);
   const noDirection = { ...maps, numbers: { ...maps.numbers, deviation: [null, null, null] } };
   assert.equal(layerMeasures(noDirection, 1, false).cells[4], 'ridge 90°, 3.0:1');
   assert.equal(mapTitle(maps), 'Likelihood. Fused: sum of likelihoods (unimodal)');

@@ -184,7 +184,7 @@ export function tilesScale(quantity, scale, range, shade) {
  * @param {Maps} maps
  * @param {number} layer
  */
-function shapeText({ numbers, shape: shapes, axes }, layer) {
+function shapeText({ numbers, shape: shapes, axes, quantity }, layer) {
   const [deviation, axis, shape] = [numbers.deviation[layer], numbers.axis[layer], shapes[layer]];
   if (shape === null) return { short: '', long: '' };
   const elongation = fixed(numbers.elongation[layer], 1);
@@ -199,6 +199,8 @@ function shapeText({ numbers, shape: shapes, axes }, layer) {
       long: `${ratio}ring with radius ${radius} around ${x}, ${y} ${unit} from the truth, over ${part} of the circle`,
     };
   }
+  if (shape === 'flat')
+    return { short: shape, long: `; flat: the ${quantity} hardly varies over the map` };
   if (shape !== 'ridge') return { short: shape, long: `${ratio}shape: ${shape}` };
   const angle = Math.round(degrees(axis) ?? NaN);
   const direction = `ridge ${fixed(angle > -90 ? angle : angle + 180, 0)}°`;

@@ -53,10 +53,13 @@ def test_shapes(size: int) -> None:
         "flat": [
             np.zeros_like(grid.x),
             3.0 * grid.x,
+            6.0 * grid.x,  # 1.6 nats
+            grid.peak((0.02, 0.0), 0.8 * HALF),  # 1.9 nats
             np.log1p(-0.999 * np.exp(grid.peak(sd=0.04))),  # everywhere but near the effector
         ],
         "round": [
             grid.peak(),
+            grid.peak(sd=0.6 * HALF),  # 2.8 nats
             grid.peak((0.1, -0.05), 0.02),
             grid.peak((0.001, 0.0), 0.002),  # within a cell
             grid.peak((HALF / size, HALF / size), 0.003),  # on a corner of cells
