@@ -211,7 +211,7 @@ ERROR_QUANTITIES = ("RMSE", "predicted", "CRPS")
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if not trace.has_covariance or not np.isfinite(trace.estimate_covariance).any():
-        return f"{trace.filter} has no covariance to compare its errors with"
+        return f"filter {trace.filter} has no covariance to compare its errors with"
     return None
 
 

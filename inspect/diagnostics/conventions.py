@@ -218,7 +218,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     if not np.isfinite(trace.episode.states).all():
         return "the episode has no ground truth at some steps"
     if checkpoint is not None and not changes_of(trace.task, modalities_of(checkpoint), trace.episode):
-        return f"{trace.filter} has no input with a sign, a scale, axes or a delay"
+        return f"filter {trace.filter} has no input with a sign, a scale, axes or a delay"
     return None
 
 

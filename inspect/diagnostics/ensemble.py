@@ -143,7 +143,7 @@ class Ensemble(Diagnostic):
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if not has_equal_weights(trace):
-        return f"{trace.filter} has no ensemble: particles of equal weight"
+        return f"filter {trace.filter} has no ensemble: particles of equal weight"
     if not np.isfinite(trace.episode.states).any():
         return "the true state is unknown"
     return None

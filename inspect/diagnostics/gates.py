@@ -148,7 +148,7 @@ class Innovations(Diagnostic):
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
-    return f"{trace.filter} reports no innovations of its measurements" if trace.innovation is None else None
+    return f"filter {trace.filter} reports no innovations of its measurements" if trace.innovation is None else None
 
 
 def innovations_of(traces: Sequence[Trace]) -> Innovations:

@@ -204,7 +204,7 @@ class ParticleHealth(Diagnostic):
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if trace.particles is None or trace.log_weights is None:
-        return f"{trace.filter} has no particles"
+        return f"filter {trace.filter} has no particles"
     if trace.all_particles_ess is not None:
         kept, total = trace.particles.shape[1], trace.particle_count
         return f"the trace has {kept} of {total} particles; trace with --particles-kept {total}"

@@ -330,7 +330,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if isinstance(checkpoint, ExternalFilter):
         if not is_stepwise(checkpoint.adapter.module):
-            return f"{trace.filter} processes all steps at once"
+            return f"filter {trace.filter} processes all steps at once"
         try:
             checkpoint.snapshot()
         except BadInput as error:

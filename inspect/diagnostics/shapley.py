@@ -341,7 +341,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         return None
     count = len(modalities_of(checkpoint))
     return (
-        f"{trace.filter} has {count} modalities; at most {MAX_MODALITIES} are supported"
+        f"filter {trace.filter} has {count} modalities; at most {MAX_MODALITIES} are supported"
         if count > MAX_MODALITIES
         else None
     )

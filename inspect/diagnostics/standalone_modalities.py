@@ -91,11 +91,11 @@ class StandaloneModalities(Diagnostic):
         result = (
             "Fusion is more accurate than every standalone modality"
             if high < 1.0
-            else f"{self.modalities[k]} standalone is more accurate than fusion"
+            else f"Standalone {self.modalities[k]} is more accurate than fusion"
             if low > 1.0
             else f"Fusion and {self.modalities[k]} standalone do not differ significantly"
         )
-        sentences.append(f"{result[0].upper()}{result[1:]} ({ratio}, 95 % interval {low:.2f} to {high:.2f}).")
+        sentences.append(f"{result} ({ratio}, 95 % interval {low:.2f} to {high:.2f}).")
         return " ".join(sentences)
 
     def tables(self) -> list[Table]:
@@ -150,7 +150,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     if why := of_standalone_run(trace):
         return why
     if checkpoint is not None and len(modalities_of(checkpoint)) < 2:
-        return f"{trace.filter} has one modality: it is the standalone filter"
+        return f"filter {trace.filter} has one modality: it is the standalone filter"
     return None
 
 

@@ -264,14 +264,14 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if trace.effective_weights is not None:
         missing = np.isnan(trace.modality_mean).all()
-        return f"{trace.filter} reports no single-modality updates" if missing else None
+        return f"filter {trace.filter} reports no single-modality updates" if missing else None
     if not trace.modalities and trace.kind == "external":
-        return f"{trace.filter} reports no fusion weights"
+        return f"filter {trace.filter} reports no fusion weights"
     if not trace.modalities:
-        return f"{trace.filter} has no fusion weights: one network processes all modalities"
+        return f"filter {trace.filter} has no fusion weights: one network processes all modalities"
     if len(trace.modalities) > 1:
-        return f"{trace.filter} reports no effective weights"
-    return f"{trace.filter} has only one measurement model, {trace.modalities[0]}"
+        return f"filter {trace.filter} reports no effective weights"
+    return f"filter {trace.filter} has only one measurement model, {trace.modalities[0]}"
 
 
 def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightAudit:

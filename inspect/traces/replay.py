@@ -105,7 +105,7 @@ class Intervention:
             return
         if isinstance(checkpoint, ExternalFilter):
             name = checkpoint.name
-            raise BadInput(f"{name} is an external filter: its fusion weights cannot be set; use sensor faults")
+            raise BadInput(f"filter {name} is external: its fusion weights cannot be set; use sensor faults")
         names = checkpoint.filter.names
         for name in self.weights:
             check_name(f"modality of filter {checkpoint.name!r}", name, names)
@@ -262,7 +262,7 @@ class Replay:
             return evidence
         intervention.check_weights(self.checkpoint)
         if self._standalone:
-            raise BadInput(f"{self._standalone} standalone has no fusion weights: it uses one modality")
+            raise BadInput(f"standalone {self._standalone} has no fusion weights: it uses one modality")
         assert evidence.log_weights is not None
         names = self.checkpoint.filter.names
         span = slice(intervention.first, intervention.to)

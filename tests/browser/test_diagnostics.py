@@ -31,7 +31,7 @@ def test_list_has_verdicts_and_reasons(open_page: Any) -> None:
     listed = page.page.request.get(f"{page.url}api/diagnostics").json()
     assert page.page.locator("#diagnostics li .title").all_text_contents() == [entry["title"] for entry in listed]
     assert row(page, "Particle health").get_attribute("data-state") == "refused"
-    assert row(page, "Particle health").locator(".verdict").text_content() == "Crossmodal-ekf has no particles."
+    assert row(page, "Particle health").locator(".verdict").text_content() == "Filter crossmodal-ekf has no particles."
     assert "NEES/n" in row(page, "Consistency").locator(".verdict").text_content()
     overflow = page.page.evaluate(
         "() => [...document.querySelectorAll('#diagnostics, #diagnostics .top, #diagnostics .list, .bar')]"

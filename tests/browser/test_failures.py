@@ -76,6 +76,7 @@ def test_worst_step_of_a_slice_is_opened(open_page: Any) -> None:
     assert rows.count() == len(slices["rows"]) > 0
     first = slices["rows"][0]
     texts = rows.first.locator("td").all_text_contents()
+    assert first["conditions"][0]["covariate"] in texts[0]  # as it is written, without a capital
     assert texts[1] == f"{100 * first['inside']:.3g}"
     assert texts[3] == f"{first['ratio']:.2g} \N{MULTIPLICATION SIGN} ({first['low']:.2g} to {first['high']:.2g})"
     assert texts[4] == f"{len(first['episodes'])} of {len(result['episodes'])}"

@@ -143,7 +143,7 @@ def test_standalone_trace_is_saved_and_replayed_exactly(episode: Episode, tmp_pa
     loaded = load_trace(tmp_path / "image.trace")
     replay = Replay(checkpoint, loaded)
     assert replay.exact
-    with pytest.raises(BadInput, match="image standalone has no fusion weights"):
+    with pytest.raises(BadInput, match="standalone image has no fusion weights"):
         replay.with_intervention(Intervention(3, 5, weights={"image": 0.5}))
     darkened = replay.with_intervention(Intervention(3, 5, faults=Faults.parse("blackout=1")))
     assert np.array_equal(darkened.estimate_mean[:3], loaded.estimate_mean[:3])

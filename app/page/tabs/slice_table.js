@@ -134,10 +134,7 @@ export function sliceSentence(slice, score, count) {
 }
 
 /** @param {FailureSlice} slice */
-function sliceText({ conditions }) {
-  const text = conditions.map(conditionText).join(' and ');
-  return text[0].toUpperCase() + text.slice(1);
-}
+const sliceText = ({ conditions }) => conditions.map(conditionText).join(' and ');
 
 /** @param {FailureSlice} slice */
 function ratioText({ ratio, low, high }) {

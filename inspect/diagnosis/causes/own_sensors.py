@@ -32,10 +32,9 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
     result = []
     for key, modality in keys.items():
         changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
-        name = display_name(key)
         for kinds, mechanism, word, action in IMAGE if key in task.images else VECTOR:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
-            title = f"{name[0].upper()}{name[1:]} {word}"
+            title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
     return (*result, *_delays(task))
 
@@ -48,13 +47,12 @@ def _delays(task: Task) -> tuple[Cause, ...]:
     result = []
     for modality, keys in task.modalities.items() if has_labels_only(task) else ():
         for key in (key for key in keys if len(task.observations[key]) == 1 and key != HAND):
-            name = display_name(key)
             changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
             if key in (FORCE, TORQUE):
                 changed += f"|lever/{FORCE}*|axes/{FORCE}/*|size/*/contact"
             if key == FORCE and TORQUE in task.observations:
                 changed += f"|*/{TORQUE}/*|*/{TORQUE} */*"
-            title, action = f"{name[0].upper()}{name[1:]} delayed", "Synchronise the clocks of the sensors."
+            title, action = f"Sensor {display_name(key)} delayed", "Synchronise the clocks of the sensors."
             symptoms = (Symptom(f"contact lag/{key}/*"),)
             result.append(Cause(f"{key}.delay", title, symptoms, changed, action, f"advance {key}"))
     return tuple(result)

@@ -84,7 +84,7 @@ def test_list_for_a_trace_gives_reasons(server: TestClient) -> None:
         }
         for filter_ in ("crossmodal-ekf", "crossmodal-pf")
     }
-    assert reasons["crossmodal-ekf"]["particles"] == "crossmodal-ekf has no particles"
+    assert reasons["crossmodal-ekf"]["particles"] == "filter crossmodal-ekf has no particles"
     assert reasons["crossmodal-pf"]["particles"] is None
     assert reasons["crossmodal-ekf"]["consistency"] is None
 
@@ -127,7 +127,10 @@ def test_errors_name_the_reason(server: TestClient) -> None:
     poll(server, url("consistency"))
     for method in ("GET", "POST"):
         inapplicable = server.request(method, url("particles"))
-        assert (inapplicable.status_code, inapplicable.json()) == (409, {"error": "crossmodal-ekf has no particles"})
+        assert (inapplicable.status_code, inapplicable.json()) == (
+            409,
+            {"error": "filter crossmodal-ekf has no particles"},
+        )
         unknown = server.request(method, url("tea-leaves"))
         assert unknown.status_code == 404
         assert f"'tea-leaves' does not exist. Available: {', '.join(DIAGNOSTICS)}." in unknown.json()["error"]
@@ -191,7 +194,7 @@ def test_failed_job_reports_reason(server: TestClient, monkeypatch: pytest.Monke
     poll(server, url("particles"))
     server.post(url("particles"))
     job = poll(server, url("particles")).json()["job"]
-    assert (job["state"], job["error"]) == ("failed", "crossmodal-ekf has no particles")
+    assert (job["state"], job["error"]) == ("failed", "filter crossmodal-ekf has no particles")
 
 
 def test_settings_json_round_trip(tmp_path: Path, root: Path) -> None:

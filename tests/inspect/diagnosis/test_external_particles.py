@@ -110,7 +110,7 @@ def noisy(readings: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "cause", "headline"),
-    [(stuck, "near.stuck", "Near stuck from step 11 (1.1 s), probability"), (noisy, "near.noise", "Near noisy")],
+    [(stuck, "near.stuck", "Sensor near stuck from step 11 (1.1 s),"), (noisy, "near.noise", "Sensor near noisy")],
 )
 def test_a_sensor_of_a_users_task_has_causes(
     change: Callable[[np.ndarray], np.ndarray], cause: str, headline: str

@@ -131,9 +131,9 @@ def test_no_traces_and_traces_of_two_filters_are_refused(entry: Entry) -> None:
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("weights", "lstm has no fusion weights: one network processes all modalities"),
-        ("consistency", "lstm has no covariance to compare its errors with"),
-        ("particles", "lstm has no particles"),
+        ("weights", "filter lstm has no fusion weights: one network processes all modalities"),
+        ("consistency", "filter lstm has no covariance to compare its errors with"),
+        ("particles", "filter lstm has no particles"),
     ],
 )
 def test_diagnostics_that_do_not_apply_to_an_lstm(name: str, why: str) -> None:

@@ -132,7 +132,7 @@ def test_outages_and_recovery_of_a_point_estimate() -> None:
     assert group.position == pytest.approx(6.0, rel=1e-4)
     assert group.bias[0] == pytest.approx(6.0, rel=1e-4)
     assert "outages of gps" in result.verdict
-    assert DIAGNOSTICS["innovations"].refusal(run, None) == "mine reports no innovations of its measurements"
+    assert DIAGNOSTICS["innovations"].refusal(run, None) == "filter mine reports no innovations of its measurements"
 
 
 def test_readings_that_are_better_than_the_estimate_are_reported() -> None:

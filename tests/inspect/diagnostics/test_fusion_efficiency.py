@@ -219,7 +219,7 @@ def test_filter_of_one_modality_is_refused(doors: tuple[Checkpoint, list[Trace]]
         == "efficiency needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
     )
     run = plant.real("crossmodal-ekf")
-    assert entry.refusal(run, single) == "crossmodal-ekf has one modality: it is the standalone filter"
+    assert entry.refusal(run, single) == "filter crossmodal-ekf has one modality: it is the standalone filter"
 
 
 def test_the_verdict_states_that_fusion_gains_little() -> None:

@@ -158,5 +158,5 @@ def test_order_of_modalities_is_irrelevant() -> None:
 
 
 def test_filters_without_particles_are_refused() -> None:
-    assert ENTRY.refusal(plant.real("crossmodal-ekf"), None) == "crossmodal-ekf has no particles"
+    assert ENTRY.refusal(plant.real("crossmodal-ekf"), None) == "filter crossmodal-ekf has no particles"
     assert ENTRY.refusal(plant.real("crossmodal-pf"), None) is None

@@ -297,7 +297,7 @@ def test_views_match_the_fields() -> None:
 def test_too_many_modalities_are_refused() -> None:
     run = builtin("crossmodal-ekf")[1]
     checkpoint: Any = SimpleNamespace(filter=SimpleNamespace(names=tuple("abcdefg")))
-    assert shapley.why_not(run, checkpoint) == "crossmodal-ekf has 7 modalities; at most 6 are supported"
+    assert shapley.why_not(run, checkpoint) == "filter crossmodal-ekf has 7 modalities; at most 6 are supported"
     assert (
         shapley.ENTRY.refusal(run, None)
         == "shapley needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"

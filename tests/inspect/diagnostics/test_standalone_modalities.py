@@ -72,7 +72,7 @@ def result(update: float, alone: float, low: float, high: float) -> StandaloneMo
     ("alone", "low", "high", "expected"),
     [
         (2.0, 0.4, 0.6, "Fusion is more accurate than every standalone modality"),
-        (0.5, 1.8, 2.2, "Image standalone is more accurate than fusion"),
+        (0.5, 1.8, 2.2, "Standalone image is more accurate than fusion"),
         (1.0, 0.9, 1.1, "Fusion and image standalone do not differ significantly"),
     ],
 )
@@ -102,7 +102,7 @@ def test_single_modalities_are_refused() -> None:
     with open_dataset(sample_path("door")) as data:
         run = trace(checkpoint, data[9], 9)
     entry = DIAGNOSTICS["standalone"]
-    assert entry.refusal(run, checkpoint) == "f has one modality: it is the standalone filter"
+    assert entry.refusal(run, checkpoint) == "filter f has one modality: it is the standalone filter"
     assert "standalone run of image" in str(
         entry.refusal(replace(run, settings={**run.settings, "standalone": "image"}), checkpoint)
     )

@@ -256,6 +256,6 @@ def test_few_trajectories_give_no_interval() -> None:
 
 def test_single_model_filters_are_refused() -> None:
     first = plant.real("image-ekf")
-    assert ENTRY.refusal(first, None) == "image-ekf has only one measurement model, image"
+    assert ENTRY.refusal(first, None) == "filter image-ekf has only one measurement model, image"
     for name in REAL:
         assert ENTRY.refusal(plant.real(name), None) is None
