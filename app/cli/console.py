@@ -6,11 +6,14 @@ import json
 import os
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
+
+from beliefscope.app.jobs.remaining_time import RemainingTime
 
 if TYPE_CHECKING:
     from beliefscope.inspect.diagnostics.views import Table
@@ -128,14 +131,16 @@ def _progress_lines() -> Callable[[str, float, str], None]:
     """(label, completed fraction, note) -> None; prints a line at every tenth, at most one per second, and at 1."""
     began = last = time.monotonic()
     tenths: dict[str, int] = {}
+    times_left: defaultdict[str, RemainingTime] = defaultdict(RemainingTime)
 
     def update(label: str, fraction: float, text: str) -> None:
         nonlocal last
         tenth, now = int(10 * fraction + 1e-9), time.monotonic()
+        remaining = times_left[label].update(fraction, now)
         if tenth <= tenths.get(label, 0) or (tenth < 10 and now - last < 1):
             return
         tenths[label], last = tenth, now
-        left = f", {(now - began) * (1 / fraction - 1):.0f} s left" if tenth < 10 else ""
+        left = f", {remaining:.0f} s left" if remaining is not None and tenth < 10 else ""
         note(f"{label}: {10 * tenth} %, {now - began:.0f} s{left}" + (f", {text}" if text else ""))
 
     return update

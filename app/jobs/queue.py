@@ -25,6 +25,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
 
 from beliefscope import __version__
+from beliefscope.app.jobs.remaining_time import RemainingTime
 from beliefscope.app.protocol.errors import NotFound, QueueFull
 from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess, memory_in_use, redirect_output
 from beliefscope.app.workspace.json_files import content, read_record
@@ -68,7 +69,7 @@ class Job:
 
     Attributes:
         id: hash of the kind and of everything the result depends on. title: shown to users.
-        progress: 0..1. message: current activity, one line. error: why there is no result, one line.
+        progress: 0..1. remaining: s from then to the end, None if unknown. message: current activity, one line. error: why there is no result, one line.
         submitted, started, ended: s since 1970; None if that has not happened.
         server: process id of the server that runs the job. link: page address of the result (``?...``) or its file.
     """
@@ -78,6 +79,7 @@ class Job:
     title: str
     state: State = "waiting"
     progress: float = 0.0
+    remaining: float | None = None
     message: str = ""
     error: str = ""
     # Files of earlier versions name it "asked".
@@ -245,7 +247,8 @@ class Jobs:
     def _end(self, job: Job, state: State, error: str = "") -> Job:
         """Save a job that has ended. The clock may have been set back."""
         ended = max(time.time(), job.started or job.submitted)
-        self._put(replace(job, state=state, error=error or REASONS.get(state, ""), ended=ended))
+        error = error or REASONS.get(state, "")
+        self._put(replace(job, state=state, remaining=None, error=error, ended=ended))
         return self._jobs[job.id]
 
     def _delete(self, id: str) -> None:
@@ -282,10 +285,12 @@ class Jobs:
 
     def _call(self, id: str, process: WorkerProcess, arguments: Mapping[str, Any]) -> str:
         """Run the job's function in the process, and end the process. Returns the error, or an empty text."""
+        time_left = RemainingTime()
 
         def report(progress: float, message: str) -> None:
+            remaining = time_left.update(progress, time.monotonic())
             with self._lock:
-                self._jobs[id] = replace(self._jobs[id], progress=progress, message=message)
+                self._jobs[id] = replace(self._jobs[id], progress=progress, remaining=remaining, message=message)
 
         call = {"function": self._kinds[self._jobs[id].kind], "folder": str(self._folder / id), "arguments": arguments}
         reusable = False

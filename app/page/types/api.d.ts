@@ -907,7 +907,7 @@ export interface components {
          *
          *     Attributes:
          *         id: hash of the kind and of everything the result depends on. title: shown to users.
-         *         progress: 0..1. message: current activity, one line. error: why there is no result, one line.
+         *         progress: 0..1. remaining: s from then to the end, None if unknown. message: current activity, one line. error: why there is no result, one line.
          *         submitted, started, ended: s since 1970; None if that has not happened.
          *         server: process id of the server that runs the job. link: page address of the result (``?...``) or its file.
          */
@@ -929,6 +929,8 @@ export interface components {
              * @default 0
              */
             progress: number;
+            /** Remaining */
+            remaining: number | null;
             /**
              * Message
              * @default
@@ -988,6 +990,8 @@ export interface components {
              * @default 0
              */
             progress: number;
+            /** Remaining */
+            remaining: number | null;
             /**
              * Message
              * @default

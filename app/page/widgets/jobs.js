@@ -191,7 +191,7 @@ export class Jobs {
  */
 export function jobSummary(job) {
   if (job.state === 'running')
-    return [percent(job.progress), job.message || 'starting', remaining(job, Date.now() / 1000)]
+    return [percent(job.progress), job.message || 'starting', timeLeft(job.remaining)]
       .filter(Boolean)
       .join(', ');
   if (job.error && job.error !== job.state)
@@ -205,12 +205,10 @@ export function jobSummary(job) {
 }
 
 /**
- * Returns the estimated time to the end of a running job; empty before 5 % are done.
- * @param {Pick<Job, 'started' | 'progress'>} job
- * @param {number} now s since 1970
+ * Writes the estimated time to the end of a running job; empty if it is unknown.
+ * @param {number | null} seconds
  */
-export function remaining({ started, progress }, now) {
-  if (!started || progress < 0.05 || progress >= 1) return '';
-  const seconds = ((now - started) * (1 - progress)) / progress;
+export function timeLeft(seconds) {
+  if (seconds === null) return '';
   return seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.round(seconds / 60)} min left`;
 }

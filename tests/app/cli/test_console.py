@@ -20,6 +20,18 @@ def test_redirected_progress_prints_lines(capsys: pytest.CaptureFixture[str], mo
     assert len(lines) == 10
 
 
+def test_the_remaining_time_of_a_task_does_not_count_the_time_before(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.bars() as update:
+        for i in range(101):
+            clock[0] = 60.0 + 0.3 * i
+            update("Filtering", i / 100, "")
+    assert capsys.readouterr().err.startswith("Filtering: 10 %, 63 s, 27 s left\n")
+
+
 def test_redirected_progress_of_a_fast_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with console.progress("Filtering") as advance:
         for i in range(101):

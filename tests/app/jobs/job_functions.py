@@ -25,6 +25,7 @@ def wait(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
     """Wait for a file; the subprocess must end with the job."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     Path(arguments["started"]).write_text(f"{os.getpid()} {child.pid}")
+    report(0.1, "started")
     while not Path(arguments["until"]).exists():
         report(0.25, "waiting for the file")
         time.sleep(0.01)

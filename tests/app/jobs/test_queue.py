@@ -130,8 +130,9 @@ def test_progress_and_cancellation(open_jobs: OpenJobs, tmp_path: Path) -> None:
     pids = job.pids
     wait_until(lambda: jobs[job.id].message == "waiting for the file")
     assert (jobs[job.id].state, jobs[job.id].progress) == ("running", 0.25)
+    assert 0.0 < jobs[job.id].remaining < TIMEOUT
     jobs.cancel(job.id)
-    assert wait_for(jobs, job.id).state == "cancelled"
+    assert (wait_for(jobs, job.id).state, jobs[job.id].remaining) == ("cancelled", None)
     wait_until(lambda: not any(map(is_alive, pids)))
     jobs.cancel(job.id)  # deletes an ended job
     assert jobs.all() == []
