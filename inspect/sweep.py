@@ -25,6 +25,8 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import squares
+from beliefscope.filters.external.load import ExternalFilter, load_external
+from beliefscope.filters.names import is_code
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -43,7 +45,8 @@ class Cell:
     """One filter over some episodes of a data set, and everything its rows depend on.
 
     Attributes:
-        checkpoint, data: files. checkpoint_hash, data_hash: of their content.
+        checkpoint: file, or build function of an external filter. data: file.
+        checkpoint_hash, data_hash: of their content.
         faults: as text. particles: of a particle filter. episodes: indices.
     """
 
@@ -65,7 +68,7 @@ class Cell:
 
     def rows(self) -> list[Row]:
         """Run the filter: a row for each episode and phase, in this order."""
-        checkpoint = _checkpoint(self.checkpoint)
+        checkpoint = _filter(self.checkpoint, self.data)
         data = _dataset(self.data, checkpoint.task)
         if checkpoint.hash != self.checkpoint_hash:
             raise BadInput(f"{self.checkpoint} was changed while the sweep ran")
@@ -81,7 +84,8 @@ class Inputs:
     """Checkpoints and data sets of a sweep. Each checkpoint runs over the data sets of its task.
 
     Attributes:
-        checkpoints: files. data: files or folders; empty: the sample data set of each task.
+        checkpoints: files, or build functions of external filters (``find_checkpoints``).
+        data: files or folders; empty: the sample data set of each task.
         faults: texts; an empty one is clean data. seeds, particles: as for ``trace``.
         all_episodes: whether to run over all episodes instead of the held-out ones.
     """
@@ -100,14 +104,15 @@ class Inputs:
         """
         cells: list[Cell] = []
         used: set[Path] = set()
-        hashes: set[str] = set()
+        hashes: dict[str, Path] = {}
+        tasks: set[str] = set()
         for path in self.checkpoints:
-            checkpoint = _checkpoint(path)
             provenance_of(path)  # an invalid one is reported before the work
-            if checkpoint.hash in hashes:  # a copy, such as the best checkpoint that is also the last
-                continue
-            hashes.add(checkpoint.hash)
-            for data_path in self.data or (sample_path(checkpoint.task),):
+            for data_path in self.data or (sample_path(_filter(path).task),):
+                checkpoint = _filter(path, data_path)
+                tasks.add(checkpoint.task.name)
+                if hashes.setdefault(checkpoint.hash, path) != path:
+                    continue  # a copy, such as the best checkpoint that is also the last
                 data = _dataset(data_path, checkpoint.task)
                 if difference(checkpoint.task, data.task):
                     continue
@@ -123,19 +128,18 @@ class Inputs:
                             for block in _blocks(episodes, size)
                         ]
         if unused := [str(path) for path in self.data if path not in used]:
-            tasks = sorted({_checkpoint(path).task.name for path in self.checkpoints})
-            raise BadInput(f"data {', '.join(unused)} fit no checkpoint; their tasks are {', '.join(tasks)}")
+            raise BadInput(f"data {', '.join(unused)} fit no checkpoint; their tasks are {', '.join(sorted(tasks))}")
         return list(dict.fromkeys(cells))
 
 
 def provenance_of(path: Path) -> Mapping[str, Any]:
-    """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one.
+    """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one, or of code.
 
     It is the configuration of the training, for example, or the address of a tracker's run. Raises BadInput if it is
     not a JSON object.
     """
     beside = path.with_suffix(".json")
-    if not beside.is_file():
+    if is_code(str(path)) or not beside.is_file():
         return {}
     try:
         provenance = json.loads(beside.read_text())
@@ -146,13 +150,16 @@ def provenance_of(path: Path) -> Mapping[str, Any]:
     return provenance
 
 
-def describe_checkpoint(path: Path) -> Row:
-    """The row of a checkpoint: name, task, training and provenance. Raises BadInput as ``provenance_of``."""
-    checkpoint = _checkpoint(path)
+def describe_checkpoint(path: Path, data: Path | None = None) -> Row:
+    """The row of a checkpoint: name, task, training and provenance. data: that an external filter ran over.
+
+    Raises BadInput as ``provenance_of``.
+    """
+    checkpoint = _filter(path, data)
     record, provenance = dict(checkpoint.record), provenance_of(path)
     return {
         "checkpoint": checkpoint.hash,
-        "name": path.stem,
+        "name": checkpoint.name if is_code(str(path)) else path.stem,
         "path": str(path),
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
@@ -170,7 +177,7 @@ def _json_text(document: Mapping[str, Any]) -> str:
 
 def describe_data(path: Path, checkpoint: Path) -> Row:
     """The row of a data set that a checkpoint ran over."""
-    data = _dataset(path, _checkpoint(checkpoint).task)
+    data = _dataset(path, _filter(checkpoint, path).task)
     return {"data": data.hash, "name": path.stem, "path": str(path), "task": data.task.name, "episodes": len(data)}
 
 
@@ -238,9 +245,15 @@ def _probabilities(trace: Trace, n: int) -> dict[str, measures.Array]:
 
 
 def find_checkpoints(patterns: Iterable[str]) -> tuple[Path, ...]:
-    """Checkpoints that match glob patterns. Raises BadInput for a pattern that none matches."""
+    """Checkpoints that match glob patterns; ``FILE.py:FUNCTION`` and ``package.module:function`` are external filters.
+
+    Raises BadInput for a pattern that none matches.
+    """
     checkpoints: dict[Path, None] = {}
     for pattern in patterns:
+        if is_code(pattern):
+            checkpoints[location(pattern)] = None
+            continue
         names = [name for name in sorted(glob(pattern, recursive=True)) if name.endswith(".safetensors")]
         if not names:
             raise BadInput(f"no checkpoint (.safetensors) matches {pattern!r}")
@@ -248,15 +261,49 @@ def find_checkpoints(patterns: Iterable[str]) -> tuple[Path, ...]:
     return tuple(checkpoints)
 
 
+def location(source: str) -> Path:
+    """The file or the build function of a filter; absolute unless it is in a module."""
+    in_module = is_code(source) and not Path(source.rpartition(":")[0]).is_file()
+    return Path(source) if in_module else Path(source).resolve()
+
+
+def source_of(checkpoint: Checkpoint) -> str:
+    """File or build function from which other processes load a filter; its name if it has no file.
+
+    Raises BadInput for an external filter without a build function.
+    """
+    if not isinstance(checkpoint, ExternalFilter):
+        return str(checkpoint.path or checkpoint.name)
+    if not is_code(checkpoint.source):
+        raise BadInput(
+            f"filter {checkpoint.name!r} was built in Python, and a sweep runs in other processes: give its build "
+            "function, path/to/file.py:NAME"
+        )
+    return checkpoint.source
+
+
 def _blocks(indices: Iterable[int], size: int) -> Iterator[tuple[int, ...]]:
     every = tuple(indices)
     return (every[i : i + size] for i in range(0, len(every), size))
+
+
+def _filter(path: Path, data: Path | None = None) -> Checkpoint:
+    """The filter of a checkpoint or build function; the data define the task of a filter that names none."""
+    return _external(str(path), data) if is_code(str(path)) else _checkpoint(path)
 
 
 # A process runs the cells of a checkpoint and of a data set one after the other.
 @lru_cache(maxsize=2)
 def _checkpoint(path: Path) -> Checkpoint:
     return load_checkpoint(path)
+
+
+@lru_cache(maxsize=2)
+def _external(source: str, data: Path | None) -> Checkpoint:
+    if data is None:
+        return load_external(source)
+    with open_dataset(data) as episodes:
+        return load_external(source, given=(episodes.task,))
 
 
 @lru_cache(maxsize=16)

@@ -28,6 +28,7 @@ from beliefscope.datasets.notebook_html import html_paragraph, html_table
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.filters.engine import Engine, run_all
+from beliefscope.filters.names import is_code
 from beliefscope.inspect.sweep import Cell, Row, describe_checkpoint, describe_data
 from beliefscope.inspect.trace import Trace, trace
 
@@ -124,7 +125,8 @@ def write_tables(cells: Sequence[Cell], folder: Path) -> None:
         for group in _groups(files):
             writer.write_table(pa.concat_tables([_aligned(pq.read_table(file), schema) for file in group]))
     os.replace(temporary, folder / f"{RESULTS}.parquet")
-    checkpoints = [describe_checkpoint(path) for path in dict.fromkeys(cell.checkpoint for cell in cells)]
+    data = {cell.checkpoint: cell.data for cell in cells}
+    checkpoints = [describe_checkpoint(*pair) for pair in data.items()]
     datasets = [describe_data(*pair) for pair in dict.fromkeys((cell.data, cell.checkpoint) for cell in cells)]
     _write(checkpoints, folder / f"{CHECKPOINTS}.parquet")
     _write(list({row["data"]: row for row in datasets}.values()), folder / f"{DATASETS}.parquet")
@@ -349,11 +351,19 @@ class Experiments:
             return trace(checkpoint, data[row["episode"]], row["episode"], row["seed"], particles, faults)
 
     def path(self, table: str, column: str, value: str) -> Path:
-        """File of a checkpoint or data set with this hash. Raises BadInput for an unknown hash or a missing file."""
+        """File of a checkpoint or data set with this hash.
+
+        Raises BadInput for an unknown hash, a missing file and an external filter: tables cannot name code to run.
+        """
         rows = self._rows(f"SELECT path FROM {table} WHERE {column} = ?", [value])
         if not rows:
             raise BadInput(f"no {column} with hash {value[:12]} in these sweeps")
         path = Path(rows[0][0])
+        if is_code(str(path)):
+            raise BadInput(
+                f"{path} is an external filter, which a table cannot run; name it yourself: beliefscope serve --filter "
+                f"{path}, or beliefscope trace TASK --filter {path}"
+            )
         if not path.exists():
             raise BadInput(f"{column} {str(path)!r} was deleted or moved after the sweep; move it back")
         return path

@@ -35,7 +35,7 @@ from beliefscope.inspect.failures.events import Failures, find_failures as rank_
 from beliefscope.inspect.healthy import measure_profile, profile_of
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap, Quantity
 from beliefscope.inspect.maps.map_engine import COARSE, MapEngine
-from beliefscope.inspect.sweep import Inputs
+from beliefscope.inspect.sweep import Inputs, location, source_of
 from beliefscope.inspect.trace import Trace, trace as trace_episode
 from beliefscope.recordings.interactive.export import write_interactive
 from beliefscope.recordings.sweep_table import Experiments, run_sweep
@@ -315,19 +315,18 @@ def sweep(
 
     Args:
         folder: of the sweep; created if missing.
-        filters: checkpoints or their files, or ``TASK/NAME`` of pretrained filters; external filters have none.
+        filters: checkpoints or their files, ``TASK/NAME``, or external filters by build function, ``FILE.py:FUNCTION``.
         data: files of episodes; default: the sample data set of each filter's task.
         faults: each is run; an empty text is clean data. seeds: number of seeds, from 0.
         all_episodes: whether to run over training episodes as well. workers: processes.
     """
-    sources = [str((f.path or f.name) if isinstance(f, Checkpoint) else f) for f in filters]
-    files = tuple(Path(f) if f.endswith(".safetensors") else _pretrained_path(f) for f in sources)
     sets = tuple(store.sample_path(str(d)) if str(d) in TASKS else Path(d).resolve() for d in data)
+    sources = [source_of(f) if isinstance(f, Checkpoint) else str(f) for f in filters]
+    files = tuple(location(f) if f.endswith(".safetensors") or is_code(f) else _pretrained_path(f) for f in sources)
     inputs = Inputs(files, sets, tuple(faults), tuple(range(seeds)), particles, all_episodes)
-    target = Path(folder)
-    target.mkdir(exist_ok=True)
-    run_sweep(inputs.cells(), target.resolve(), workers=workers)
-    return Experiments([target])
+    Path(folder).mkdir(exist_ok=True)
+    run_sweep(inputs.cells(), Path(folder).resolve(), workers=workers)
+    return Experiments([Path(folder)])
 
 
 def record(run: Trace, path: str | Path, filter_: Filter | None = None, map_stride: int = 10) -> Path:
@@ -376,7 +375,7 @@ def serve(
 def _pretrained_path(text: str) -> Path:
     """File of a pretrained filter, ``TASK/NAME``."""
     task, _, name = text.partition("/")
-    if not name or is_code(text):
+    if not name:
         raise BadInput(f"filter {text!r} is neither TASK/NAME, such as door/crossmodal-pf, nor a .safetensors file")
     return pretrained_path(task, name)
 

@@ -20,6 +20,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
+from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.sweep import Inputs, describe_checkpoint, summary
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.sweep_table import RESULTS, TABLES, Experiments, is_finished, run_sweep, write_tables
@@ -152,6 +153,26 @@ def test_provenance_of_checkpoints(sweep: Path) -> None:
         {"name": "crossmodal-ekf", "run": "https://tracker.example/7", "task": "door"},
         {"name": "image-pf", "run": None, "task": "door"},
     ]
+
+
+def test_external_filters_run_beside_checkpoints(inputs: Inputs, tmp_path: Path, run: Run) -> None:
+    """Their errors are those of the evaluation. Code that a table names is not executed."""
+    external = "examples/04_own_filter.py:build"
+    options = ("--checkpoints", external, "--checkpoints", str(inputs.checkpoints[0]), "--data", str(inputs.data[0]))
+    code, out, _ = run("sweep", *options, "--workers", 2, "-o", tmp_path / "sweep", "--json", "-")
+    assert code == 0
+    rows = {row["name"]: row for row in json.loads(out)["overview"]}
+    with open_dataset(inputs.data[0]) as data:
+        filter_ = load_external(external, data.task)
+        metrics = evaluate(filter_, [data[i] for i in range(EPISODES)])
+    assert set(rows) == {filter_.name, FILTERS[0]}
+    own = rows[filter_.name]
+    assert own["error"] == pytest.approx(metrics.rmse["position_cm"], rel=1e-5)
+    assert (own["checkpoint"], own["provenance"]) == (filter_.hash, "{}")
+    tables = Experiments([tmp_path / "sweep"])
+    (row,) = tables.query("SELECT * FROM results WHERE checkpoint = ? LIMIT 1", [filter_.hash]).to_pylist()
+    with pytest.raises(BadInput, match=r"04_own_filter\.py:build is an external filter, .* serve --filter /"):
+        tables.trace(row)
 
 
 def test_queries_find_any_text_of_the_provenance(tmp_path: Path) -> None:

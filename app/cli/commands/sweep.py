@@ -5,7 +5,10 @@ from beliefscope.app.cli import console, options as opt
 
 def sweep(
     checkpoints: list[str] = opt.option(
-        "GLOB", "Checkpoints, such as 'runs/*.safetensors' (quoted). Repeatable.", ..., "--checkpoints"
+        "GLOB|MODULE:BUILD",
+        "Checkpoints, such as 'runs/*.safetensors' (quoted), or an external filter. Repeatable.",
+        ...,
+        "--checkpoints",
     ),
     output: Path = opt.option("DIR", "Folder of the sweep; created if missing.", ..., "-o", "--output"),
     data: list[Path] | None = opt.option(
@@ -37,6 +40,7 @@ def sweep(
     Examples:
       beliefscope sweep --checkpoints 'runs/*.safetensors' --data door.h5 -o sweep
       beliefscope sweep --checkpoints 'runs/*.safetensors' --faults '' --faults blackout=0.8 --workers 8 -o sweep
+      beliefscope sweep --checkpoints own.py:build --checkpoints 'runs/*.safetensors' --data own.h5 -o sweep
       beliefscope sweep --checkpoints '/lab/**/*.safetensors' --data /lab/door.h5 --engine ray -o /lab/sweep
     """
     opt.prepare_workers(engine, workers, "beliefscope.recordings.sweep_table")

@@ -907,7 +907,8 @@ export interface components {
          *
          *     Attributes:
          *         id: hash of the kind and of everything the result depends on. title: shown to users.
-         *         progress: 0..1. remaining: s from then to the end, None if unknown. message: current activity, one line. error: why there is no result, one line.
+         *         progress: 0..1. message: current activity, one line. error: why there is no result, one line.
+         *         remaining: s from the last progress to the end; None if unknown.
          *         submitted, started, ended: s since 1970; None if that has not happened.
          *         server: process id of the server that runs the job. link: page address of the result (``?...``) or its file.
          */
