@@ -162,12 +162,16 @@ def check_size(healthy: int, count: int, alarm_rate: float) -> None:
     """
     if healthy < MIN_HEALTHY:
         raise BadInput(f"a healthy record of {healthy} episodes is too small; measure it from at least {MIN_HEALTHY}")
-    if count == 1 and 1 / (healthy + 1) > alarm_rate:
+    if count == 1 and healthy < (needed := needed_for_one(alarm_rate)):
         raise BadInput(
             f"a healthy record of {healthy} episodes cannot show a fault in a single one: an alarm rate of "
-            f"{alarm_rate:g} needs {math.ceil(1 / alarm_rate) - 1}; diagnose several episodes, or measure the record "
-            "from more"
+            f"{alarm_rate:g} needs {needed}; diagnose several episodes, or measure the record from {needed} or more"
         )
+
+
+def needed_for_one(alarm_rate: float = ALARM_RATE) -> int:
+    """Smallest number of healthy episodes with which a fault in a single episode can raise an alarm."""
+    return max(MIN_HEALTHY, math.ceil(1 / alarm_rate) - 1)
 
 
 def _run_inputs(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> RunInputs:

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import math
+import shlex
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,6 +52,7 @@ def diagnose(
       beliefscope diagnose door --filter new.py:build --profile-from door.h5 --profile-filter old.py:build
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
+    from beliefscope.datasets.store import sample_path
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
     from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
@@ -62,9 +66,13 @@ def diagnose(
     correct = checkpoint if profile_filter is None else open_filter(checkpoint.task, profile_filter)
     other = None if base is None else open_filter(checkpoint.task, str(base))
     with runs.episodes(checkpoint.task) as data:
+        held_out = len(data.held_out())
         indices = data.held_out() if episode is None else [episode]
         episodes = faults.apply_all(data, indices, runs.seed)
         failed = None if repair is None else data[repair]
+    if profile_from is None:
+        clean = (str(runs.data or sample_path(checkpoint.task)), held_out) if faults else ("", 0)
+        _check_record(correct, len(episodes), alarm_rate, *clean)
     profile = _profile(correct, profile_from, len(episodes), alarm_rate, () if faults else episodes.values())
     with console.progress("Diagnosing") as advance:
         result = run(
@@ -88,6 +96,41 @@ def diagnose(
     return console.Result(document, "\n\n".join(parts))
 
 
+def _command(*options: str) -> str:
+    """The command that was run, with further options."""
+    return shlex.join(["beliefscope", *sys.argv[1:], *options])
+
+
+def _check_record(checkpoint: Checkpoint, count: int, alarm_rate: float, clean: str, held_out: int) -> None:
+    """Raise BadInput for a filter without a healthy record, with the command that measures it.
+
+    Args:
+        count: number of diagnosed episodes. clean: data that are known to be clean, if any.
+        held_out: number of their held-out episodes.
+    """
+    from beliefscope.inspect.diagnosis.diagnose import needed_for_one, no_diagnosis
+    from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
+
+    if reason := no_diagnosis(checkpoint):
+        needed = needed_for_one(alarm_rate) if count == 1 else MIN_HEALTHY
+        command = _command("--profile-from", clean if held_out >= needed else "CLEAN.h5")
+        raise BadInput(f"{reason}; measure it on clean data with {needed} or more held-out episodes: {command}")
+
+
+def _check_size(healthy: int, count: int, alarm_rate: float) -> None:
+    """``check_size`` with the command that diagnoses a single episode with the given record."""
+    from beliefscope.inspect.diagnosis.diagnose import check_size
+    from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
+
+    try:
+        check_size(healthy, count, alarm_rate)
+    except BadInput as error:
+        if healthy < MIN_HEALTHY:
+            raise
+        enough = math.ceil(100 / (healthy + 1)) / 100
+        raise BadInput(f"{error}; or accept more false alarms: {_command('--alarm-rate', f'{enough:g}')}") from None
+
+
 def _profile(
     checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float, diagnosed: Iterable[Episode]
 ) -> HealthyProfile:
@@ -97,14 +140,14 @@ def _profile(
     ``diagnosed``: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
-    from beliefscope.inspect.diagnosis.diagnose import check_size, required_profile
+    from beliefscope.inspect.diagnosis.diagnose import required_profile
     from beliefscope.inspect.healthy import overlap_warning, profile_of
 
     if clean is None:
         return required_profile(checkpoint)
     with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
-        check_size(len(indices), count, alarm_rate)
+        _check_size(len(indices), count, alarm_rate)
         episodes = [data[index] for index in indices]
         if warning := overlap_warning(episodes, diagnosed):
             console.note(f"Warning: {warning}")

@@ -238,10 +238,12 @@ export interface components {
         /**
          * DiagnosisJob
          * @description Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone.
+         *
+         *     The latter is None for several episodes whose healthy record is too small for a single one.
          */
         DiagnosisJob: {
             job: components["schemas"]["Job"] | null;
-            preliminary: components["schemas"]["Diagnosis"];
+            preliminary: components["schemas"]["Diagnosis"] | null;
         };
         /**
          * DiagnosisRecovery

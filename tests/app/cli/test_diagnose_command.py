@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from beliefscope.app.runs.settings import Settings
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 pytestmark = pytest.mark.slow
 
@@ -20,3 +22,40 @@ def test_too_few_clean_episodes_are_refused_before_the_runs(run: Run, base_setti
     assert code == 2
     assert "a healthy record of 1 episodes is too small; measure it from at least 10" in error
     assert "Measuring the healthy record" not in error
+
+
+OWN = "examples/04_own_filter.py:build"
+
+
+@pytest.mark.parametrize(
+    ("options", "needed", "clean"),
+    [
+        ("", 10, "CLEAN.h5"),
+        ("--episode 9", 49, "CLEAN.h5"),
+        ("--episode 9 --alarm-rate 0.1 --faults blackout", 10, "datasets/samples/door.h5"),
+        ("--episode 9 --data mine.h5 --faults blackout", 49, "CLEAN.h5"),  # these episodes are too few
+    ],
+)
+def test_the_command_that_measures_a_record_is_the_users(
+    run: Run, base_settings: Settings, options: str, needed: int, clean: str
+) -> None:
+    line = f"diagnose door --filter {OWN} {options}".replace("mine.h5", str(base_settings.data["mine"])).strip()
+    code, _, error = run(line.replace("--episode 9 --data", "--episode 0 --data"))
+    assert code == 2
+    message, _, command = error.rpartition(": ")
+    assert message.endswith(f"no healthy record; measure it on clean data with {needed} or more held-out episodes")
+    assert command.startswith("beliefscope diagnose door")
+    assert command.rstrip().endswith(clean)
+
+
+def test_a_small_record_suggests_a_higher_alarm_rate(run: Run, tmp_path: Path) -> None:
+    """The suggested command, which repeats the options, works."""
+    with open_dataset(sample_path("door")) as data:
+        write_dataset(tmp_path / "clean.h5", data.task, [data[index] for index in data.held_out()[:12]])
+    line = f"diagnose door --filter {OWN} --episode 9 --profile-from {tmp_path / 'clean.h5'}"
+    code, _, error = run(line)
+    assert code == 2
+    assert "needs 49; diagnose several episodes, or measure the record from 49 or more; or accept" in error
+    command = error.rpartition(": ")[2].strip()
+    assert command == f"beliefscope {line} --alarm-rate 0.08"
+    assert run(command.removeprefix("beliefscope "))[0] == 0
