@@ -43,7 +43,9 @@ MODALITIES = {"image": "image"}
 def causes_of(task: Task) -> tuple[Cause, ...]:
     """All causes, and those in sensors that only this task has."""
     modalities = {key: modality for modality, keys in task.modalities.items() for key in keys}
-    return (*(_of_modality(cause, modalities) for cause in CAUSES), *own_sensors.own_causes(task))
+    own = own_sensors.own_causes(task)
+    names = {cause.name for cause in own}
+    return (*(_of_modality(cause, modalities) for cause in CAUSES if cause.name not in names), *own)
 
 
 def _of_modality(cause: Cause, modalities: Mapping[str, str]) -> Cause:

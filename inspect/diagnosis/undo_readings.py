@@ -110,9 +110,13 @@ def realign_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
 
 
 def _shift(deviations: Deviations, axis: str) -> float | None:
-    """Pixels: mean of the shifts of the scene and of the hand, weighted by the precision of healthy episodes."""
-    names = [f"{kind}/image {axis}/all" for kind in ("shift", "hand offset")]
+    """Pixels: mean of the shifts of the scene and of the hand, weighted by the precision of healthy episodes.
+
+    Without a measured hand, that of the object from its label.
+    """
+    names = [f"{kind}/image {axis}/all" for kind in ("shift", "hand offset", "object offset")]
     shifts = [deviations[name] for name in names if name in deviations]
+    shifts = [d for d in shifts if not d.statistic.startswith("object")] or shifts
     if not shifts:
         return None
     weights = [max(d.high - d.low, 1e-6) ** -2 for d in shifts]

@@ -25,7 +25,7 @@ CAUSES = (
             Symptom("lag/labels*|lag/dynamics/*", 1, 2.0),
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
-        f"{OBJECT}|object match/image*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*",
+        f"{OBJECT}|object match/*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*",
         "Synchronise the clock of the motion capture with the sensors.",
         "advance labels",
     ),
@@ -37,8 +37,7 @@ CAUSES = (
             Symptom(OBJECT, 0, optional=True),
             Symptom("module bias/*", 0, 0.3, "common"),
         ),
-        f"object match/image*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}"
-        f"|{DYNAMICS}",
+        f"object match/*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
         "Register the frame of the motion capture with the robot's.",
         "shift labels",
     ),
@@ -48,12 +47,12 @@ CAUSES = (
         (
             Symptom("module error/*", 1),
             Symptom(
-                "module power/*|object match/image*|sharpness/image/*|occlusion/image/*|shift/image*|lever/force*"
+                "module power/*|object match/*|sharpness/image/*|occlusion/image/*|shift/image*|lever/force*"
                 "|size/*|contact distance/*",
                 0,
             ),
         ),
-        f"{OBJECT}|object match/image*|contact distance/*|contact distance error/*|sharpness/*|occlusion/*|shift/*"
+        f"{OBJECT}|object match/*|contact distance/*|contact distance error/*|sharpness/*|occlusion/*|shift/*"
         "|brightness/*|offset/*"
         f"|{CONTACTS}|{LABELS}|{MODULES}",
         "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "

@@ -8,10 +8,10 @@ from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
 HAND = "hand offset/image*"
 """Position of the hand in the image against the measured one."""
 
-OBJECT = "object offset/image*"
+OBJECT = "object offset/*"
 """Position of the object in the image against the labelled one."""
 
-LANDMARKS = f"{HAND}|{OBJECT}|hand match/image*|object match/image*"
+LANDMARKS = f"{HAND}|{OBJECT}|hand match/image*|object match/*"
 """Everything about landmarks in the image."""
 
 CHECK = "Check the camera and its driver; until then, run the filter without the image."

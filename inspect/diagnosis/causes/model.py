@@ -6,12 +6,15 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER, LABELS
 
 
-def causes_of(modality: str) -> tuple[Cause, ...]:
-    """Causes of one modality's measurement model."""
-    name, title = f"model.{modality}", f"{modality.capitalize()} model"
+def causes_of(modality: str, title: str, check: str = "") -> tuple[Cause, ...]:
+    """Causes of one modality's measurement model.
+
+    title: start of the headlines. check: what to do before the next action, where faults of the sensors look alike.
+    """
+    name = f"model.{modality}"
     module = f"*{modality}*"
     finetune = "`beliefscope finetune {task} --filter {filter} --train"
-    retrain = f"Fine-tune it: {finetune} {modality}-only -o tuned.safetensors`."
+    retrain = f"{check}Fine-tune it: {finetune} {modality}-only -o tuned.safetensors`."
     calibrate = f"Calibrate it: {finetune} noise-only -o tuned.safetensors`."
     return (
         Cause(
@@ -53,4 +56,4 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
     )
 
 
-CAUSES = causes_of("image") + causes_of("haptics")
+CAUSES = causes_of("image", "Image model") + causes_of("haptics", "Haptics model")

@@ -1,15 +1,20 @@
-"""Causes in sensors of a user's task, by the names of its observations."""
+"""Causes in sensors and measurement models of a user's task, by the names of its observations and modalities."""
 
 from __future__ import annotations
 
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes import model
 from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.image import OBJECT
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, has_labels_only
 from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")
 """Observations that have their own causes."""
+
+MODALITIES = ("image", "haptics")
+"""Modalities whose measurement models have causes in the catalog."""
 
 VECTOR = (
     ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
@@ -36,7 +41,38 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
-    return (*result, *_delays(task))
+    return (*result, *_moved_cameras(task), *_delays(task), *_models(task))
+
+
+def _moved_cameras(task: Task) -> tuple[Cause, ...]:
+    """Cameras of tasks without a measured hand, whose position only the labels show: labels with an offset are alike.
+
+    A second sensor of the position separates the two: it agrees with the labels if the camera has moved.
+    """
+    result = []
+    for modality, keys in task.modalities.items() if HAND not in task.observations else ():
+        for key in (key for key in keys if key in task.images):
+            module = f"module bias/*{modality}*"
+            changed = (
+                f"{module}|object match/*|occlusion/{key}/*|brightness/{key}/*|sharpness/{key}/*|module */*{modality}*"
+                f"|likelihood share/*|{LABELS}|{WEIGHTS}"
+            )
+            title = "Camera moved" if key == "image" else f"Camera {display_name(key)} moved"
+            symptoms = (
+                Symptom(OBJECT, 0),
+                Symptom(module, 0, 0.5),
+                Symptom("module bias/*", 0, 0.3, "alone"),
+            )
+            undo = f"realign image|drop {modality}" if key == "image" else f"drop {modality}"
+            result.append(Cause(f"{key}.shift", title, symptoms, changed, "Calibrate the camera pose again.", undo))
+    return tuple(result)
+
+
+def _models(task: Task) -> tuple[Cause, ...]:
+    """Causes in measurement models of modalities that the catalog does not have."""
+    check = "Check the calibration of its sensors, whose offsets and scales look alike. "
+    names = [name for name in task.modalities if name not in MODALITIES]
+    return tuple(c for name in names for c in model.causes_of(name, f"Sensors or model of {display_name(name)}", check))
 
 
 def _delays(task: Task) -> tuple[Cause, ...]:
