@@ -15,7 +15,6 @@ from beliefscope.app.protocol import map_format, messages
 from beliefscope.app.runs.sweep_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
-from beliefscope.inspect.diagnosis.diagnose import needed_for_one
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
 
 PATH = Path(__file__).parents[1] / "app" / "page" / "core" / "constants.js"
@@ -40,7 +39,6 @@ def constants() -> dict[str, tuple[str, object]]:
         "CELL_STEPS": ("Largest value of a map's cell.", map_format.LEVELS),
         "SHOWN": ("Smallest probability of a cause of a fault that is listed.", SHOWN),
         "LARGEST": ("Largest probability that is displayed as a number.", LARGEST),
-        "HEALTHY_FOR_ONE": ("Healthy episodes that the diagnosis of a single episode needs.", needed_for_one()),
         "HASH_DIGITS": ("Digits of its hash at the end of the name of a checkpoint of a sweep.", HASH_DIGITS),
         "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),

@@ -85,12 +85,9 @@ class Diagnosis(Reply):
 
 
 class DiagnosisJob(JobReply):
-    """Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone.
+    """Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone."""
 
-    The latter is None for several episodes whose healthy record is too small for a single one.
-    """
-
-    preliminary: Diagnosis | None
+    preliminary: Diagnosis
 
 
 class RepairedInterval(Reply):
@@ -134,13 +131,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         job = jobs.find("diagnosis", _arguments(store, selection, over))
         if path := jobs.finished_result(job):
             return FileResponse(path, media_type="application/json")
-        first = None
-        try:
-            first = preliminary_diagnosis(store, selection)
-        except BadInput:
-            if over == "episode":  # the healthy record may be large enough for several
-                raise
-        if over == "episode" and first and first["state"] == "healthy":
+        first = preliminary_diagnosis(store, selection)
+        if over == "episode" and first["state"] == "healthy":
             return JSONResponse(first)
         return JSONResponse({"job": job and asdict(job), "preliminary": first}, status_code=202)
 

@@ -61,7 +61,7 @@ def diagnose(
     *,
     seed: int = 0,
     particles: int = 300,
-    alarm_rate: float = ALARM_RATE,
+    alarm_rate: float | None = None,
     base: Checkpoint | None = None,
     profile: HealthyProfile | None = None,
     engine: Engine = "local",
@@ -72,7 +72,7 @@ def diagnose(
 
     Args:
         episodes: by index in their data set.
-        alarm_rate: probability that a healthy filter is not called healthy.
+        alarm_rate: probability that a healthy filter is not called healthy; default: see ``checked_alarm_rate``.
         base: checkpoint of the same architecture whose modules replace suspected ones.
         profile: healthy profile; default: that of the checkpoint.
         engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
@@ -85,7 +85,7 @@ def diagnose(
     if not episodes:
         raise BadInput("no episodes to diagnose")
     profile = profile or required_profile(checkpoint)
-    check_size(profile.episodes, len(episodes), alarm_rate)
+    alarm_rate = checked_alarm_rate(profile.episodes, len(episodes), alarm_rate)
     items = list(episodes.items())
     blocks = [items[i : i + BLOCK] for i in range(0, len(items), BLOCK)]
     observed: dict[int, Observed] = {}
@@ -125,7 +125,7 @@ def diagnose_traces(
     *,
     seed: int = 0,
     particles: int = 300,
-    alarm_rate: float = ALARM_RATE,
+    alarm_rate: float | None = None,
     base: Checkpoint | None = None,
     profile: HealthyProfile | None = None,
     progress: Callable[[float], None] | None = None,
@@ -136,7 +136,7 @@ def diagnose_traces(
 
 
 def preliminary(
-    checkpoint: Checkpoint, trace: Trace, particles: int = 300, alarm_rate: float = ALARM_RATE
+    checkpoint: Checkpoint, trace: Trace, particles: int = 300, alarm_rate: float | None = None
 ) -> Diagnosis:
     """The diagnosis of one run before any cause is undone, within a fraction of a second; final if it is healthy.
 
@@ -147,31 +147,30 @@ def preliminary(
 
 
 def _examined(
-    checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile, alarm_rate: float
+    checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile, alarm_rate: float | None
 ) -> Case:
-    check_size(profile.episodes, len(traces), alarm_rate)
+    alarm_rate = checked_alarm_rate(profile.episodes, len(traces), alarm_rate)
     rows, sensors = zip(*(observe(trace, checkpoint, profile) for trace in traces), strict=True)
     inputs = _run_inputs(checkpoint, traces, particles, profile)
     return compared(inputs, traces, rows, sensors, profile, alarm_rate)
 
 
-def check_size(healthy: int, count: int, alarm_rate: float) -> None:
-    """Raise BadInput if no diagnosis of ``count`` episodes is possible with a record of ``healthy`` episodes.
+def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None) -> float:
+    """The alarm rate of a diagnosis of ``count`` episodes with a record of ``healthy`` episodes.
 
-    Fewer than ``MIN_HEALTHY`` have no statistics. A single episode has a p-value of at least 1 / (healthy + 1).
+    A single episode has a p-value of at least 1 / (healthy + 1). Default: ``ALARM_RATE``, or that p-value if it is
+    larger. Raises BadInput for a lower rate, and for a record of fewer than ``MIN_HEALTHY`` episodes.
     """
     if healthy < MIN_HEALTHY:
         raise BadInput(f"a healthy record of {healthy} episodes is too small; measure it from at least {MIN_HEALTHY}")
-    if count == 1 and healthy < (needed := needed_for_one(alarm_rate)):
+    smallest = 1 / (healthy + 1) if count == 1 else 0.0
+    if alarm_rate is not None and alarm_rate < smallest:
         raise BadInput(
             f"a healthy record of {healthy} episodes cannot show a fault in a single one: an alarm rate of "
-            f"{alarm_rate:g} needs {needed}; diagnose several episodes, or measure the record from {needed} or more"
+            f"{alarm_rate:g} needs {math.ceil(1 / alarm_rate) - 1}; diagnose several episodes, or use a rate of "
+            f"{math.ceil(1000 * smallest) / 1000:g} or more"
         )
-
-
-def needed_for_one(alarm_rate: float = ALARM_RATE) -> int:
-    """Smallest number of healthy episodes with which a fault in a single episode can raise an alarm."""
-    return max(MIN_HEALTHY, math.ceil(1 / alarm_rate) - 1)
+    return max(ALARM_RATE, smallest) if alarm_rate is None else alarm_rate
 
 
 def _run_inputs(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> RunInputs:

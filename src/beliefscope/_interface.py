@@ -160,14 +160,15 @@ def diagnose(
     faults: str | Faults = "",
     seed: int = 0,
     particles: int = 300,
-    alarm_rate: float = 0.05,
+    alarm_rate: float | None = None,
     profile_from: Data | None = None,
 ) -> Diagnosis:
     """Name the probable cause of a fault, with evidence and the effect of undoing it (docs/diagnose.md).
 
     Args:
         episodes: indices; default: the held-out ones. faults: to inject first, to try the diagnosis.
-        alarm_rate: probability that a healthy filter is not called healthy.
+        alarm_rate: probability that a healthy filter is not called healthy. Default: 0.02, or 1 / (n + 1) for one
+            episode and a healthy record of n < 49 episodes.
         profile_from: clean data whose held-out episodes become the healthy record; default: that of the filter.
 
     Raises BadInput for a filter without a healthy record.

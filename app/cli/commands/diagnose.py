@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 import shlex
 import sys
 from collections.abc import Iterable
@@ -22,7 +21,12 @@ def diagnose(
         "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
     ),
     base: Path | None = opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None),
-    alarm_rate: float = opt.option("P", "Probability that a healthy filter raises an alarm.", 0.02),
+    alarm_rate: float | None = opt.option(
+        "P",
+        "Probability that a healthy filter raises an alarm. Default: 0.02; for one episode and a healthy record of "
+        "n < 49 episodes, 1 / (n + 1).",
+        None,
+    ),
     profile_from: Path | None = opt.option(
         "DATA", "Clean data; the healthy record is measured on their held-out episodes.", None
     ),
@@ -58,7 +62,7 @@ def diagnose(
     from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
     from beliefscope.inspect.trace import trace
 
-    if not 0.0 < alarm_rate < 1.0:
+    if alarm_rate is not None and not 0.0 < alarm_rate < 1.0:
         raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
     if profile_filter is not None and profile_from is None:
         raise BadInput("--profile-filter needs --profile-from, the clean episodes that it runs over")
@@ -72,7 +76,7 @@ def diagnose(
         failed = None if repair is None else data[repair]
     if profile_from is None:
         clean = (str(runs.data or sample_path(checkpoint.task)), held_out) if faults else ("", 0)
-        _check_record(correct, len(episodes), alarm_rate, *clean)
+        _check_record(correct, *clean)
     profile = _profile(correct, profile_from, len(episodes), alarm_rate, () if faults else episodes.values())
     with console.progress("Diagnosing") as advance:
         result = run(
@@ -96,43 +100,23 @@ def diagnose(
     return console.Result(document, "\n\n".join(parts))
 
 
-def _command(*options: str) -> str:
-    """The command that was run, with further options."""
-    return shlex.join(["beliefscope", *sys.argv[1:], *options])
-
-
-def _check_record(checkpoint: Checkpoint, count: int, alarm_rate: float, clean: str, held_out: int) -> None:
+def _check_record(checkpoint: Checkpoint, clean: str, held_out: int) -> None:
     """Raise BadInput for a filter without a healthy record, with the command that measures it.
 
     Args:
-        count: number of diagnosed episodes. clean: data that are known to be clean, if any.
-        held_out: number of their held-out episodes.
+        clean: data that are known to be clean, if any. held_out: number of their held-out episodes.
     """
-    from beliefscope.inspect.diagnosis.diagnose import needed_for_one, no_diagnosis
+    from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
     from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 
     if reason := no_diagnosis(checkpoint):
-        needed = needed_for_one(alarm_rate) if count == 1 else MIN_HEALTHY
-        command = _command("--profile-from", clean if held_out >= needed else "CLEAN.h5")
-        raise BadInput(f"{reason}; measure it on clean data with {needed} or more held-out episodes: {command}")
-
-
-def _check_size(healthy: int, count: int, alarm_rate: float) -> None:
-    """``check_size`` with the command that diagnoses a single episode with the given record."""
-    from beliefscope.inspect.diagnosis.diagnose import check_size
-    from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
-
-    try:
-        check_size(healthy, count, alarm_rate)
-    except BadInput as error:
-        if healthy < MIN_HEALTHY:
-            raise
-        enough = math.ceil(100 / (healthy + 1)) / 100
-        raise BadInput(f"{error}; or accept more false alarms: {_command('--alarm-rate', f'{enough:g}')}") from None
+        data = clean if held_out >= MIN_HEALTHY else "CLEAN.h5"
+        command = shlex.join(["beliefscope", *sys.argv[1:], "--profile-from", data])
+        raise BadInput(f"{reason}; measure it on clean data with {MIN_HEALTHY} or more held-out episodes: {command}")
 
 
 def _profile(
-    checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float, diagnosed: Iterable[Episode]
+    checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float | None, diagnosed: Iterable[Episode]
 ) -> HealthyProfile:
     """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``.
 
@@ -140,14 +124,14 @@ def _profile(
     ``diagnosed``: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
-    from beliefscope.inspect.diagnosis.diagnose import required_profile
+    from beliefscope.inspect.diagnosis.diagnose import checked_alarm_rate, required_profile
     from beliefscope.inspect.healthy import overlap_warning, profile_of
 
     if clean is None:
         return required_profile(checkpoint)
     with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
-        _check_size(len(indices), count, alarm_rate)
+        checked_alarm_rate(len(indices), count, alarm_rate)
         episodes = [data[index] for index in indices]
         if warning := overlap_warning(episodes, diagnosed):
             console.note(f"Warning: {warning}")

@@ -20,9 +20,6 @@ export const SHOWN = /** @type {const} */ (0.05);
 /** Largest probability that is displayed as a number. */
 export const LARGEST = /** @type {const} */ (0.99);
 
-/** Healthy episodes that the diagnosis of a single episode needs. */
-export const HEALTHY_FOR_ONE = /** @type {const} */ (49);
-
 /** Digits of its hash at the end of the name of a checkpoint of a sweep. */
 export const HASH_DIGITS = /** @type {const} */ (8);
 

@@ -7,7 +7,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
-import { HEALTHY_FOR_ONE, SHOWN } from '../core/constants.js';
+import { SHOWN } from '../core/constants.js';
 import { create, html } from '../core/dom.js';
 import { displayName, percent, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -231,7 +231,7 @@ export class Diagnosis {
     const isReady = entry.state === 'ready'; // the run is loading again
     this.#writeHeadline(isReady ? 'Loading …' : sentence(reason));
     const { data } = trace.selection;
-    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them. A single episode needs ${HEALTHY_FOR_ONE} of them or more; with fewer, diagnose the held-out episodes together.`;
+    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them. The more there are, the rarer are false alarms in a single episode.`;
     const state = this.#starts
       ? stateOf(entry) || about
       : 'Read-only server: the record cannot be measured here.';

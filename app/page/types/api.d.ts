@@ -238,12 +238,10 @@ export interface components {
         /**
          * DiagnosisJob
          * @description Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone.
-         *
-         *     The latter is None for several episodes whose healthy record is too small for a single one.
          */
         DiagnosisJob: {
             job: components["schemas"]["Job"] | null;
-            preliminary: components["schemas"]["Diagnosis"] | null;
+            preliminary: components["schemas"]["Diagnosis"];
         };
         /**
          * DiagnosisRecovery

@@ -65,7 +65,7 @@ export type JobWithLog = Required<api.JobWithLog>;
 /** preliminary: result that is available before the job is done. */
 export interface JobReply<T = never> {
   job: Job | null;
-  preliminary?: T | null;
+  preliminary?: T;
 }
 
 export interface StartedJob {

@@ -112,7 +112,7 @@ export class JobResults {
   /**
    * @param {string} key
    * @param {JobResult<T>} result that is not ready
-   * @param {T | null} [preliminary]
+   * @param {T} [preliminary]
    */
   #wait(key, result, preliminary = this.get(key).preliminary) {
     this.#set(key, preliminary ? { ...result, preliminary } : result);

@@ -9,7 +9,7 @@ import pytest
 
 from beliefscope.app.cli.commands.diagnose import diagnose as command
 from beliefscope.inspect.diagnosis.case import ALARM_RATE
-from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.diagnose import checked_alarm_rate, diagnose
 from beliefscope.inspect.diagnostics.healthy_comparison import compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
@@ -75,5 +75,7 @@ def test_a_smaller_alarm_rate_keeps_the_scale_of_deviations() -> None:
 
 
 def test_the_command_has_the_default_alarm_rate_of_the_library() -> None:
-    assert signature(command).parameters["alarm_rate"].default.default == ALARM_RATE
-    assert signature(diagnose).parameters["alarm_rate"].default == ALARM_RATE
+    option = signature(command).parameters["alarm_rate"].default
+    assert (option.default, signature(diagnose).parameters["alarm_rate"].default) == (None, None)
+    assert f"Default: {ALARM_RATE}; for one episode and a healthy record of n < 49 episodes, 1 / (n + 1)" in option.help
+    assert (checked_alarm_rate(49, 1), checked_alarm_rate(48, 1)) == (ALARM_RATE, 1 / 49)

@@ -25,7 +25,7 @@ from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.diagnosis.case import Case, affected_episodes, compared, explain_all, focus, observe
 from beliefscope.inspect.diagnosis.cause import SHOWN
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis, preliminary
+from beliefscope.inspect.diagnosis.diagnose import checked_alarm_rate, diagnose, no_diagnosis, preliminary
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
@@ -260,13 +260,16 @@ def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
 
 
-def test_a_small_record_judges_several_episodes_and_not_one() -> None:
-    """One of N + 1 episodes is the most unusual one with probability 1 / (N + 1)."""
+def test_the_alarm_rate_of_one_episode_depends_on_the_size_of_the_record() -> None:
+    """One of n + 1 episodes is the most unusual one with probability 1 / (n + 1)."""
+    assert [checked_alarm_rate(*sizes) for sizes in ((12, 1), (12, 2), (49, 1), (120, 1))] == [1 / 13, 0.02, 0.02, 0.02]
     small = replace(profile(), statistics={k: v[:12] for k, v in profile().statistics.items()}, episodes=12)
     black = faulty("blackout=0.9")
-    with pytest.raises(BadInput, match=r"12 episodes cannot show a fault in a single one: .* of 0\.02 needs 49;"):
-        diagnose(checkpoint(), {100: next(iter(black.values()))}, profile=small)
+    one = diagnose(checkpoint(), {100: next(iter(black.values()))}, profile=small)
+    assert (one.state != "healthy", one.provenance["alarm_rate"]) == (True, 1 / 13)
     assert diagnose(checkpoint(), black, profile=small).state != "healthy"
+    with pytest.raises(BadInput, match=r"12 episodes cannot show a fault in a single one: .* of 0\.02 needs 49;"):
+        checked_alarm_rate(12, 1, 0.02)
 
 
 def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
