@@ -12,7 +12,7 @@ from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import modalities_of
-from beliefscope.inspect.diagnosis.case import Case, affected_episodes, affected_steps, symptoms_of
+from beliefscope.inspect.diagnosis.case import ALARM_RATE, Case, affected_episodes, affected_steps, symptoms_of
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
@@ -49,7 +49,8 @@ CONVENTIONS = "test the signs, scales and axes of its inputs: diagnostic Convent
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
-    text = f"no significant deviation from the record of {record} healthy episodes in {count} statistics."
+    small = "; a larger record shows smaller faults" if case.alarm_rate > ALARM_RATE else ""
+    text = f"no significant deviation from the record of {record} healthy episodes in {count} statistics{small}."
     largest = tuple(_evidence(case, deviation) for deviation in case.deviations[:LARGEST])
     nees = _nees(case.profile)
     headline = f"Healthy: {text}"

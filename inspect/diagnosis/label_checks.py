@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag
 from beliefscope.inspect.trace import Trace
@@ -32,7 +33,7 @@ def label_statistics(trace: Trace) -> dict[str, float]:
         return {}
     difference = task.difference(labels[:, None], measured)  # (T, K, n)
     offset = np.median(difference[keep], axis=0)  # (K, n)
-    lags = np.array([_lag(labels, labels - difference[:, k], keep) for k in range(len(trace.modalities))])
+    lags = np.array([_lag(task, labels, labels - difference[:, k], keep) for k in range(len(trace.modalities))])
     values = {f"lag/labels {name}/all": float(steps) for name, steps in zip(trace.modalities, lags, strict=True)}
     values["lag/labels/all"] = (
         float(common_part(lags[np.isfinite(lags), None])[0]) if np.isfinite(lags).any() else np.nan
@@ -42,13 +43,14 @@ def label_statistics(trace: Trace) -> dict[str, float]:
     return values
 
 
-def _lag(labels: Array, measured: Array, keep: Mask) -> float:
+def _lag(task: Task, labels: Array, measured: Array, keep: Mask) -> float:
     """Steps by which changes of the labels follow those of measured values (T, n), from the components that move."""
     moving = np.ptp(labels[keep], axis=0) > SMALLEST_MOTION
     if not moving.any():
         return np.nan
     scale = labels[keep][:, moving].std(0)
-    late, early = ((x[BASELINE:, moving] - x[:-BASELINE, moving]) / scale for x in (labels, measured))
+    changes = (task.difference(x[BASELINE:], x[:-BASELINE]) for x in (labels, measured))
+    late, early = (change[:, moving] / scale for change in changes)
     return lag(late, early, keep[BASELINE:])[0]
 
 

@@ -76,7 +76,8 @@ def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
     if behind.get(key, 0) > 0:
         steps_of = {name: steps for name, steps in behind.items() if steps > 0}
     else:
-        lag = deviations.get(f"lag/{key if key in ('control', 'labels') else 'image'}/all")
+        names = (f"lag/{key if key in ('control', 'labels') else 'image'}/all", f"lag/labels {key}/all")
+        lag = next((deviations[name] for name in names if name in deviations), None)
         steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
         if not steps:
             return None

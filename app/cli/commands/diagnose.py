@@ -15,18 +15,19 @@ if TYPE_CHECKING:
     from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
+ALARM_RATE = (
+    "Probability that a healthy filter raises an alarm. Default: 0.02; for one episode and a healthy record of n < 49 "
+    "episodes, 1 / (n + 1)."
+)
+
+
 def diagnose(
     runs: opt.Runs,
     episode: int | None = opt.option(
         "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
     ),
     base: Path | None = opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None),
-    alarm_rate: float | None = opt.option(
-        "P",
-        "Probability that a healthy filter raises an alarm. Default: 0.02; for one episode and a healthy record of "
-        "n < 49 episodes, 1 / (n + 1).",
-        None,
-    ),
+    alarm_rate: float | None = opt.option("P", ALARM_RATE, None),
     profile_from: Path | None = opt.option(
         "DATA", "Clean data; the healthy record is measured on their held-out episodes.", None
     ),
@@ -56,7 +57,6 @@ def diagnose(
       beliefscope diagnose door --filter new.py:build --profile-from door.h5 --profile-filter old.py:build
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
-    from beliefscope.datasets.store import sample_path
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
     from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
@@ -75,8 +75,7 @@ def diagnose(
         episodes = faults.apply_all(data, indices, runs.seed)
         failed = None if repair is None else data[repair]
     if profile_from is None:
-        clean = (str(runs.data or sample_path(checkpoint.task)), held_out) if faults else ("", 0)
-        _check_record(correct, *clean)
+        _check_record(correct, runs, held_out if faults else 0)
     profile = _profile(correct, profile_from, len(episodes), alarm_rate, () if faults else episodes.values())
     with console.progress("Diagnosing") as advance:
         result = run(
@@ -100,17 +99,17 @@ def diagnose(
     return console.Result(document, "\n\n".join(parts))
 
 
-def _check_record(checkpoint: Checkpoint, clean: str, held_out: int) -> None:
+def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:
     """Raise BadInput for a filter without a healthy record, with the command that measures it.
 
-    Args:
-        clean: data that are known to be clean, if any. held_out: number of their held-out episodes.
+    clean: number of held-out episodes that are known to be clean.
     """
+    from beliefscope.datasets.store import sample_path
     from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
     from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 
     if reason := no_diagnosis(checkpoint):
-        data = clean if held_out >= MIN_HEALTHY else "CLEAN.h5"
+        data = str(runs.data or sample_path(checkpoint.task)) if clean >= MIN_HEALTHY else "CLEAN.h5"
         command = shlex.join(["beliefscope", *sys.argv[1:], "--profile-from", data])
         raise BadInput(f"{reason}; measure it on clean data with {MIN_HEALTHY} or more held-out episodes: {command}")
 

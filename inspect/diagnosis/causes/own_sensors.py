@@ -41,7 +41,7 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
-    return (*result, *_moved_cameras(task), *_delays(task), *_models(task))
+    return (*result, *_moved_cameras(task), *_delays(task), *_delayed_modalities(task), *_models(task))
 
 
 def _moved_cameras(task: Task) -> tuple[Cause, ...]:
@@ -65,6 +65,17 @@ def _moved_cameras(task: Task) -> tuple[Cause, ...]:
             )
             undo = f"realign image|drop {modality}" if key == "image" else f"drop {modality}"
             result.append(Cause(f"{key}.shift", title, symptoms, changed, "Calibrate the camera pose again.", undo))
+    return tuple(result)
+
+
+def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
+    """Modalities behind the labels, of tasks without a measured hand and labelled contact, which show it better."""
+    result = []
+    for modality in task.modalities if HAND not in task.observations and not has_labels_only(task) else ():
+        changed = f"{LABELS}|{OBJECT}|object match/*|module */*{modality}*|likelihood share/*|{WEIGHTS}"
+        title = "Image delayed" if modality == "image" else f"Modality {display_name(modality)} delayed"
+        symptoms, action = (Symptom(f"lag/labels {modality}/*", -1),), "Synchronise the clocks of the sensors."
+        result.append(Cause(f"{modality}.delay", title, symptoms, changed, action, f"advance {modality}"))
     return tuple(result)
 
 

@@ -128,4 +128,5 @@ def test_built_in_tasks_have_the_causes_of_the_catalog() -> None:
     for name in ("door", "push-field", "door-field"):
         assert causes_of(load_task(name)) == CAUSES
     own = [cause.name for cause in causes_of(TASK)[len(CAUSES) :] if not cause.name.startswith("model.")]
-    assert own == [f"{key}.{mechanism}" for key in STD for mechanism in ("stuck", "noise", "saturation")]
+    sensors = [f"{key}.{mechanism}" for key in STD for mechanism in ("stuck", "noise", "saturation")]
+    assert own == [*sensors, *(f"{modality}.delay" for modality in TASK.modalities)]

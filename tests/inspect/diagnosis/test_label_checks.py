@@ -49,6 +49,17 @@ def test_a_late_modality_is_not_a_late_label(exact: Trace) -> None:
     assert values["lag/labels haptics/all"] == values["lag/labels/all"] == 0.0
 
 
+def test_lags_do_not_depend_on_where_angles_wrap_around(exact: Trace) -> None:
+    angle = exact.episode.states[:, 2].astype(np.float64)
+    turned = (angle + np.pi - np.median(angle) + np.pi) % (2.0 * np.pi) - np.pi
+    assert np.abs(np.diff(turned)).max() > np.pi, "the labels wrap around"
+    states = np.column_stack([exact.episode.states[:, :2], turned]).astype(np.float32)
+    measured = np.repeat(states[:, None], 2, axis=1)
+    measured[:, 0] = delayed(states, 3)
+    values = label_statistics(replace(with_labels(exact, states), observation_mean=measured))
+    assert (values["lag/labels image/all"], values["lag/labels haptics/all"]) == (-3.0, 0.0)
+
+
 def test_offsets_are_shared_only_if_all_modalities_have_them(exact: Trace) -> None:
     assert exact.observation_mean is not None
     offset = np.array([0.02, -0.01, 0.1], dtype=np.float32)

@@ -52,6 +52,14 @@ def test_cameras_have_the_name_of_their_sensor_and_a_hand_replaces_labels() -> N
     assert "hand offset/image*" in moved.symptoms[0].statistics
 
 
+@pytest.mark.parametrize("modality", ["image", "gps"])
+def test_a_modality_behind_the_labels_is_delayed(modality: str) -> None:
+    """Labels behind all modalities have the opposite sign."""
+    late = Deviation(f"lag/labels {modality}/all", -4.0, 0.0, -0.5, 0.5, 0.0, True, -5.0)
+    assert ranked(TASK, late)[f"{modality}.delay"] > 0.9
+    assert ranked(TASK, replace(late, value=4.0, t=5.0)).get(f"{modality}.delay", 0.0) < 0.1
+
+
 @pytest.mark.parametrize("mechanism", ["bias", "overconfident", "underconfident", "broken"])
 def test_models_of_own_modalities_have_causes(mechanism: str) -> None:
     names = [cause.name for cause in causes_of(TASK)]
