@@ -49,7 +49,8 @@ CONVENTIONS = "test the signs, scales and axes of its inputs: diagnostic Convent
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
-    small = "; a larger record shows smaller faults" if case.alarm_rate > ALARM_RATE else ""
+    is_small = len(case.traces) == 1 and 1 / (record + 1) > ALARM_RATE  # as ``checked_alarm_rate``
+    small = "; a larger record shows smaller faults" if is_small else ""
     text = f"no significant deviation from the record of {record} healthy episodes in {count} statistics{small}."
     largest = tuple(_evidence(case, deviation) for deviation in case.deviations[:LARGEST])
     nees = _nees(case.profile)

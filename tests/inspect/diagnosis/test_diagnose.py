@@ -85,6 +85,9 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     assert result.headline.startswith(start)
     assert [deviation.value for deviation in result.deviations] == [nees]
     assert result.to_json()["miscalibrated"] == ("confident" in start)
+    small = "; a larger record shows smaller faults"
+    assert small not in result.headline
+    assert small in healthy(replace(case, traces=case.traces[:1])).headline
 
 
 @pytest.mark.parametrize(
