@@ -168,21 +168,6 @@ def test_a_healthy_record_needs_ten_episodes(tmp_path: Path, open_client: Callab
         assert "'few' has 7 held-out episodes; a healthy record needs at least 10" in reply.text
 
 
-def test_a_small_healthy_record_diagnoses_one_episode(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
-    with open_dataset(sample_path("door")) as data:
-        write_dataset(tmp_path / "few.h5", data.task, [data[index] for index in data.held_out()[:12]])
-    url, params = "/api/diagnosis/door/hand-on-arc/3", {"data": "few"}
-    with open_client(Settings(workspace=tmp_path, data={"few": tmp_path / "few.h5"})) as client:
-        client.post("/api/healthy-record/door/hand-on-arc", params=params)
-        while client.get("/api/healthy-record/door/hand-on-arc", params=params).status_code == 202:
-            time.sleep(0.05)
-        while (one := client.get(url, params=params)).status_code == 202:
-            time.sleep(0.05)
-        assert (one.status_code, one.json()["state"], one.json()["alarm_rate"]) == (200, "healthy", 1 / 13)
-        several = client.get(url, params={**params, "over": "held-out"})
-        assert (several.status_code, several.json()["preliminary"]["state"]) == (202, "healthy")
-
-
 def test_unknown_names_are_reported(server: TestClient) -> None:
     for url, name in (
         ("/api/diagnosis/door/crossmodal-ekg/1", "crossmodal-ekg"),
