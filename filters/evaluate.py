@@ -311,7 +311,8 @@ def _stay(task: Task, mean: Tensor, states: Tensor) -> Run:
 def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:
     """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each trajectory."""
     # An estimate that counts turns has no larger errors.
-    trajectories = [(Angles(task.angles).wrapped(e), c) for e, c in trajectories]
+    angles = Angles(task.angles)
+    trajectories = [(angles.wrapped(e), c) for e, c in trajectories]
     late = [(e[first:], c[first:]) for e, c in trajectories for first in [task.first_counted(len(e))]]
     result = metrics(task, torch.cat([e for e, _ in late]), torch.cat([c for _, c in late]))
     sums = [[float(len(e)), *(float(values.sum()) for values in squares(task, e).values())] for e, _ in late]

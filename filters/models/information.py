@@ -140,11 +140,13 @@ class InformationFilter(ExtendedKalmanFilter):
         alone = roots.unsqueeze(1) * torch.eye(len(self.names), device=roots.device).unsqueeze(-1)
         power = powers(evidence.log_weights, evidence.present)
         weighted = roots * power.clamp_min(TINY).sqrt() * (power > 0)
-        sensors = self.sensor_matrix(evidence)
-        expected = (sensors @ predicted.mean.unsqueeze(-1)).reshape_as(evidence.observation)
+        sensors, observation = self.sensor_matrix(evidence), evidence.observation
+        if self.angles.indices:
+            expected = (sensors @ predicted.mean.unsqueeze(-1)).reshape_as(observation)
+            observation = self.angles.near(observation, expected)
         posteriors = joint_update(
             Gaussian(predicted.mean.unsqueeze(1), predicted.covariance.unsqueeze(1)),
-            self.angles.near(evidence.observation, expected).flatten(1).unsqueeze(1),
+            observation.flatten(1).unsqueeze(1),
             sensors.unsqueeze(1),
             torch.cat([weighted.unsqueeze(1), alone], dim=1).flatten(2),
         )  # of all sensors, and of each alone: (N, 1 + K, n (1 + K))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_of
@@ -16,7 +18,7 @@ from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics,
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
-from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
+from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
 
@@ -27,6 +29,24 @@ SHARED = 0.25
 """Mean deviation of episodes, relative to that of others, from which a fault affects them as well."""
 
 Rows = Sequence[Mapping[str, float]]
+
+
+def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None) -> float:
+    """The alarm rate of a diagnosis of ``count`` episodes with a record of ``healthy`` episodes.
+
+    A single episode has a p-value of at least 1 / (healthy + 1). Default: ``ALARM_RATE``, or that p-value if it is
+    larger. Raises BadInput for a lower rate, and for a record of fewer than ``MIN_HEALTHY`` episodes.
+    """
+    if healthy < MIN_HEALTHY:
+        raise BadInput(f"a healthy record of {healthy} episodes is too small; measure it from at least {MIN_HEALTHY}")
+    smallest = 1 / (healthy + 1) if count == 1 else 0.0
+    if alarm_rate is not None and alarm_rate < smallest:
+        raise BadInput(
+            f"a healthy record of {healthy} episodes cannot show a fault in a single one: an alarm rate of "
+            f"{alarm_rate:g} needs {math.ceil(1 / alarm_rate) - 1}; diagnose several episodes, or use a rate of "
+            f"{math.ceil(1000 * smallest) / 1000:g} or more"
+        )
+    return max(ALARM_RATE, smallest) if alarm_rate is None else alarm_rate
 
 
 @dataclass(frozen=True)

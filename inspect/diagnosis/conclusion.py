@@ -12,7 +12,14 @@ from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import modalities_of
-from beliefscope.inspect.diagnosis.case import ALARM_RATE, Case, affected_episodes, affected_steps, symptoms_of
+from beliefscope.inspect.diagnosis.case import (
+    ALARM_RATE,
+    Case,
+    affected_episodes,
+    affected_steps,
+    checked_alarm_rate,
+    symptoms_of,
+)
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
@@ -49,7 +56,7 @@ CONVENTIONS = "test the signs, scales and axes of its inputs: diagnostic Convent
 def healthy(case: Case) -> Diagnosis:
     """The diagnosis without an alarm."""
     count, record = len(case.deviations), case.profile.episodes
-    is_small = len(case.traces) == 1 and 1 / (record + 1) > ALARM_RATE  # as ``checked_alarm_rate``
+    is_small = checked_alarm_rate(record, len(case.traces)) > ALARM_RATE
     small = "; a larger record shows smaller faults" if is_small else ""
     text = f"no significant deviation from the record of {record} healthy episodes in {count} statistics{small}."
     largest = tuple(_evidence(case, deviation) for deviation in case.deviations[:LARGEST])

@@ -7,7 +7,6 @@ with the same random numbers. The right undo restores the healthy statistics.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,10 +17,10 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import (
-    ALARM_RATE,
     Case,
     affected_episodes,
     affected_steps,
+    checked_alarm_rate,
     compared,
     examine_again,
     explain_all,
@@ -153,24 +152,6 @@ def _examined(
     rows, sensors = zip(*(observe(trace, checkpoint, profile) for trace in traces), strict=True)
     inputs = _run_inputs(checkpoint, traces, particles, profile)
     return compared(inputs, traces, rows, sensors, profile, alarm_rate)
-
-
-def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None) -> float:
-    """The alarm rate of a diagnosis of ``count`` episodes with a record of ``healthy`` episodes.
-
-    A single episode has a p-value of at least 1 / (healthy + 1). Default: ``ALARM_RATE``, or that p-value if it is
-    larger. Raises BadInput for a lower rate, and for a record of fewer than ``MIN_HEALTHY`` episodes.
-    """
-    if healthy < MIN_HEALTHY:
-        raise BadInput(f"a healthy record of {healthy} episodes is too small; measure it from at least {MIN_HEALTHY}")
-    smallest = 1 / (healthy + 1) if count == 1 else 0.0
-    if alarm_rate is not None and alarm_rate < smallest:
-        raise BadInput(
-            f"a healthy record of {healthy} episodes cannot show a fault in a single one: an alarm rate of "
-            f"{alarm_rate:g} needs {math.ceil(1 / alarm_rate) - 1}; diagnose several episodes, or use a rate of "
-            f"{math.ceil(1000 * smallest) / 1000:g} or more"
-        )
-    return max(ALARM_RATE, smallest) if alarm_rate is None else alarm_rate
 
 
 def _run_inputs(checkpoint: Checkpoint, traces: Sequence[Trace], particles: int, profile: HealthyProfile) -> RunInputs:

@@ -123,7 +123,8 @@ def _profile(
     ``diagnosed``: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
-    from beliefscope.inspect.diagnosis.diagnose import checked_alarm_rate, required_profile
+    from beliefscope.inspect.diagnosis.case import checked_alarm_rate
+    from beliefscope.inspect.diagnosis.diagnose import required_profile
     from beliefscope.inspect.healthy import overlap_warning, profile_of
 
     if clean is None:

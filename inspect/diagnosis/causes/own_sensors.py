@@ -36,12 +36,17 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in KNOWN}
     result = []
     for key, modality in keys.items():
-        changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
+        changed = f"*/{key}/*|*/{key} */*|lag/*|{_downstream(modality)}"
         for kinds, mechanism, word, action in IMAGE if key in task.images else VECTOR:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
     return (*result, *_moved_cameras(task), *_delays(task), *_delayed_modalities(task), *_models(task))
+
+
+def _downstream(modality: str) -> str:
+    """Statistics that a fault in a sensor of a modality changes downstream."""
+    return f"module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
 
 
 def _moved_cameras(task: Task) -> tuple[Cause, ...]:
@@ -52,15 +57,11 @@ def _moved_cameras(task: Task) -> tuple[Cause, ...]:
     result = []
     for modality, keys in task.modalities.items() if HAND not in task.observations else ():
         for key in (key for key in keys if key in task.images):
-            module = f"module bias/*{modality}*"
-            changed = (
-                f"{module}|object match/*|occlusion/{key}/*|brightness/{key}/*|sharpness/{key}/*|module */*{modality}*"
-                f"|likelihood share/*|{LABELS}|{WEIGHTS}"
-            )
+            changed = f"object match/*|occlusion/{key}/*|brightness/{key}/*|sharpness/{key}/*|{_downstream(modality)}"
             title = "Camera moved" if key == "image" else f"Camera {display_name(key)} moved"
             symptoms = (
                 Symptom(OBJECT, 0),
-                Symptom(module, 0, 0.5),
+                Symptom(f"module bias/*{modality}*", 0, 0.5),
                 Symptom("module bias/*", 0, 0.3, "alone"),
             )
             undo = f"realign image|drop {modality}" if key == "image" else f"drop {modality}"
@@ -72,7 +73,7 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
     """Modalities behind the labels, of tasks without a measured hand and labelled contact, which show it better."""
     result = []
     for modality in task.modalities if HAND not in task.observations and not has_labels_only(task) else ():
-        changed = f"{LABELS}|{OBJECT}|object match/*|module */*{modality}*|likelihood share/*|{WEIGHTS}"
+        changed = f"{OBJECT}|object match/*|{_downstream(modality)}"
         title = "Image delayed" if modality == "image" else f"Modality {display_name(modality)} delayed"
         symptoms, action = (Symptom(f"lag/labels {modality}/*", -1),), "Synchronise the clocks of the sensors."
         result.append(Cause(f"{modality}.delay", title, symptoms, changed, action, f"advance {modality}"))
@@ -94,7 +95,7 @@ def _delays(task: Task) -> tuple[Cause, ...]:
     result = []
     for modality, keys in task.modalities.items() if has_labels_only(task) else ():
         for key in (key for key in keys if len(task.observations[key]) == 1 and key != HAND):
-            changed = f"*/{key}/*|*/{key} */*|lag/*|module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
+            changed = f"*/{key}/*|*/{key} */*|lag/*|{_downstream(modality)}"
             if key in (FORCE, TORQUE):
                 changed += f"|lever/{FORCE}*|axes/{FORCE}/*|size/*/contact"
             if key == FORCE and TORQUE in task.observations:
