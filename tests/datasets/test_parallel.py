@@ -69,7 +69,7 @@ def is_imported(name):
 
 if __name__ == "__main__":
     prepare_processes("colorsys")
-    print(list(run_in_processes(is_imported, ["colorsys", "this"], 1)))
+    print(sorted(run_in_processes(is_imported, ["colorsys", "this"], 1)))
 """
 
 
