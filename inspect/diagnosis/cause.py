@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
+from fnmatch import translate
+from functools import cache
 from typing import Any, Literal
 
 from beliefscope.inspect.diagnostics.views import Table, html_result
@@ -40,7 +42,12 @@ class Symptom:
 
 def matches(patterns: str, statistic: str) -> bool:
     """Whether the name of a statistic matches one of the patterns, which are joined by ``|``."""
-    return any(fnmatchcase(statistic, pattern) for pattern in patterns.split("|"))
+    return _regex(patterns).match(statistic) is not None
+
+
+@cache
+def _regex(patterns: str) -> re.Pattern[str]:
+    return re.compile("|".join(map(translate, patterns.split("|"))))
 
 
 @dataclass(frozen=True)
