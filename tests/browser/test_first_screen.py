@@ -146,12 +146,14 @@ def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
     assert size("#maps") == default
 
 
-@pytest.mark.parametrize("options", [(), ("--read-only",)])
+@pytest.mark.parametrize("read_only", [False, True])
 def test_names_of_tabs_have_space_beside_their_dividers(
-    start_server: Callable[..., Any], open_page: Any, options: tuple[str, ...]
+    server: Any, start_server: Callable[..., Any], open_page: Any, read_only: bool
 ) -> None:
-    """In the narrow panel, with the widest selected name, and without wrapping or scrolling."""
-    page = open_page("?task=door&tab=diagnostics", url=start_server(*options).url, size=(1024, 768))
+    """In the narrow panel, with the widest selected name and a running job, without wrapping or scrolling."""
+    url = start_server("--read-only").url if read_only else server.url
+    page = open_page("?task=door&tab=diagnostics", url=url, size=(1024, 768))
+    page.page.evaluate("document.querySelector('#jobs-button').dataset.active = '1'")
     space, lines, hidden = page.page.evaluate(TAB_SPACE)
     assert space >= 4.0
     assert lines == 1

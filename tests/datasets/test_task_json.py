@@ -80,7 +80,7 @@ def test_invalid_definitions_are_rejected(change: dict[str, Any], message: str) 
 
 
 def test_mutated_definitions_give_a_task_or_one_line() -> None:
-    """2000 definitions with a value replaced, at any depth."""
+    """500 definitions with a value replaced, at any depth."""
     rng = np.random.default_rng(0)
     values = [None, "", "x", -1, 0, 1.5, 1e308, True, [], {}, [[]], {"a": 1}, "m" * 300, [1, 2, 3]]
 
@@ -89,7 +89,7 @@ def test_mutated_definitions_give_a_task_or_one_line() -> None:
         return [pair for key in keys for pair in [(node, key), *places(node[key])]]
 
     rejected = []
-    for _ in range(2000):
+    for _ in range(500):
         document = stored(find_task("door-field"))
         nodes = places(document)
         node, key = nodes[rng.integers(len(nodes))]

@@ -119,7 +119,7 @@ export class Jobs {
     const changed = JSON.stringify(list) !== JSON.stringify(this.#list);
     this.#list = list;
     const active = list.filter(isActive).length;
-    this.#button.textContent = active ? `Jobs (${active})` : 'Jobs';
+    this.#button.dataset.active = active ? String(active) : '';
     if (!this.#drawer.hidden) this.#show();
     if (changed) for (const listener of this.#listeners) listener(list);
   }

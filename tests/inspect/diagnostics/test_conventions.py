@@ -24,7 +24,7 @@ from beliefscope.inspect.traces.batch import trace_all
 sys.path.insert(0, str(Path(__file__).parent))
 import planted_traces as plant
 
-EPISODES, STEPS = 8, 100
+EPISODES, STEPS = 6, 80
 MIRRORED = "sensor_gain=effector_position:factor=-1"
 
 

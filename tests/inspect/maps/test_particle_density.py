@@ -33,7 +33,7 @@ def test_moments_are_those_of_the_particles(particles: int) -> None:
     states = rng.multivariate_normal((0.4, -0.2), [[4e-4, 2e-4], [2e-4, 9e-4]], particles)
     weights = rng.dirichlet(np.ones(particles))
     density = ParticleDensity(PUSH, states, np.log(weights))
-    offsets = np.linspace(-0.2, 0.2, 161)
+    offsets = np.linspace(-0.2, 0.2, 81)
     p = np.exp(density.log_density(np.array([0.4, -0.2]), (0, 1), offsets, offsets)) * (offsets[1] - offsets[0]) ** 2
     cells = np.stack(np.meshgrid(0.4 + offsets, -0.2 + offsets), axis=-1)
     assert p.sum() == pytest.approx(1.0, abs=1e-3)
