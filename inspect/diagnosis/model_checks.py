@@ -21,6 +21,7 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
+from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.signals import lag
@@ -185,7 +186,8 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     grows with the motion. ``dynamics slope``: slope of the
     predicted on the true change, for components that move enough. ``dynamics bias`` and ``dynamics spread``: mean and
     standard deviation of r that the slope does not explain. ``process noise``: q. ``lag/dynamics``: steps by which the
-    true changes follow the predicted ones.
+    true changes follow the predicted ones. ``opposed/control``, of controls that do not command a measured hand:
+    log-ratio of the size of r to that with the opposite sign of the channel; 0 if the present sign fits better.
     """
     filter_ = checkpoint.filter
     if not isinstance(getattr(filter_, "dynamics", None), Dynamics) or len(episode) < MIN_STEPS:
@@ -220,6 +222,15 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     if moved.any():
         scaled = (change + residual)[:, moved] / std[moved], change[:, moved] / std[moved]
         values["lag/dynamics/all"] = lag(scaled[1], scaled[0])[0]
+    if moved.any() and not commands_hand(episode.task):
+        signs = 1.0 - 2.0 * torch.eye(controls.shape[1])[:, None]
+        controls = si.standardise("control", signs * torch.from_numpy(episode.controls[1:]))
+        opposite = filter_.dynamics(before, filter_.dynamics.control_part(controls))
+        other = measures.wrapped(filter_.task, (opposite - after).double().numpy() * std)
+        size, sizes = (np.square((r / std)[..., moved]).sum((-2, -1)) for r in (residual, other))
+        ratio = size / np.maximum(sizes, 1e-12)
+        for i, value in enumerate(np.log(np.maximum(ratio, 1.0)) / 2.0):
+            values[f"opposed/{axis_name('control', i, len(ratio))}/all"] = float(value)
     return values
 
 

@@ -15,7 +15,16 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
 from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
-from beliefscope.inspect.diagnosis.vector_checks import CHANGE, FORCE, TORQUE, free_motion, in_contact, lever
+from beliefscope.inspect.diagnosis.vector_checks import (
+    CHANGE,
+    FORCE,
+    TORQUE,
+    axis_index,
+    commands_hand,
+    free_motion,
+    in_contact,
+    lever,
+)
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
 from beliefscope.inspect.statistics.signals import MIN_STEPS
@@ -76,7 +85,8 @@ def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
     if behind.get(key, 0) > 0:
         steps_of = {name: steps for name, steps in behind.items() if steps > 0}
     else:
-        names = (f"lag/{key if key in ('control', 'labels') else 'image'}/all", f"lag/labels {key}/all")
+        names = [f"lag/{key if key in ('control', 'labels') else 'image'}/all", f"lag/labels {key}/all"]
+        names += ["lag/dynamics/all"] if key == "control" else []
         lag = next((deviations[name] for name in names if name in deviations), None)
         steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
         if not steps:
@@ -246,16 +256,29 @@ def shift_labels(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
 
 
 def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Controls whose change of the hand position has the healthy scale."""
-    scale = _ratio(deviations, "scale/control/all")
-    channels = CHANGE if inputs.checkpoint.task.control_size >= CHANGE.stop else slice(None)
+    """Controls whose change of the hand position has the healthy scale; of others, with the healthy sizes."""
+    factors = np.ones(inputs.checkpoint.task.control_size)
+    if commands_hand(inputs.checkpoint.task):
+        factors[CHANGE] = _ratio(deviations, "scale/control/all") or 1.0
+    for name, deviation in deviations.items():
+        if name.startswith("size/control") and deviation.alarm:
+            factors[_channel(name)] = _ratio(deviations, name) or 1.0
+    return None if (factors == 1.0).all() else _with_readings(inputs, "control", lambda values, _: values / factors)
 
-    def rescaled(controls: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        controls = controls.copy()
-        controls[:, channels] /= scale
-        return controls
 
-    return None if not scale else _with_readings(inputs, "control", rescaled)
+def negate_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
+    """Controls with the opposite sign of the channels that fit the dynamics better with it."""
+    signs = np.ones(inputs.checkpoint.task.control_size)
+    for name, deviation in deviations.items():
+        if name.startswith("opposed/control") and deviation.alarm:
+            signs[_channel(name)] = -1.0
+    return None if (signs == 1.0).all() else _with_readings(inputs, "control", lambda values, _: values * signs)
+
+
+def _channel(statistic: str) -> int:
+    """Index of the channel of the controls that a statistic is about."""
+    axis = statistic.split("/")[1].partition(" ")[2]
+    return axis_index(axis) if axis else 0
 
 
 def _excess(deviations: Deviations, name: str) -> float | None:
@@ -280,5 +303,6 @@ READINGS: Mapping[str, Undo] = {
     "scale force": scale_force,
     "negate force": negate_force,
     "scale control": scale_control,
+    "negate control": negate_control,
 }
 """Intervention -> function."""

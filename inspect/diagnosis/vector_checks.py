@@ -62,7 +62,7 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
     noise = noise_level(readings, present)
     values: dict[str, float] = {}
     for i in range(readings.shape[1]):
-        axis = _axis(key, i, readings.shape[1])
+        axis = axis_name(key, i, readings.shape[1])
         values |= {
             f"level/{axis}/free motion": float(level[i]),
             f"drift/{axis}/free motion": float(slope[i] / episode.dt),
@@ -194,8 +194,15 @@ def lever(force: Array, torque: Array) -> tuple[Array, float]:
 
 
 def control_statistics(episode: Episode) -> dict[str, float]:
-    """Delay and scale of controls that command a hand position, against the measured position."""
-    if not commands_hand(episode):
+    """Delay and scale of controls that command a hand position, against the measured position.
+
+    Of other controls, the standard deviation of each channel: only a filter's dynamics say what they do.
+    """
+    if not commands_hand(episode.task):
+        controls = episode.controls.astype(np.float64)
+        names = [axis_name("control", i, controls.shape[1]) for i in range(controls.shape[1])]
+        return {f"size/{name}/all": float(size) for name, size in zip(names, controls.std(0), strict=True)}
+    if HAND not in episode.observations:
         return {}
     hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
     moved, change = np.diff(hand, axis=0, prepend=hand[:1]), controls[:, CHANGE]
@@ -211,10 +218,9 @@ def control_statistics(episode: Episode) -> dict[str, float]:
     }
 
 
-def commands_hand(episode: Episode) -> bool:
+def commands_hand(task: Task) -> bool:
     """Whether the controls command the position (x, y, z) of a hand that is measured."""
-    measured = HAND in episode.observations and episode.observations[HAND].shape[1] == 3
-    return measured and episode.controls.shape[1] >= CHANGE.stop
+    return task.observations.get(HAND) == (3,) and task.control_size >= CHANGE.stop
 
 
 def impedance_statistics(episode: Episode) -> dict[str, float]:
@@ -225,7 +231,7 @@ def impedance_statistics(episode: Episode) -> dict[str, float]:
     the force divides c by g. A robust fit; c and k are NaN if the set point is the measured position. The offset and c
     are NaN where the law does not hold (``LAWFUL``), such as for a jammed arm.
     """
-    if not commands_hand(episode):
+    if not commands_hand(episode.task) or HAND not in episode.observations:
         return {}
     hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
     present = episode.present(HAND)[:-1]
@@ -341,7 +347,7 @@ def saturated(values: Array) -> Mask:
     return at if np.diff(at, prepend=False).sum() > 2 else np.zeros(len(values), dtype=bool)
 
 
-def _axis(key: str, i: int, count: int) -> str:
+def axis_name(key: str, i: int, count: int) -> str:
     """Display name of an axis: ``force x``, ``joints 4``; of a scalar, the key."""
     return key if count == 1 else f"{key} {AXES[i] if count <= 3 else i}"
 

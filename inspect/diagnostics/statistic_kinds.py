@@ -75,6 +75,7 @@ KINDS = {
     "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),
     "compliance": ("yielding of the hand to the force{axis}", False, 2e-5),
     "following": ("steps by which the hand follows its set point{axis}", False, 0.05),
+    "opposed": ("evidence for the opposite sign", False, 0.1),
     "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
@@ -103,7 +104,7 @@ PHASES = {
 
 RISING = frozenset(
     {"error", "angle error", "regret", "outside", "black", "losses", "frozen", "stuck", "saturation", "occlusion"}
-    | {"change", "opposition", "contact distance error", "contact distance scatter"}
+    | {"change", "opposition", "opposed", "contact distance error", "contact distance scatter"}
     | {"module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import model
-from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
-from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, has_labels_only
+from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, commands_hand, has_labels_only
 from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")
@@ -31,6 +31,35 @@ IMAGE = (
 """As ``VECTOR``, of images."""
 
 
+CONTROLS = (
+    Cause(
+        "control.scale",
+        "Controls scaled",
+        (Symptom("size/control*", 0), Symptom("dynamics slope/*|dynamics spread/*", 0, optional=True)),
+        f"{DYNAMICS}|{LABELS}",
+        "Check the units of the controls.",
+        "scale control",
+    ),
+    Cause(
+        "control.delay",
+        "Controls delayed",
+        (Symptom("lag/dynamics/*", -1),),
+        f"{DYNAMICS}|{LABELS}",
+        "Synchronise the controls with the sensors.",
+        "advance control",
+    ),
+    Cause(
+        "control.sign",
+        "Controls with the opposite sign",
+        (Symptom("opposed/control*"),),
+        f"lag/dynamics/*|{DYNAMICS}|{LABELS}",
+        "Check the sign convention of the controls.",
+        "negate control",
+    ),
+)
+"""Causes in controls that do not command a measured hand, as the dynamics model of the filter shows them."""
+
+
 def own_causes(task: Task) -> tuple[Cause, ...]:
     """Causes in the sensors of a task that have none in the catalog."""
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in KNOWN}
@@ -41,7 +70,8 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
-    return (*result, *_moved_cameras(task), *_delays(task), *_delayed_modalities(task), *_models(task))
+    controls = CONTROLS if task.control_size and not commands_hand(task) else ()
+    return (*result, *_moved_cameras(task), *_delays(task), *_delayed_modalities(task), *_models(task), *controls)
 
 
 def _downstream(modality: str) -> str:
