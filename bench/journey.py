@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from page import browsing, usable
-from served import serving
+from server_process import serving
 
 RUNS = ("push-field/information-ekf:image_noise=40", "door-field/information-ekf:image_noise=40")
 CLICKS, SECONDS = 5, 180.0  # bars

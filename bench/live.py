@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from page import browsing, find_chromium
-from served import serving
+from server_process import serving
 from subject import Row
 
 RATES = (10.0, 20.0)

@@ -19,7 +19,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 import numpy as np
-from served import serving
+from server_process import serving
 from subject import STEPS, Row, episode
 
 from beliefscope.datasets.catalog import find_task

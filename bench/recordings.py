@@ -23,7 +23,7 @@ from statistics import median
 import subject
 import torch
 from page import browsing
-from served import serving
+from server_process import serving
 from subject import NAMES, STEPS, Row
 
 from beliefscope.inspect.maps.map_engine import MapEngine

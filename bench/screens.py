@@ -21,7 +21,7 @@ from typing import Any
 
 import sensor_rigs
 from playwright.sync_api import Page, sync_playwright
-from served import serving
+from server_process import serving
 
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import pretrained_path

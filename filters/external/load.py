@@ -58,9 +58,9 @@ from beliefscope.filters.external.calls import (
     steps_of,
 )
 from beliefscope.filters.external.fingerprint import fingerprint
-from beliefscope.filters.external.hooks import Capture
 from beliefscope.filters.external.module_weights import load_weights, pretrained_std
 from beliefscope.filters.external.step_values import StepValues, with_ancestors
+from beliefscope.filters.external.torchfilter_hooks import Capture
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import START_VARIANCE
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from beliefscope.filters.external.adapter import Values, letters_of
 from beliefscope.filters.external.ancestors import Words, ancestors, new_table, words_of
-from beliefscope.filters.external.hooks import RESAMPLED
+from beliefscope.filters.external.torchfilter_hooks import RESAMPLED
 
 BLOCK = 32
 """Steps whose ancestors are searched together, which takes half of the time: code and tables stay in the caches."""

@@ -15,9 +15,9 @@ from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import WEIGHTED, Architecture, Filter, encoders
 from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.ekf_numpy import SingleTrajectory, is_usual
 from beliefscope.filters.models.fusion import in_one_turn, product_of_experts, symmetric, weighted_average
 from beliefscope.filters.models.networks import Residual, Stack
-from beliefscope.filters.models.single_trajectory import SingleTrajectory, is_usual
 from beliefscope.filters.models.weight_model import WeightModel
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from browsers import Browser, Selection
 from rich.console import Console
 from rich.table import Table
-from served import Served, serving
+from server_process import Served, serving
 
 RATE, MOVES, REST = 30.0, 90, 1.0
 LIMIT = 64  # largest number of views of the server

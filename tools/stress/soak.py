@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 import httpx
 import numpy as np
 from browsers import Browser, Selection, trace_path
-from served import Served, serving
+from server_process import Served, serving
 
 EVERY = 10.0  # s between samples
 WARM_UP = 0.25  # fraction of the time

@@ -10,8 +10,8 @@ from torch import Tensor
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.external import adapter
 from beliefscope.filters.external.ancestors import ancestors as search, new_table, words_of
-from beliefscope.filters.external.hooks import RESAMPLED
 from beliefscope.filters.external.step_values import BLOCK, StepValues, with_ancestors
+from beliefscope.filters.external.torchfilter_hooks import RESAMPLED
 
 
 def ancestors(after: Tensor, before: Tensor) -> Tensor:
