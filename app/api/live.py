@@ -83,7 +83,7 @@ def routes(store: TraceStore) -> APIRouter:
                 unavailable = isinstance(checkpoint, UnavailableFilter) and bool(run.template.checkpoint_hash)
                 entry = {"filter": filter_name, "available": not unavailable, "kind": run.template.kind}
                 if other := difference(tasks.setdefault(run.task.name, run.task), run.task):
-                    raise BadInput(f"live run {name!r} is of {other}, unlike a newer run")
+                    raise BadInput(f"live run {name!r} has {other}, unlike a newer run")
                 entries.append(describe(run) | entry)
             except BadInput as error:
                 entries.append({"name": name, "state": "damaged", "message": str(error)})

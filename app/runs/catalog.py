@@ -206,7 +206,7 @@ def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, source: str) -> Ta
     """The catalog of a task, added if missing. Raises BadInput if another task has the same name."""
     catalog = catalogs.setdefault(task.name, TaskCatalog(task))
     if other := difference(catalog.task, task):
-        raise BadInput(f"{source} is of {other}; a server has one task of each name")
+        raise BadInput(f"{source} has {other}; names of tasks must be unique in a server")
     return catalog
 
 

@@ -222,7 +222,7 @@ class Diagnosis:
         actions = tuple((c.cause.name, c.next) for c in causes)
         rows = [((c.cause.name,), e) for c in causes for e in c.evidence]
         return [
-            Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), ranked),
+            Table("Causes", ("cause", "probability", "error removed by undoing it", "episodes"), ranked),
             *([_evidence_table("Evidence", ("cause",), rows)] if rows else largest_table),
             Table("Next", ("cause", "action"), actions),
             *missing,

@@ -187,7 +187,7 @@ def _run(trace: Trace) -> Passage:
     task = trace.task
     start = "Runs start at the true state"
     if task.start_distance:
-        start = "Runs start beside the true state, with a covariance that matches the distance"
+        start = "Runs start at an offset from the true state, with a covariance that matches the distance"
     elif not measures.starts_at_truth(trace):
         start = "Runs start at a belief of the filter or its user"
     elif trace.has_covariance:

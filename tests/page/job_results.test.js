@@ -95,7 +95,7 @@ test('the effect of undoing a cause has a direction and no sign', () => {
   const angle = { error: 0.6, low: 0.5, high: 0.7, nll: 1, measure: 'angle' };
   assert.match(
     recoveredText(angle),
-    /^Undoing it recovers 60 % \(50 % to 70 %\) of the angle error;/,
+    /^Undoing it removes 60 % \(50 % to 70 %\) of the angle error;/,
   );
   assert.match(
     recoveredText({ ...angle, error: -0.2 }),

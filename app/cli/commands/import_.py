@@ -34,9 +34,9 @@ def import_(
     """Import a recording or a log as a trace or data set.
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
-    Of a live run that is in progress or was killed, the complete steps are extracted.
+    From a live run in progress, or one that was killed, the complete steps are extracted.
 
-    Of a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
+    For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
     run that the page displays. Filters are trained and fine-tuned on the episodes of --split train and evaluated on
     those of val and test.
@@ -70,7 +70,7 @@ def import_(
         raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")
     if source.suffix.lower() in RECORDINGS and map is None:
         if split is not None:
-            raise BadInput(f"--split is of logs: {source.name} is a recording, whose episode has a split already")
+            raise BadInput(f"--split applies to logs: {source.name} is a recording, whose episode already has a split")
         opt.check_output(output, ".trace", ".live")
         return _written(open_recording(source, task), output)
     if map is None:

@@ -26,7 +26,7 @@ const OVER = [
 ];
 const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN}.`;
 const WITHIN =
-  'The largest of all statistics; healthy episodes, too, have some outside of these ranges.';
+  'The largest deviations of all statistics; healthy episodes also have some outside these ranges.';
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MEASURE = 'Measure a healthy record';
@@ -231,7 +231,7 @@ export class Diagnosis {
     const isReady = entry.state === 'ready'; // the run is loading again
     this.#writeHeadline(isReady ? 'Loading …' : sentence(reason));
     const { data } = trace.selection;
-    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them. The more there are, the rarer are false alarms in a single episode.`;
+    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them. More held-out episodes mean fewer false alarms for a single episode.`;
     const state = this.#starts
       ? stateOf(entry) || about
       : 'Read-only server: the record cannot be measured here.';

@@ -71,7 +71,7 @@ export function recoveredText({ error, low, high, nll, measure }) {
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
   if (error < 0)
     return `Undoing it increases the ${measure} error by ${percent(-error)}; ${likelihood}.`;
-  return `Undoing it recovers ${percent(error)}${range} of the ${measure} error; ${likelihood}.`;
+  return `Undoing it removes ${percent(error)}${range} of the ${measure} error; ${likelihood}.`;
 }
 
 /**

@@ -268,7 +268,7 @@ export class FinetuneForm {
   #showCount() {
     const name = this.#select('preset').value;
     const preset = this.#offer?.presets.find((item) => item.name === name);
-    html('.help', this.#form).textContent = preset?.help ?? 'Your own selection of modules.';
+    html('.help', this.#form).textContent = preset?.help ?? 'Custom selection of modules.';
     const [trained, total] = this.#diagram.count.map((count) => count.toLocaleString('en'));
     html('.count', this.#form).textContent =
       `${trained} of ${total} parameters; the others are frozen`;

@@ -84,7 +84,7 @@ export class CommandPalette {
     this.#displayed = commands.slice(0, MAX_OPTIONS);
     this.#list.replaceChildren(...this.#displayed.map(option));
     this.#list.hidden = !this.#displayed.length;
-    this.#none.textContent = this.#displayed.length ? '' : 'No command has these words.';
+    this.#none.textContent = this.#displayed.length ? '' : 'No matching command.';
     this.#input.ariaExpanded = String(this.#displayed.length > 0);
   }
 

@@ -86,4 +86,4 @@ def test_another_split_is_refused(run: Run, log: Path) -> None:
 def test_a_recording_has_a_split_already(run: Run, tmp_path: Path) -> None:
     code, _, error = run("import --split train", tmp_path / "run.rrd", "-o", tmp_path / "run.trace")
     assert code == 2
-    assert error == "error: --split is of logs: run.rrd is a recording, whose episode has a split already\n"
+    assert error == "error: --split applies to logs: run.rrd is a recording, whose episode already has a split\n"
