@@ -31,7 +31,7 @@ def serve(
     filter: list[str] | None = opt.option(
         "CHECKPOINT|MODULE:BUILD",
         "Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, if it "
-        "has none, for the one given with --task.",
+        "has none, for that of --task or --data.",
         None,
     ),
     study: list[Path] | None = opt.option("DIR", "Folder of a study to serve. Repeatable.", None),
