@@ -180,7 +180,7 @@ def time_error(time: NDArray[Any]) -> str:
 
 
 def is_image(readings: NDArray[Any]) -> bool:
-    """Whether readings (T, ...) are images: (T, H, W) grey or (T, H, W, 3) RGB, uint8."""
+    """Whether readings (T, ...) are images: (T, H, W) gray or (T, H, W, 3) RGB, uint8."""
     return readings.dtype == np.uint8 and readings.ndim in (3, 4)
 
 

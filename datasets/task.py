@@ -182,8 +182,8 @@ class Task:
         name: without spaces, colons and slashes.
         components: n state components, in order.
         observations: observation key -> shape per step, e.g. ``{"image": (32, 32), "force": (3,)}``: (d,) a vector,
-            (H, W) a grey and (H, W, 3) an RGB image.
-        modalities: modality -> its observation keys. The built-in networks take one grey image, or vectors.
+            (H, W) a gray and (H, W, 3) an RGB image.
+        modalities: modality -> its observation keys. The built-in networks take one gray image, or vectors.
         control_size: length of the control vector.
         dt: seconds per step.
         map_components: the two components of the likelihood map (x to the right, y up), or one, whose map is a curve.

@@ -71,7 +71,7 @@ class Selection:
             return replace(self, intervention=Intervention.parse(text))
         if "only" in parts:
             if len(parts) > 1 or not parts["only"]:
-                raise BadInput(f"{text!r} is not only=MODALITY, without other parts of the comparison run")
+                raise BadInput(f"comparison run {text!r}: only= names one modality, without other parts")
             return replace(self, only=parts["only"])
         for key in parts:
             if key not in ("filter", "faults"):

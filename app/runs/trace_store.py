@@ -112,7 +112,7 @@ class TraceStore:
             if catalog is None:
                 return {}
             if other := difference(catalog.task, run.task):
-                raise BadInput(f"live run {run.name!r} is of {other}; this server has its own task {run.task.name!r}")
+                raise BadInput(f"live run {run.name!r} has {other}, unlike task {run.task.name!r} of this server")
             return catalog.filters
 
     def default_selection(self) -> Selection:

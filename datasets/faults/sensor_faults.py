@@ -79,7 +79,7 @@ class SensorSwapped(SensorFault):
     second: int = integer_field(1, "channel", "index of the other channel")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        count = readings.shape[-1] if readings.ndim != 3 else 1  # the last axis of a grey image is its width
+        count = readings.shape[-1] if readings.ndim != 3 else 1  # the last axis of a gray image is its width
         if max(self.first, self.second) >= count:
             raise BadInput(f"{self} uses a channel that the sensor does not have. Available: 0 to {count - 1}.")
         order = np.arange(count)

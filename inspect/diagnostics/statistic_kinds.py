@@ -73,8 +73,8 @@ KINDS = {
     "lever": ("lever of the torque{axis}", False, 0.01),
     "axes": ("evidence for the order of the axes", False, 0.3),
     "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),
-    "compliance": ("yielding of the hand to the force{axis}", False, 2e-5),
-    "following": ("steps by which the hand follows its set point{axis}", False, 0.05),
+    "compliance": ("compliance of the hand to the force{axis}", False, 2e-5),
+    "following": ("delay of the hand in steps behind its set point{axis}", False, 0.05),
     "opposed": ("evidence for the opposite sign", False, 0.1),
     "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
 }

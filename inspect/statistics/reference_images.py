@@ -126,7 +126,7 @@ def gradients(images: Array) -> tuple[Spectrum, Spectrum]:
 
 
 def image_keys(episode: Episode) -> list[str]:
-    """Observation keys of grey images (T, H, W)."""
+    """Observation keys of gray images (T, H, W)."""
     return [key for key, array in episode.observations.items() if array.ndim == 3 and array.dtype == np.uint8]
 
 

@@ -174,7 +174,7 @@ def _weights(trace: Trace) -> dict[str, Any] | None:
 
 
 def _images(trace: Trace) -> list[dict[str, Any]]:
-    """Images as the filter received them, grey or RGB, T x H x W x channels."""
+    """Images as the filter received them, gray or RGB, T x H x W x channels."""
     images = []
     for key, values in trace.episode.observations.items():
         if is_image(values):

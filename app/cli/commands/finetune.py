@@ -30,7 +30,7 @@ class Learning:
     freeze: list[str] | None = None
     slices: list[str] | None = None
     fault_sets: list[str] | None = opt.option(
-        "FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", None, "--faults"
+        "FAULTS", "Train on a slice of all steps with these sensor faults. Repeatable.", None, "--faults"
     )
     clean_weight: float | None = opt.option(
         "SHARE",
@@ -38,7 +38,7 @@ class Learning:
         None,
     )
     events: list[str] | None = opt.option(
-        "EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", None, "--event"
+        "EPISODE[:FIRST-LAST]", "Restrict the slices to these steps. Repeatable.", None, "--event"
     )
     data: Path | None = None
     skip_bad: bool = False

@@ -66,7 +66,7 @@ export const isTrainable = ({ next }) => next.includes('`beliefscope finetune ')
 export function recoveredText({ error, low, high, nll, measure }) {
   const change = (nll ?? 0) < 0 ? 'increases' : 'decreases';
   const size = nll === null ? '?' : fixed(Math.abs(nll), 2);
-  const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
+  const likelihood = `the negative log-likelihood ${change} by ${size} nats per step`;
   if (error === null) return `If undone, ${likelihood}.`;
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
   if (error < 0)

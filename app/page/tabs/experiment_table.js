@@ -93,7 +93,7 @@ export class ExperimentTable {
     const { pinned } = this.#contents;
     const isPinned = pinned.includes(key);
     const button = create('button', { type: 'button', className: 'quiet pin', textContent: '⇤' });
-    button.title = isPinned ? 'Release this column' : 'Keep this column at the left';
+    button.title = isPinned ? 'Unpin this column' : 'Pin this column at the left';
     button.ariaLabel = `Pin ${title}`;
     button.ariaPressed = String(isPinned);
     button.addEventListener('click', () => {

@@ -112,7 +112,7 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
 
 def _models(task: Task) -> tuple[Cause, ...]:
     """Causes in measurement models of modalities that the catalog does not have."""
-    check = "Check the calibration of its sensors, whose offsets and scales look alike. "
+    check = "Check the calibration of its sensors, whose offsets and scales have the same symptoms. "
     names = [name for name in task.modalities if name not in MODALITIES]
     return tuple(c for name in names for c in model.causes_of(name, f"Sensors or model of {display_name(name)}", check))
 

@@ -123,7 +123,7 @@ def test_compare_with_another_filter_or_other_faults(
         ("faults=lightning", "lightning"),
         ("speed=3", "the comparison run"),
         ("only=touch", "Modality 'touch' is not in this filter. Available: image, haptics."),
-        ("only=image&filter=crossmodal-pf", "the comparison run"),
+        ("only=image&filter=crossmodal-pf", "only= names one modality"),
         ("from=40&to=60", "is empty: give faults"),
         ("from=40&faults=blackout", "'to' of intervention"),
         ("from=60&to=40&faults=blackout", "has no steps"),
