@@ -29,7 +29,7 @@ FOLDS = 4
 
 @dataclass(frozen=True)
 class SensorRecord:
-    """What a healthy profile says about sensors, which is the same for all filters of a task.
+    """The part of a healthy profile about sensors, which is the same for all filters of a task.
 
     Attributes:
         rows: statistics of the sensors by episode. Images are compared with a reference of the other groups of

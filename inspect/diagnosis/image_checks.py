@@ -19,7 +19,7 @@ from beliefscope.inspect.statistics.reference_images import (
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats
 
 BLACK = 8
-"""Gray level up to which a pixel says nothing about the exposure."""
+"""Gray level up to which a pixel carries no information about the exposure."""
 
 DARK, BRIGHT = 30.0, 225.0
 """Gray levels between which noise is not clipped."""

@@ -1,6 +1,6 @@
 """Fusion efficiency: achieved error against the best that the modalities' own errors and their correlation allow.
 
-The standalone filters (``inspect/standalone.py``) measure what each modality knows by itself. The best linear
+The standalone filters (``inspect/standalone.py``) measure the accuracy of each modality. The best linear
 combination of their estimates, with constant weights in contact and free motion, each with and without image blackout,
 is the reference. ``fusion_gaps.py`` measures the reasons for a gap.
 """

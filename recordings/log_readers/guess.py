@@ -15,7 +15,7 @@ ESTIMATE = r"est|mean|pred|filter|posterior|belief"
 POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
-"""Part of a column's name that says that it is a true value."""
+"""Part of a column's name that marks a true value."""
 
 UNITS_BY_NAME = {
     "rad/s": r"^w[xyz]?$|omega|yaw_?rate|gyro|angular",

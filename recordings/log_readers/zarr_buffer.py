@@ -28,7 +28,7 @@ EPISODE = "episode"
 DOCUMENTS = (*METADATA, ".zattrs", ".zgroup")
 
 BLOSC = ("Blosc", "BloscCodec")
-"""Compressor in format 2 and 3. It reads beyond the end of a chunk that is shorter than its header says."""
+"""Compressor in format 2 and 3. It reads beyond the end of a chunk that is shorter than its header states."""
 
 REFUSED = ("pickle", "json2", "msgpack2")
 """Codecs of objects. Reading the first can run code."""

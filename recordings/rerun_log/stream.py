@@ -68,7 +68,7 @@ class FileStream(rr.RecordingStream):
 def send_layout(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
     """Send a layout, which is active at once, also in a viewer that shows another recording.
 
-    Send steps before: the viewer warns of a layout with a timeline that it does not know yet. Closes the stream that
+    Send steps before: the viewer warns of a layout with a timeline that it has not received yet. Closes the stream that
     Rerun creates for a layout; otherwise its memory and two threads are never released.
     """
     opened, log = [], layout._log_to_stream

@@ -380,7 +380,7 @@ class LinkReader {
     return fallback;
   }
 
-  /** The track if it is one of a filter's own scalars, which only its trace knows. */
+  /** The track if it is one of a filter's own scalars, which only its trace contains. */
   get scalar() {
     const track = this.query.get('track') ?? '';
     return track.startsWith(SCALAR) ? [track] : [];

@@ -15,7 +15,7 @@ CONTACTS = (
     "|".join(f"{kind}/*" for kind in ("size", "lever", "direction", "axes", "change", "noise", "saturation"))
     + "|roughness/*|*/contact/*"
 )
-"""Statistics of forces and torques in contact, which depend on the physics; in free motion these say nothing."""
+"""Statistics of forces and torques in contact, which depend on the physics; free motion has no information."""
 
 CAUSES = (
     Cause(
