@@ -33,7 +33,7 @@ MAX_EPISODES = 10
 
 @fields_of(Evidence)
 class DiagnosisEvidence(Reply):
-    """A deviation that supports a cause. low, high: healthy range. episode, step: moment that shows it best."""
+    """A deviation that supports a cause. low, high: healthy range. episode, step: where it shows best."""
 
 
 @fields_of(Recovery)

@@ -101,7 +101,7 @@ class Evidence:
     Attributes:
         text: statistic, value and healthy range in words.
         value, low, high: value of the statistic and its 95 % healthy range.
-        episode, step: moment that shows it best; None if it concerns whole episodes.
+        episode, step: where it shows best; None if it concerns whole episodes.
         time: s from the first step to ``step``; None without timestamps.
     """
 

@@ -32,7 +32,7 @@ PHASE_SLICES = {
 class Weakness:
     """A weakness and the settings of a fine-tuning that addresses it.
 
-    source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
+    source: of the weakness. title: in words. evidence: its numbers. episode, step: where it shows, or None.
     """
 
     source: Literal["diagnosis", "faults", "failures", "default"]

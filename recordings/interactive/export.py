@@ -37,7 +37,7 @@ SCENE_STEPS = 400
 """Maximum number of steps with a drawing of the scene."""
 
 MOMENTS = 5
-"""Listed moments with the largest errors."""
+"""Number of listed steps with the largest errors."""
 
 
 def write_interactive(

@@ -157,14 +157,14 @@ export class Viewer {
   build() {
     const { run } = this;
     this.cursor.max = String(run.steps - 1);
-    this.html('#moments ol').append(
+    this.html('#events ol').append(
       ...run.moments.map(({ step: at, error }) =>
         create('li', {}, create('a', { href: `#step=${at}`, textContent: `step ${at}: ${error}` })),
       ),
     );
     if (run.scene) this.buildScene(run.scene);
     run.images.forEach((images) => this.buildImages(images));
-    this.html('#pictures').hidden = !this.painters.length;
+    this.html('#images').hidden = !this.painters.length;
     if (run.maps) this.buildMaps(run.maps);
     else this.html('#maps h2').textContent = `No maps: ${run.no_maps}`;
   }
@@ -502,7 +502,7 @@ export class Viewer {
         6 * scale + (x - left) * factor,
         canvas.height - 6 * scale - (y - bottom) * factor,
       ]);
-    this.html('#pictures').append(
+    this.html('#images').append(
       create('figure', {}, canvas, create('figcaption', { textContent: 'from above' })),
     );
     this.painters.push((t) => {
@@ -534,7 +534,7 @@ export class Viewer {
     const canvas = canvasOf(140, (140 * height) / width);
     const pixels = bitmap(width, height);
     const image = context(pixels).createImageData(width, height);
-    this.html('#pictures').append(
+    this.html('#images').append(
       create('figure', {}, canvas, create('figcaption', { textContent: name })),
     );
     this.painters.push((t) => {

@@ -17,7 +17,7 @@ class ReportedDiagnosis:
     """The diagnosis of the traces, or the reason why there is none.
 
     Attributes:
-        link: permalink of the moment that shows the first cause best, or empty.
+        link: permalink of the step that shows the first cause best, or empty.
     """
 
     result: Diagnosis | None

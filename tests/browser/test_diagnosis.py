@@ -1,4 +1,4 @@
-"""Diagnosis tab: from the key to the causes, and the links to their moments."""
+"""Diagnosis tab: from the key to the causes, and the links to their steps."""
 
 from __future__ import annotations
 

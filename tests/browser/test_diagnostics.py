@@ -197,7 +197,7 @@ def test_every_kind_of_figure_is_drawn(open_page: Any) -> None:
     row(page, "Weight audit").click()
     page.until("() => document.querySelectorAll('.panels figure').length === 5")
     pixels = page.page.evaluate(
-        "() => [...document.querySelectorAll('.picture > canvas')]"
+        "() => [...document.querySelectorAll('.pixel-map > canvas')]"
         ".map((c) => [...c.getContext('2d').getImageData(0, 0, 2, 2).data])"
     )
     signed, unsigned = ([tuple(p[4 * i : 4 * i + 4]) for i in range(4)] for p in pixels)

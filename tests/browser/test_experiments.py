@@ -1,4 +1,4 @@
-"""Experiments tab: results are sorted, filtered and opened at their worst moment."""
+"""Experiments tab: results are sorted, filtered and opened at their worst step."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: A
     parts = ["#finding strong", "#finding span", "#heatmaps canvas", "#step-table", "#tracks .cursor", "#intro .chip"]
     assert page.page.evaluate(VISIBLE, parts) == []
     assert not page.violations()
-    page.page.locator("#finding .moment").click()
+    page.page.locator("#finding .go-to-step").click()
     page.until(f"() => beliefscope.state().step === {step + 1}")
 
     # The tour explains six parts and returns the focus.

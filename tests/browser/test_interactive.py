@@ -37,7 +37,7 @@ def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
     assert page.evaluate(image) != first
     page.keyboard.press("End")
     assert page.text_content("#place").startswith("step 99 of 99")
-    page.locator("#moments a").first.click()
+    page.locator("#events a").first.click()
     page.wait_for_function("() => location.hash !== '#step=99'")
     moment = int(page.evaluate("() => location.hash").removeprefix("#step="))
     assert page.input_value("#cursor") == str(moment)
@@ -90,7 +90,7 @@ def test_widget_shares_its_cursor(context: Any) -> None:
     assert page.text_content("#place") == "step 42 of 99, 4.20 s"
     page.locator(".run").press("ArrowRight")
     assert page.evaluate("() => model.get('step')") == 43
-    page.locator("#moments a").first.click()
+    page.locator("#events a").first.click()
     assert page.evaluate("() => model.get('step')") == widget.step
     assert page.evaluate("() => location.hash") == ""
     assert page.locator("#timeline canvas").count() >= 4

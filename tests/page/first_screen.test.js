@@ -158,7 +158,7 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.match(healthy.evidence, /^Largest error at step 10\. /);
 });
 
-test('a run without truth has no moment', () => {
+test('a run without truth has no step to go to', () => {
   const blind = { ...run(11), error: () => series(() => NaN), hasTruth: () => false };
   assert.equal(finding(blind, 0, null).step, null);
   assert.equal(finding(blind, 0, HEALTHY).step, null);

@@ -217,7 +217,7 @@ export interface components {
         };
         /**
          * DiagnosisEvidence
-         * @description A deviation that supports a cause. low, high: healthy range. episode, step: moment that shows it best.
+         * @description A deviation that supports a cause. low, high: healthy range. episode, step: where it shows best.
          */
         DiagnosisEvidence: {
             /** Text */

@@ -1,4 +1,4 @@
-/** The finding of the displayed run at the top of the page, with its moment and its diagnosis one click away. */
+/** The finding of the displayed run at the top of the page, with links to its step and its diagnosis. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
@@ -28,7 +28,7 @@ export class FindingBar {
   constructor(host, store) {
     this.#host = host;
     this.#store = store;
-    html('.moment', host).addEventListener('click', ({ timeStamp }) =>
+    html('.go-to-step', host).addEventListener('click', ({ timeStamp }) =>
       this.#retry ? this.#retry() : this.goToMoment(timeStamp),
     );
     html('.why', host).addEventListener('click', () => store.set({ tab: 'diagnosis' }));
@@ -102,8 +102,8 @@ export class FindingBar {
     html('span', line).textContent = evidence;
     line.title = `${headline} ${evidence}`;
     [this.#step, this.#retry] = [step, retry];
-    const moment = html('.moment', this.#host);
-    moment.classList.toggle('none', step === null && !retry);
-    moment.textContent = retry ? 'Try again' : `Go to step ${step ?? ''}`;
+    const button = html('.go-to-step', this.#host);
+    button.classList.toggle('none', step === null && !retry);
+    button.textContent = retry ? 'Try again' : `Go to step ${step ?? ''}`;
   }
 }

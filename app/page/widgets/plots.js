@@ -125,7 +125,7 @@ export function drawPixelMap({ title, values, unit, signed }) {
   });
   canvas.addEventListener('pointerleave', () => (output.textContent = ''));
   const caption = create('figcaption', {}, scale, output);
-  return create('figure', { className: 'picture' }, heading(title), canvas, caption);
+  return create('figure', { className: 'pixel-map' }, heading(title), canvas, caption);
 }
 
 /**
