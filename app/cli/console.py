@@ -60,7 +60,8 @@ class Result:
         if self.path is not None:
             size = self.path.stat().st_size
             document |= {"path": str(self.path), "bytes": size}
-            text = f"{self.path} ({size / 1e6:.1f} MB): {text}"
+            amount = f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+            text = f"{self.path} ({amount}): {text}"
         print(text if json_destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
 
 

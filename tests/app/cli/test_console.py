@@ -1,6 +1,8 @@
-"""Tests of the progress display where standard error is not a terminal."""
+"""Tests of the progress display where standard error is not a terminal, and of printed results."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
@@ -37,3 +39,11 @@ def test_redirected_progress_of_a_fast_command_is_one_line(capsys: pytest.Captur
         for i in range(101):
             advance(i / 100)
     assert capsys.readouterr().err == "Filtering: 100 %, 0 s\n"
+
+
+@pytest.mark.parametrize(("size", "text"), [(2_300, "2.3 kB"), (1_100_000, "1.1 MB")])
+def test_size_of_the_written_file(capsys: pytest.CaptureFixture[str], tmp_path: Path, size: int, text: str) -> None:
+    path = tmp_path / "run.trace"
+    path.write_bytes(bytes(size))
+    console.Result({}, "100 steps", path).print(None)
+    assert capsys.readouterr().out == f"{path} ({text}): 100 steps\n"
