@@ -37,7 +37,7 @@ def interval(result: Metrics, key: str) -> str:
 
 
 def main(names: list[str]) -> None:
-    print("| task | filter | image blackout | quantity | filter | from step 0 | dynamics | stay |")
+    print("| task | filter | image blackout | quantity | RMSE | from step 0 | dynamics | stay |")
     print("| --- | --- | ---: | --- | ---: | ---: | ---: | ---: |", flush=True)
     for text in names:
         path = Path(text) if text.endswith(".safetensors") else pretrained_path(*text.split("/"))

@@ -245,7 +245,7 @@ def _baseline_table(rows: Sequence[Row]) -> str:
     if not lines:
         return ""
     head = ["\nThe RMSE, the RMSE from step 0 and the baselines, all from the same starts.\n"]
-    head.append(f"| filter | image blackout | quantity | filter | from step 0 | {' | '.join(BASELINES)} |")
+    head.append(f"| filter | image blackout | quantity | RMSE | from step 0 | {' | '.join(BASELINES)} |")
     head.append("| --- | ---: | --- |" + " ---: |" * (2 + len(BASELINES)))
     return "\n".join(head + lines) + "\n"
 
