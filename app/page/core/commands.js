@@ -96,7 +96,7 @@ function tabCommands(page) {
   return [...document.querySelectorAll('[role=tab]')].map((tab) => ({
     group: 'Tab',
     title: tab.textContent ?? '',
-    keys: tab instanceof HTMLElement ? tab.title : '',
+    keys: tab.getAttribute('aria-keyshortcuts') ?? '',
     run: () => page.openTab(tab.id.replace('tab-', '')),
   }));
 }
