@@ -12,7 +12,9 @@ from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import modalities_of
-from beliefscope.inspect.diagnosis.case import (
+from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
+from beliefscope.inspect.diagnosis.deviations import (
     ALARM_RATE,
     Case,
     affected_episodes,
@@ -20,8 +22,6 @@ from beliefscope.inspect.diagnosis.case import (
     checked_alarm_rate,
     symptoms_of,
 )
-from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible

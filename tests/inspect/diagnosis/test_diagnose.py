@@ -22,7 +22,9 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.open_filter import open_filter
-from beliefscope.inspect.diagnosis.case import (
+from beliefscope.inspect.diagnosis.cause import SHOWN
+from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
+from beliefscope.inspect.diagnosis.deviations import (
     Case,
     affected_episodes,
     checked_alarm_rate,
@@ -31,8 +33,6 @@ from beliefscope.inspect.diagnosis.case import (
     focus,
     observe,
 )
-from beliefscope.inspect.diagnosis.cause import SHOWN
-from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis, preliminary
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
