@@ -19,11 +19,9 @@ from beliefscope.recordings.log_readers.table_folder import TABLES, table_files
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
-    **{".rrd": "rerun_file", ".zip": "zarr_buffer"},
+    **{".rrd": "rerun_file", ".zip": "zarr_buffer", ".h5": "hdf5_file", ".hdf5": "hdf5_file"},
 }
 """Suffix of a file -> its reader, a module of this package."""
-
-HDF5 = (".h5", ".hdf5")
 
 FOLDERS = {
     **{"metadata.yaml": "ros_bag", "meta/info.json": "lerobot"},
@@ -65,6 +63,7 @@ def _read(path: Path, mapping: ColumnMap | None) -> Preview:
         else:
             references = mapping.references if mapping else set()
             used = references | {base_name(reference) for reference in references}
+            used |= {mapping.time} if mapping else set()
             result = Preview(reader.read(path, used.__contains__))
     columns = {name: column for name, column in result.columns.items() if column.ndim and len(column)}
     if not columns:
@@ -85,9 +84,8 @@ def _reader(path: Path) -> str:
         )
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        other = "; HDF5 files are read by `beliefscope convert`" if suffix in HDF5 else ""
         raise BadInput(
-            f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder{other}"
+            f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder"
         )
     if not path.is_file():
         raise BadInput(f"{path} does not exist")

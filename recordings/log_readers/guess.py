@@ -6,6 +6,8 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from beliefscope.recordings.log_readers.arrays import Columns
 from beliefscope.recordings.log_readers.column_map import QUATERNION, base_name
 from beliefscope.recordings.log_readers.messages import Preview
@@ -59,13 +61,15 @@ def _table(columns: Columns) -> list[str]:
     covariance = [n for n in square if rows[n].dtype.kind == "f"][:1]
     if not mean and not ensemble:  # of an estimate: without it, they are sensors
         std, covariance = [], []
-    control = _named(r"^(action|control|u)$", [*columns])[:1]
-    used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control}
+    control = _named(r"(^|[/_.])(actions?|controls?)([/_.]|$)|^u$", [*columns])[:1]
+    flags = [n for n in _named(r"contact|touch", flat) if {*np.unique(columns[n]).tolist()} <= {0, 1}][:1]
+    used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control, *flags}
     used |= {n.partition("[")[0] for n in state.values()}
     sensors = _sensors([n for n in columns if n not in used and (n in flat or n in rows)], flat)
     lines = [f"time = {_text(time[0])}" if time else f"dt = {DT}  # s per row"]
     lines += [f"episode = {_text(episode[0])}"] if episode else []
     lines += [f"control = {_text(control[0])}"] if control else []
+    lines += [f"contact = {_text(flags[0])}"] if flags else []
     lines += _sections({component: _value(component, reference) for component, reference in state.items()}, sensors)
     if mean or ensemble:
         lines.append("[estimate]")
@@ -180,7 +184,9 @@ def _components(flat: Sequence[str], rows: Columns, arrays: Sequence[str]) -> di
     if not arrays or rows[arrays[0]].ndim != 2:
         return {}
     name = arrays[0]
-    return {f"s{i}" if rows[name].shape[1] > 3 else "xyz"[i]: f"{name}[{i}]" for i in range(rows[name].shape[1])}
+    size = rows[name].shape[1]
+    axes = ("x", "y", "yaw") if "pose" in name.lower() else ("x", "y", "z")
+    return {f"s{i}" if size > 3 else axes[i]: f"{name}[{i}]" for i in range(size)}
 
 
 def _key(name: str) -> str:

@@ -41,14 +41,20 @@ IRREGULAR = 0.01
 LARGE = 5.0
 """m, span of the positions above which they are displayed in m."""
 
+AUTO = {8: "val", 9: "test"}
+"""Last digit of an episode's number -> its split; the others are for training."""
+
 MARGIN = 1.2
 """Half width of maps relative to the largest half range of the map components."""
 
 
 def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "test") -> list[Episode]:
-    """The episodes of a log, in the order of their first rows. split: of all episodes, ``train``, ``val`` or ``test``.
+    """The episodes of a log, in the order of their first rows.
 
-    Raises BadInput for missing columns, columns of different lengths and times that do not ascend.
+    split: of all episodes, ``train``, ``val`` or ``test``; ``auto`` as for collected ones, ``AUTO``.
+
+    Raises BadInput for missing columns, columns of different lengths and times that do not ascend, and for ``auto``
+    with less than ten episodes.
     """
     states = _float32(_states(columns, mapping), "the state")
     sensors = {name: _sensor(columns, name, refs) for name, refs in mapping.sensors.items()}
@@ -66,6 +72,8 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "te
     if max(map(len, rows.values())) < 2:
         step = f" of {mapping.dt:g} s" if mapping.dt else ""
         raise BadInput(f"{source} has one step{step} per episode, expected two or more")
+    if split == "auto" and len(rows) < 10:
+        raise BadInput(f"{source} has {len(rows)} episodes, and --split auto needs 10: give train, val or test")
     dt, times = _times(columns, mapping, rows)
     declared = {name: covariate for name, (covariate, _) in covariates.items()}
     present = {name: _present(columns, mapping, name, array) for name, array in sensors.items()}
@@ -85,12 +93,12 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "te
             qpos=np.zeros((len(at), 0), np.float32),
             dt=dt,
             seed=-1,
-            split=split,
+            split=AUTO.get(index % 10, "train") if split == "auto" else split,
             provenance={"source": source, "episode": name},
             covariates={name: numbers[at] for name, numbers in values.items()},
             time=time,
         )
-        for (name, at), time in zip(rows.items(), times, strict=True)
+        for index, ((name, at), time) in enumerate(zip(rows.items(), times, strict=True))
     ]
 
 
@@ -316,6 +324,8 @@ def _times(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp
         if error := time_error(time):
             raise BadInput(f"time {name!r} of episode {episode} {error}, counted from its first row")
     dt = float(f"{np.median(np.concatenate([np.diff(time) for time in times])):.9g}")  # rounding errors
+    resolution = np.spacing(np.abs(column_times).max())  # of times since 1970: 0.2 us
+    dt = round(dt, int(-np.log10(resolution))) if resolution < IRREGULAR * dt else dt
     regular = [np.abs(time - dt * np.arange(len(time))).max() <= IRREGULAR * dt for time in times]
     return dt, [None if same else time for same, time in zip(regular, times, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Columns of a folder of tables, with one file per episode: NumPy archives, CSV or Parquet."""
+"""Columns of a folder of tables, with one file per episode: NumPy archives, HDF5, CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.log_readers import tables
+from beliefscope.datasets.readers.hdf5_guard import probe
+from beliefscope.recordings.log_readers import hdf5_file, tables
 from beliefscope.recordings.log_readers.arrays import Wanted, check_downloaded, check_size
 
-TABLES = (".npz", ".csv", ".parquet")
+TABLES = (".npz", ".csv", ".parquet", *hdf5_file.SUFFIXES)
 """Suffixes of the files."""
 
 FILE = "<file>"
@@ -38,6 +39,7 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     files = table_files(path)
     if len(suffixes := sorted({file.suffix.lower() for file in files})) > 1:
         raise BadInput(f"folder {path.name} has files {' and '.join(suffixes)}, expected one format")
+    probe(file for file in files if file.suffix.lower() in hdf5_file.SUFFIXES)
     parts = []
     for file in files:
         check_downloaded(file)
@@ -55,7 +57,8 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
 def _table(file: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     """Columns of a file that have rows. Raises BadInput, with its name, for a damaged file and unequal lengths."""
     try:
-        columns = {name: values for name, values in tables.read(file, wanted).items() if values.ndim and len(values)}
+        reader = hdf5_file if file.suffix.lower() in hdf5_file.SUFFIXES else tables
+        columns = {name: values for name, values in reader.read(file, wanted).items() if values.ndim and len(values)}
     except BadInput:
         raise
     except Exception as error:

@@ -27,7 +27,11 @@ def import_(
     guess: bool = opt.flag("Print a first map of a log instead of importing it.", "--guess"),
     episode: int = opt.option("I", "Index of the episode of a log that becomes a trace.", 0, "--episode"),
     split: str | None = opt.option(
-        "NAME", "train, val or test: split of all episodes of a log. Default: test.", None, "--split"
+        "NAME",
+        "train, val or test: split of all episodes of a log; auto: of every ten, one for validation and one for "
+        "tests. Default: test.",
+        None,
+        "--split",
     ),
     task: str = opt.TASK_OF_FILES,
 ) -> console.Result:
@@ -39,18 +43,18 @@ def import_(
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
     run that the page displays. Filters are trained and fine-tuned on the episodes of --split train and evaluated on
-    those of val and test.
+    those of val and test; --split auto makes a data set for all of it.
 
-    Formats of logs: NumPy (.npz), CSV and Parquet, also folders of them with one file per episode; MCAP, ROS 2 bags
-    (folder or .db3), Zarr replay buffers (folder or .zip), LeRobot data sets (folder, version 3), and Rerun recordings
-    of other programs (.rrd with --map or --guess).
+    Formats of logs: NumPy (.npz), HDF5 (.h5, .hdf5), CSV and Parquet, also folders of them with one file per episode;
+    MCAP, ROS 2 bags (folder or .db3), Zarr replay buffers (folder or .zip), LeRobot data sets (folder, version 3), and
+    Rerun recordings of other programs (.rrd with --map or --guess).
 
     \b
     Examples:
       beliefscope import run.rrd -o run.trace
       beliefscope import log.csv --guess
       beliefscope import log.csv --map map.toml -o log.h5
-      beliefscope import log.csv --map map.toml --split train -o train.h5
+      beliefscope import logs --map map.toml --split auto -o logs.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
       beliefscope import log.csv --map map.toml -o run.live
       beliefscope import drive.mcap --map map.toml -o drive.h5
@@ -75,7 +79,7 @@ def import_(
         return _written(open_recording(source, task), output)
     if map is None:
         raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
-    check_name("split", split or "test", SPLITS)
+    check_name("split", split or "test", (*SPLITS, "auto"))
     mapping = read_map(map)
     columns = read_columns(source, mapping)
     episodes = read_log(columns, mapping, source.name, split or "test")
@@ -91,6 +95,9 @@ def import_(
     ranges = _ranges(episodes)
     document = {"task": mapping.task, "episodes": len(episodes), "steps": steps} | ranges
     count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
+    splits = {name: sum(episode.split == name for episode in episodes) for name in SPLITS}
+    document["splits"] = splits
+    count += " (" + ", ".join(f"{number} {name}" for name, number in splits.items() if number) + ")"
     return console.Result(document, f"{count} of {mapping.task}, {steps} steps, {_values(ranges)}", output)
 
 

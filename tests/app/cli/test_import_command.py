@@ -79,7 +79,7 @@ def test_a_filter_is_trained_on_an_imported_log(run: Run, log: Path) -> None:
 def test_another_split_is_refused(run: Run, log: Path) -> None:
     output = log.with_name("data.h5")
     code, _, error = run("import --split validation", log, "--map", log.with_name("map.toml"), "-o", output)
-    assert (code, error) == (2, "error: split 'validation' does not exist. Available: train, val, test.\n")
+    assert (code, error) == (2, "error: split 'validation' does not exist. Available: train, val, test, auto.\n")
     assert not output.exists()
 
 

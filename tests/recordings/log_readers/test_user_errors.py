@@ -85,7 +85,7 @@ def test_spaces_around_the_names_of_columns_are_ignored(run: Run, tmp_path: Path
     (tmp_path / "map.toml").write_text(MAP)
     code, out, _ = run("import", tmp_path / "log.csv", "--map", tmp_path / "map.toml", "-o", tmp_path / "out.h5")
     assert code == 0
-    assert "1 episode of car, 30 steps, 0.1 s each; x 0 to 0.9996 m; yaw 0 to 2.9 rad" in out
+    assert "1 episode (1 test) of car, 30 steps, 0.1 s each; x 0 to 0.9996 m; yaw 0 to 2.9 rad" in out
 
 
 @pytest.mark.parametrize(
