@@ -6,12 +6,14 @@ Measurement models are compared with the true state of their step; the dynamics 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
@@ -59,13 +61,13 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
     """
     has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
     if external:
-        values = reported_particle_statistics(trace)
+        values = reported_particle_statistics(trace) | weight_statistics(trace)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if has_truth:
         values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
-    if has_truth and not external:
-        values |= dynamics_statistics(trace.episode, checkpoint)
+    if has_truth:
+        values |= reported_dynamics_statistics(trace) if external else dynamics_statistics(trace.episode, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
@@ -204,6 +206,46 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     )
     residual = measures.wrapped(filter_.task, (predicted - after).double().numpy() * std)
     change = measures.wrapped(filter_.task, (after - before).double().numpy() * std)
+    nis = (np.square(residual) / (used.double().numpy() * std) ** 2).mean(0)
+    values = _of_changes(filter_.task, residual, change, {"dynamics nis": nis, "process noise": noise}, std)
+    if commands_hand(episode.task):
+        return values
+    signs = 1.0 - 2.0 * torch.eye(controls.shape[1])[:, None]
+    controls = si.standardise("control", signs * torch.from_numpy(episode.controls[1:]))
+    opposite = filter_.dynamics(before, filter_.dynamics.control_part(controls))
+    other = measures.wrapped(filter_.task, (opposite - after).double().numpy() * std)
+    moved = np.abs(change).sum(0) > MIN_PATH * std
+    size, sizes = (np.square((r / std)[..., moved]).sum((-2, -1)) for r in (residual, other))
+    for i, ratio in enumerate(size / np.maximum(sizes, 1e-12)):
+        values[f"opposed/{axis_name('control', i, len(signs))}/all"] = 0.5 * math.log(max(ratio, 1.0))
+    return values
+
+
+def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
+    """Those of ``dynamics_statistics`` from the predictions of an external filter, which start at its estimates.
+
+    The process noise is what a prediction adds to the variance of the estimate. Only of filters whose models share one
+    prediction.
+    """
+    mean, covariance = trace.predicted_mean, trace.predicted_covariance
+    states, task = trace.episode.states.astype(np.float64), trace.task
+    keep = measures.counted(trace)[1:]
+    if mean is None or task.rotations or keep.sum() < MIN_STEPS or not np.allclose(mean, mean[:, :1], rtol=1e-3):
+        return {}
+    predicted = task.difference(mean[1:, 0].astype(np.float64), trace.estimate_mean[:-1].astype(np.float64))[keep]
+    change = task.difference(states[1:], states[:-1])[keep]
+    residual = measures.wrapped(task, predicted - change)
+    more: dict[str, Array] = {}
+    if covariance is not None and trace.has_covariance:
+        added = covariance[1:, 0].astype(np.float64) - trace.estimate_covariance[:-1].astype(np.float64)
+        variance = np.median(np.diagonal(added, axis1=-2, axis2=-1)[keep], axis=0)
+        variance = np.where(variance > 0.0, variance, np.nan)
+        more = {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
+    return _of_changes(task, residual, change, more, states.std(0))
+
+
+def _of_changes(task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array) -> dict[str, float]:
+    """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,)."""
     values: dict[str, float] = {}
     moved = np.abs(change).sum(0) > MIN_PATH * std
     centred, around = residual - residual.mean(0), change - change.mean(0)
@@ -211,26 +253,15 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     columns = {
         "dynamics bias": residual.mean(0) - excess * change.mean(0),
         "dynamics error": np.sqrt(np.square(residual).mean(0)),
-        "dynamics nis": (np.square(residual) / (used.double().numpy() * std) ** 2).mean(0),
         "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
         "dynamics spread": (centred - excess * around).std(0),
-        "process noise": noise,
     }
-    for kind, column in columns.items():
-        for component, value in zip(filter_.task.components, column, strict=True):
+    for kind, column in {**columns, **more}.items():
+        for component, value in zip(task.components, column, strict=True):
             values[f"{kind}/{component.name}/all"] = float(value)
     if moved.any():
         scaled = (change + residual)[:, moved] / std[moved], change[:, moved] / std[moved]
         values["lag/dynamics/all"] = lag(scaled[1], scaled[0])[0]
-    if moved.any() and not commands_hand(episode.task):
-        signs = 1.0 - 2.0 * torch.eye(controls.shape[1])[:, None]
-        controls = si.standardise("control", signs * torch.from_numpy(episode.controls[1:]))
-        opposite = filter_.dynamics(before, filter_.dynamics.control_part(controls))
-        other = measures.wrapped(filter_.task, (opposite - after).double().numpy() * std)
-        size, sizes = (np.square((r / std)[..., moved]).sum((-2, -1)) for r in (residual, other))
-        ratio = size / np.maximum(sizes, 1e-12)
-        for i, value in enumerate(np.log(np.maximum(ratio, 1.0)) / 2.0):
-            values[f"opposed/{axis_name('control', i, len(ratio))}/all"] = float(value)
     return values
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
+from beliefscope.inspect.diagnosis.control_checks import control_label_statistics
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
     axis_index,
@@ -42,7 +43,7 @@ def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
     values |= vector_statistics(episode) | law_statistics(episode)
-    values |= contact_distance_statistics(episode, reference)
+    values |= contact_distance_statistics(episode, reference) | control_label_statistics(episode)
     values |= window_statistics(episode, reference)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1

@@ -193,7 +193,7 @@ def shift_dynamics(inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
 
 def scale_dynamics(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Predicted changes with the healthy slope; None for a slope below ``MIN_SLOPE``."""
-    slopes = [d.value / d.healthy for name, d in deviations.items() if name.startswith("dynamics slope/")]
+    slopes = [d.value / d.healthy for name, d in deviations.items() if name.startswith("dynamics slope/") and d.healthy]
     if not slopes or np.mean(slopes) < MIN_SLOPE:
         return None
     factor = 1.0 / float(np.mean(slopes))

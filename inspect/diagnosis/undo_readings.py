@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from fnmatch import fnmatch
 from functools import partial
 from itertools import permutations
 from typing import Any
@@ -19,7 +20,7 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     CHANGE,
     FORCE,
     TORQUE,
-    axis_index,
+    axis_name,
     commands_hand,
     free_motion,
     in_contact,
@@ -86,7 +87,7 @@ def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
         steps_of = {name: steps for name, steps in behind.items() if steps > 0}
     else:
         names = [f"lag/{key if key in ('control', 'labels') else 'image'}/all", f"lag/labels {key}/all"]
-        names += ["lag/dynamics/all"] if key == "control" else []
+        names += ["control lag/control/all", "lag/dynamics/all"] if key == "control" else []
         lag = next((deviations[name] for name in names if name in deviations), None)
         steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
         if not steps:
@@ -256,29 +257,30 @@ def shift_labels(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
 
 
 def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Controls whose change of the hand position has the healthy scale; of others, with the healthy sizes."""
-    factors = np.ones(inputs.checkpoint.task.control_size)
+    """Controls with the healthy scale of the change of the hand or, of others, the healthy scale of each channel."""
+    size = inputs.checkpoint.task.control_size
+    factors = np.array([_scale(deviations, channel, size) for channel in range(size)])
     if commands_hand(inputs.checkpoint.task):
         factors[CHANGE] = _ratio(deviations, "scale/control/all") or 1.0
-    for name, deviation in deviations.items():
-        if name.startswith("size/control") and deviation.alarm:
-            factors[_channel(name)] = _ratio(deviations, name) or 1.0
     return None if (factors == 1.0).all() else _with_readings(inputs, "control", lambda values, _: values / factors)
+
+
+def _scale(deviations: Deviations, channel: int, size: int) -> float:
+    """Healthy over actual gain on the component that a channel changes most; without one, actual over healthy size."""
+    gains = [d for name, d in deviations.items() if fnmatch(name, f"control gain/control * {channel}/all")]
+    gain = max(gains, key=lambda d: abs(d.healthy) / max(d.high - d.low, 1e-12), default=None)
+    if gain is not None:
+        return gain.healthy / gain.value if gain.alarm and gain.value else 1.0
+    name = f"size/{axis_name('control', channel, size)}/all"
+    return (_ratio(deviations, name) or 1.0) if name in deviations and deviations[name].alarm else 1.0
 
 
 def negate_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Controls with the opposite sign of the channels that fit the dynamics better with it."""
-    signs = np.ones(inputs.checkpoint.task.control_size)
-    for name, deviation in deviations.items():
-        if name.startswith("opposed/control") and deviation.alarm:
-            signs[_channel(name)] = -1.0
+    size = inputs.checkpoint.task.control_size
+    opposed = (deviations.get(f"opposed/{axis_name('control', channel, size)}/all") for channel in range(size))
+    signs = np.array([-1.0 if deviation is not None and deviation.alarm else 1.0 for deviation in opposed])
     return None if (signs == 1.0).all() else _with_readings(inputs, "control", lambda values, _: values * signs)
-
-
-def _channel(statistic: str) -> int:
-    """Index of the channel of the controls that a statistic is about."""
-    axis = statistic.split("/")[1].partition(" ")[2]
-    return axis_index(axis) if axis else 0
 
 
 def _excess(deviations: Deviations, name: str) -> float | None:

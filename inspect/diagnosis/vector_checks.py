@@ -125,6 +125,24 @@ def size_statistics(episode: Episode) -> dict[str, float]:
     return {f"size/{FORCE}/contact": size, f"roughness/{FORCE}/contact": noise / size if size > 0.0 else np.nan}
 
 
+def own_size_statistics(episode: Episode, key: str) -> dict[str, float]:
+    """Standard deviation of each axis of a sensor in contact, and its roughness, as ``size_statistics`` of the force.
+
+    Without ``contact_flag``, in the whole episode.
+    """
+    at = in_contact(episode) & episode.present(key)
+    if at.sum() < MIN_STEPS:
+        return {}
+    readings = episode.observations[key].astype(np.float64)
+    size, noise = readings[at].std(0), noise_level(readings, at)
+    values: dict[str, float] = {}
+    for i in range(readings.shape[1]):
+        axis = axis_name(key, i, readings.shape[1])
+        values[f"size/{axis}/contact"] = float(size[i])
+        values[f"roughness/{axis}/contact"] = float(noise[i] / size[i]) if size[i] > 0.0 else np.nan
+    return values
+
+
 def _force(episode: Episode) -> Array | None:
     """(T, 3) measured force; None without it, or if less than ``MIN_STEPS`` steps are in contact."""
     force = episode.observations.get(FORCE)
@@ -312,6 +330,7 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
     values: dict[str, float] = {}
     for key in _vector_keys(episode):
         values |= axis_statistics(episode, key)
+        values |= own_size_statistics(episode, key) if key not in (FORCE, TORQUE) else {}
     if HAND in episode.observations:
         hand, present = episode.observations[HAND], episode.present(HAND)
         noise = noise_level(hand.astype(np.float64), present)

@@ -38,6 +38,12 @@ CRITICAL = 0.05
 SMALLEST_T = 2.0
 """Lower limit of this quantile."""
 
+OF_AXES = frozenset({"level", "drift", "change", "noise"})
+"""Kinds of statistics of an axis of a sensor, in the unit of its readings (per s for drifts)."""
+
+SMALLEST_SHARE = 0.02
+"""Smallest standard deviation of these statistics relative to the size of the readings, where that is known."""
+
 SMALLEST_REST = 0.005
 """Smallest share of remaining readings that is distinguished from none."""
 
@@ -233,6 +239,9 @@ def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np
     settings = [KINDS.get(kind, ("", False, 1e-9)) for kind in kinds]
     logarithmic, lost = np.array([s[1] for s in settings]), np.array([kind in LOST for kind in kinds])
     floor = np.array([s[2] * (LEVER if "/torque " in n else 1.0) for n, s in zip(names, settings, strict=True)])
+    for i, (kind, subject, _) in enumerate(name.split("/") for name in names):
+        if kind in OF_AXES and (size := f"size/{subject}/contact") in names:
+            floor[i] = min(floor[i], SMALLEST_SHARE * np.nanmedian(values[:, names.index(size)]))
     rising = np.array([k in RISING or n.endswith("/range") for n, k in zip(names, kinds, strict=True)])
     scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
     return np.where(lost, -np.log(np.maximum(1.0 - values, SMALLEST_REST)), scaled), floor, rising

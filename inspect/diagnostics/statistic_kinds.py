@@ -48,6 +48,8 @@ KINDS = {
     "shift": ("shift", False, 0.2),
     "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
     "contact lag": ("delay{of} in steps behind the labelled contact", False, 0.5),
+    "control lag": ("delay{of} in steps behind the true changes", False, 0.5),
+    "control gain": ("true change per unit{of}", False, 1e-9),
     "hand offset": ("distance of the hand in the image from its measured position{axis}", False, 0.1),
     "hand match": ("similarity of the hand in the image to healthy images{axis}", True, 0.05),
     "object offset": ("distance of the object in the image from its labelled position{axis}", False, 0.1),

@@ -50,7 +50,8 @@ def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkp
 
     Args:
         source: ``TASK/NAME`` of a pretrained filter, such as ``door/crossmodal-pf``; the path of a ``.safetensors``
-            checkpoint; a build function, ``path/to/file.py:build`` or ``package.module:build``; or your own filter: a
+            checkpoint; a build function, ``path/to/file.py:build`` or ``package.module:build``, each also with
+            ``@weights.safetensors``; or your own filter: a
             ``torch.nn.Module``, any other object, a function, or an ``Adapter`` of one (docs/own_filter.md).
         task: of a filter of your own: its definition, name or ``path/to/file.py:NAME``.
         name: of a filter of your own, for display; default: its class or function.
@@ -59,7 +60,9 @@ def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkp
     """
     if isinstance(source, Checkpoint):
         return source
-    if isinstance(source, Path) or (isinstance(source, str) and source.endswith(".safetensors")):
+    if isinstance(source, Path) or (
+        isinstance(source, str) and source.endswith(".safetensors") and not is_code(source)
+    ):
         given = (load_task(task),) if isinstance(task, Task) or ":" in task else ()
         return load_checkpoint(Path(source), given)
     if not isinstance(source, str):

@@ -25,7 +25,8 @@ CAUSES = (
             Symptom("lag/labels*|lag/dynamics/*", 1, 2.0),
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
-        f"{OBJECT}|object match/*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*",
+        f"{OBJECT}|object match/*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*"
+        "|control lag/*|control gain/*",
         "Synchronise the clock of the motion capture with the sensors.",
         "advance labels",
     ),

@@ -6,10 +6,11 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER, LABELS
 
 
-def causes_of(modality: str, title: str, check: str = "") -> tuple[Cause, ...]:
+def causes_of(modality: str, title: str, check: str = "", belief: str = FILTER) -> tuple[Cause, ...]:
     """Causes of one modality's measurement model.
 
     title: start of the headlines. check: what to do before the next action, where faults of the sensors look alike.
+    belief: statistics downstream of the model.
     """
     name = f"model.{modality}"
     module = f"*{modality}*"
@@ -21,7 +22,7 @@ def causes_of(modality: str, title: str, check: str = "") -> tuple[Cause, ...]:
             f"{name}.bias",
             f"{title} biased",
             (Symptom(f"module bias/{module}", 0), Symptom("module bias/*", 0, 0.3, "alone")),
-            "|".join(f"module {kind}/{module}" for kind in ("error", "nis")) + f"|{LABELS}|{FILTER}",
+            "|".join(f"module {kind}/{module}" for kind in ("error", "nis")) + f"|{LABELS}|{belief}",
             retrain,
             f"shift {modality}",
             lowers=f"module spread/{module}|module scatter/{module}",
@@ -30,7 +31,7 @@ def causes_of(modality: str, title: str, check: str = "") -> tuple[Cause, ...]:
             f"{name}.overconfident",
             f"{title} overconfident",
             (Symptom(f"module power/{module}", 1),),
-            f"module std/{module}|module nis/{module}|{LABELS}|{FILTER}",
+            f"module std/{module}|module nis/{module}|{LABELS}|{belief}",
             calibrate,
             f"rescale {modality}",
         ),
@@ -38,7 +39,7 @@ def causes_of(modality: str, title: str, check: str = "") -> tuple[Cause, ...]:
             f"{name}.underconfident",
             f"{title} underconfident",
             (Symptom(f"module power/{module}", -1),),
-            f"module std/{module}|module nis/{module}|{LABELS}|{FILTER}",
+            f"module std/{module}|module nis/{module}|{LABELS}|{belief}",
             calibrate,
             f"rescale {modality}",
         ),
@@ -49,7 +50,7 @@ def causes_of(modality: str, title: str, check: str = "") -> tuple[Cause, ...]:
                 Symptom(f"module error/{module}|module spread/{module}|module scatter/{module}", 0),
                 Symptom(f"module power/{module}", 0, 0.5),
             ),
-            f"module */{module}|{LABELS}|{FILTER}",
+            f"module */{module}|{LABELS}|{belief}",
             retrain,
             f"restore {modality}",
         ),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes import model
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes import data, fusion, image, model
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, commands_hand, has_labels_only
 from beliefscope.inspect.statistics.reference_images import HAND
@@ -16,9 +18,11 @@ KNOWN = ("image", "force", "torque", "effector_position", "contact")
 MODALITIES = ("image", "haptics")
 """Modalities whose measurement models have causes in the catalog."""
 
+BIASED = ("level", "drift", "saturation", "contact lag")
+"""Kinds of statistics of vector sensors that a bias changes."""
+
 VECTOR = (
     ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
-    ("noise", "noise", "noisy", "Check the cable and the filter of the sensor."),
     ("saturation", "saturation", "saturated", "Extend the measuring range of the sensor."),
 )
 """Kinds of the statistic, mechanism, word of the title, next action."""
@@ -30,34 +34,15 @@ IMAGE = (
 )
 """As ``VECTOR``, of images."""
 
+VIEW = {
+    "blur": "Images of {} blurred",
+    "exposure": "Exposure of {} changed",
+    "occlusion": "Camera {} occluded",
+}
+"""Mechanisms of causes in the image that other cameras have as well -> title."""
 
-CONTROLS = (
-    Cause(
-        "control.scale",
-        "Controls scaled",
-        (Symptom("size/control*", 0), Symptom("dynamics slope/*|dynamics spread/*", 0, optional=True)),
-        f"{DYNAMICS}|{LABELS}",
-        "Check the units of the controls.",
-        "scale control",
-    ),
-    Cause(
-        "control.delay",
-        "Controls delayed",
-        (Symptom("lag/dynamics/*", -1),),
-        f"{DYNAMICS}|{LABELS}",
-        "Synchronise the controls with the sensors.",
-        "advance control",
-    ),
-    Cause(
-        "control.sign",
-        "Controls with the opposite sign",
-        (Symptom("opposed/control*"),),
-        f"lag/dynamics/*|{DYNAMICS}|{LABELS}",
-        "Check the sign convention of the controls.",
-        "negate control",
-    ),
-)
-"""Causes in controls that do not command a measured hand, as the dynamics model of the filter shows them."""
+EDGES = "sharpness/{}/*"
+"""Statistics of an image that the edges of an object in front of the camera change."""
 
 
 def own_causes(task: Task) -> tuple[Cause, ...]:
@@ -70,8 +55,59 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
             symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
-    controls = CONTROLS if task.control_size and not commands_hand(task) else ()
-    return (*result, *_moved_cameras(task), *_delays(task), *_delayed_modalities(task), *_models(task), *controls)
+        result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
+        result += _changed_views(key, modality) if key in task.images else []
+    parts = (_moved_cameras, _delays, _delayed_modalities, _models, _labels, _controls, _weights)
+    return (*result, *(cause for part in parts for cause in part(task)))
+
+
+def _changed_readings(key: str, modality: str) -> list[Cause]:
+    """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio."""
+
+    def of(*kinds: str) -> str:
+        return "|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds)
+
+    scaled = of(*BIASED, "change", "size", "noise")
+    noise = (Symptom(of("noise")), Symptom(of("roughness"), optional=True))
+    gain = (Symptom(of("size"), 0), Symptom(of("noise"), 0))
+    rough = f"{scaled}|{of('roughness', 'stuck')}"
+    entries = (
+        ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor."),
+        ("bias", "biased", (Symptom(of("level"), 0),), of(*BIASED), "Tare the sensor."),
+        ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor."),
+    )
+    return [
+        Cause(
+            f"{key}.{mechanism}",
+            f"Sensor {display_name(key)} {words}",
+            symptoms,
+            f"{changed}|{_downstream(modality)}",
+            action,
+            f"drop {modality}",
+        )
+        for mechanism, words, symptoms, changed, action in entries
+    ]
+
+
+def _changed_views(key: str, modality: str) -> list[Cause]:
+    """Causes of ``VIEW`` with the names of the sensor and its modality."""
+
+    def renamed(patterns: str) -> str:
+        return patterns.replace("/image", f"/{key}").replace("*image*", f"*{modality}*")
+
+    return [
+        replace(
+            cause,
+            name=f"{key}.{mechanism}",
+            title=VIEW[mechanism].format(display_name(key)),
+            symptoms=tuple(replace(symptom, statistics=renamed(symptom.statistics)) for symptom in cause.symptoms),
+            consequences=f"{renamed(cause.consequences)}|{EDGES.format(key) if mechanism == 'occlusion' else ''}",
+            lowers=renamed(cause.lowers),
+            undo=f"drop {modality}",
+        )
+        for cause in image.CAUSES
+        if (mechanism := cause.name.partition(".")[2]) in VIEW
+    ]
 
 
 def _downstream(modality: str) -> str:
@@ -100,9 +136,14 @@ def _moved_cameras(task: Task) -> tuple[Cause, ...]:
 
 
 def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
-    """Modalities behind the labels, of tasks without a measured hand and labelled contact, which show it better."""
+    """Modalities behind the labels, of tasks without a measured hand, which shows it better.
+
+    Where contact is labelled, it shows the delay of vector sensors.
+    """
     result = []
-    for modality in task.modalities if HAND not in task.observations and not has_labels_only(task) else ():
+    modalities = task.modalities.items() if HAND not in task.observations else ()
+    by_contact = {key for key in task.observations if key not in task.images} if has_labels_only(task) else set()
+    for modality in (modality for modality, keys in modalities if not by_contact & {*keys}):
         changed = f"{OBJECT}|object match/*|{_downstream(modality)}"
         title = "Image delayed" if modality == "image" else f"Modality {display_name(modality)} delayed"
         symptoms, action = (Symptom(f"lag/labels {modality}/*", -1),), "Synchronise the clocks of the sensors."
@@ -111,10 +152,91 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
 
 
 def _models(task: Task) -> tuple[Cause, ...]:
-    """Causes in measurement models of modalities that the catalog does not have."""
+    """Causes in measurement models of modalities that the catalog does not have, or whose sensors it does not have."""
     check = "Check the calibration of its sensors, whose offsets and scales have the same symptoms. "
-    names = [name for name in task.modalities if name not in MODALITIES]
-    return tuple(c for name in names for c in model.causes_of(name, f"Sensors or model of {display_name(name)}", check))
+    names = [name for name, keys in task.modalities.items() if name not in MODALITIES or not {*keys} & {*KNOWN}]
+    title = "Sensors or model of {}"  # their fusion weights may depend on their models
+    return tuple(c for n in names for c in model.causes_of(n, title.format(display_name(n)), check, WEIGHTS))
+
+
+def _labels(task: Task) -> tuple[Cause, ...]:
+    """Delayed labels of tasks without a measured hand: behind all modalities and, if these cause changes, the controls.
+
+    A faulty sensor can make a single modality appear early.
+    """
+    if HAND in task.observations:
+        return ()
+    (delay,) = (cause for cause in data.CAUSES if cause.name == "labels.delay")
+    (_, dynamics) = delay.symptoms
+    lag = Symptom("lag/labels/*|lag/dynamics/*", 1, 2.0)
+    controls = Symptom("control lag/*", -1, optional=True)
+    return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls)),)
+
+
+def _controls(task: Task) -> tuple[Cause, ...]:
+    """Causes in controls that do not command a measured hand, and in their use.
+
+    Two things show such controls: the changes of the labels, where a regression on the controls explains them, and the
+    dynamics model of a filter. Inverted dynamics are also frozen ones, by their slope; the prior prefers them.
+    """
+    if not task.control_size or commands_hand(task):
+        return ()
+    changed = f"control gain/*|lag/dynamics/*|{DYNAMICS}|{LABELS}"
+    used = Symptom("dynamics slope/*|dynamics spread/*|control gain/*", 0, optional=True)
+    return (
+        Cause(
+            "control.delay",
+            "Controls delayed",
+            (Symptom("control lag/*", otherwise=(Symptom("lag/dynamics/*", -1),)),),
+            changed,
+            "Synchronise the controls with the sensors.",
+            "advance control",
+        ),
+        Cause(
+            "control.scale",
+            "Controls with a wrong scale or order",
+            (Symptom("control gain/*", 0, otherwise=(Symptom("size/control*", 0),)), used),
+            f"control lag/*|size/control*|{changed}",
+            "Check the units and the order of the controls.",
+            "scale control",
+        ),
+        Cause(
+            "control.sign",
+            "Controls with the opposite sign",
+            (Symptom("opposed/control*"), Symptom("control gain/*", 0, optional=True)),
+            f"control lag/*|{changed}",
+            "Check the sign convention of the controls.",
+            "negate control",
+        ),
+        Cause(
+            "dynamics.inverted",
+            "Dynamics inverted: predicted changes have the wrong sign",
+            (Symptom("dynamics slope/*", target="mirrored"),),
+            f"opposed/control*|lag/dynamics/*|{DYNAMICS}",
+            "Check the sign of the controls in the dynamics model.",
+            prior=0.2,
+        ),
+    )
+
+
+def _weights(task: Task) -> tuple[Cause, ...]:
+    """Fusion weights that ignore one of two modalities of other names than those of the catalog."""
+    if len(task.modalities) != 2 or set(task.modalities) == set(MODALITIES):
+        return ()
+    return tuple(
+        Cause(
+            f"weights.ignores_{name}",
+            f"Fusion weights ignore {display_name(name)}",
+            (
+                Symptom(f"beta logit/{name}*", -1, otherwise=(Symptom(f"beta logit/{other}*", 1),)),
+                Symptom("beta logit/*", target="shifted"),
+            ),
+            f"beta spread/*|{FILTER}",
+            fusion.RETRAIN,
+            "healthy beta",
+        )
+        for name, other in zip(task.modalities, reversed([*task.modalities]), strict=True)
+    )
 
 
 def _delays(task: Task) -> tuple[Cause, ...]:

@@ -7,8 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset
+from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.filters.external.adapter import Adapter
+from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.label_checks import label_statistics
 from beliefscope.inspect.trace import Trace, trace
 
@@ -70,3 +74,25 @@ def test_offsets_are_shared_only_if_all_modalities_have_them(exact: Trace) -> No
     measured[:, 0] -= offset
     values = label_statistics(replace(exact, observation_mean=measured))
     assert values["offset/labels hinge_x/all"] == 0.0
+
+
+def test_small_tasks_and_components_that_are_not_measured_do_not_hide_a_delay() -> None:
+    """A position that moves by 5 mm, with an angle that a camera does not see."""
+    parts = (Component("x", "m"), Component("y", "m"), Component("yaw", "rad"))
+    task = Task("peg", parts, {"camera": (8, 8)}, {"camera": ("camera",)}, 0, 0.05, map_half_width=0.01, warmup=0)
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(np.repeat(rng.normal(0.0, [5e-4, 5e-4, 5e-3], (20, 3)), 4, axis=0), axis=0)
+    states = np.clip(walk - walk.mean(0), [-4e-3, -4e-3, -1.0], [4e-3, 4e-3, 1.0]).astype(np.float32)
+    images = np.zeros((80, 8, 8), np.uint8)
+    measured = delayed(states, 4)
+    measured[:, 2] = rng.normal(0.0, 0.3, 80)
+    covariance = np.broadcast_to(np.eye(3), (80, 1, 3, 3))
+    outputs = {"estimate_mean": measured, "modality_mean": measured[:, None], "modality_covariance": covariance}
+
+    def camera(*, observations: object, controls: object) -> dict[str, np.ndarray]:
+        return outputs
+
+    episode = Episode(task, states, observations={"camera": images})
+    adapter = Adapter(camera, batched=False, modalities=("camera",), initial_std=(1.0, 1.0, 1.0))
+    values = label_statistics(trace(as_external(adapter, "camera", task), episode))
+    assert values["lag/labels camera/all"] == pytest.approx(-4.0, abs=1.0)

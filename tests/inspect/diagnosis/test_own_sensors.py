@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from beliefscope.datasets.covariate import CONTACT
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
+from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
-from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.undo_readings import scale_control
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 SENSORS = {"image": (8, 8), "gps": (2,)}
 TASK = Task("cart", (Component("x", "m"), Component("y", "m")), SENSORS, {k: (k,) for k in SENSORS}, 0, 0.1)
@@ -72,3 +82,98 @@ def test_a_biased_model_of_an_own_modality_is_not_data_that_differ_as_a_whole() 
     result = ranked(TASK, bias("gps", 0.1), bias("image", 0.0), error, power)
     assert result["model.gps.bias"] > 0.8
     assert max(result["data.shift"], result["labels.offset"]) < 0.1
+
+
+WRENCH = Task(
+    name="peg",
+    components=(Component("x", "m"), Component("y", "m"), Component("yaw", "rad")),
+    observations={"camera": (8, 8), "wrench": (2,)},
+    modalities={"camera": ("camera",), "haptics": ("wrench",)},
+    control_size=2,
+    dt=0.05,
+    map_half_width=0.01,
+    covariates={"contact": CONTACT},
+)
+
+
+def slide(seed: int) -> Episode:
+    """A peg slides by 5 mm, as commanded; the wrench depends on the state in contact and is small otherwise."""
+    rng = np.random.default_rng(seed)
+    controls = np.repeat(rng.normal(0.0, 5e-4, (15, 2)), 4, axis=0)
+    states = np.cumsum(np.hstack([-controls, np.zeros((60, 1))]) + rng.normal(0.0, [5e-5, 5e-5, 2e-3], (60, 3)), axis=0)
+    contact = np.arange(60) >= 20
+    wrench = np.where(contact[:, None], [2.0, 0.02] * (1.0 + 300.0 * states[:, :2]), 0.0)
+    wrench = wrench + rng.normal(0.0, 1.0, (60, 2)) * [0.05, 5e-4]
+    images = rng.integers(0, 255, (60, 8, 8)).astype(np.uint8)
+    return Episode(WRENCH, states, controls, {"camera": images, "wrench": wrench}, contact=contact)
+
+
+RECORD = [sensor_statistics(slide(seed), None) for seed in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("faults", "cause"),
+    [
+        ("sensor_gain=wrench:factor=10", "wrench.gain"),
+        ("sensor_gain=wrench:factor=0.5", "wrench.gain"),
+        ("sensor_noise=wrench:std=1", "wrench.noise"),
+        ("sensor_bias=wrench:offset=0.02", "wrench.bias"),
+        ("control_scale=-1", "control.scale"),
+        ("control_scale=0.1", "control.scale"),
+        ("control_delay=4", "control.delay"),
+    ],
+)
+def test_faults_of_readings_and_controls_of_a_task_without_a_measured_hand(faults: str, cause: str) -> None:
+    """A bias of 0.02 is small for the force of 2 N and large for the torque of 0.02 N m in the same sensor."""
+    values = {name: np.array([row.get(name, np.nan) for row in RECORD]) for name in RECORD[0]}
+    profile = HealthyProfile("peg", len(RECORD), None, values)
+    tested = [sensor_statistics(Faults.parse(faults).apply(slide(seed), seed), None) for seed in range(30, 42)]
+    deviations = with_critical_values(profile, compare(profile, tested, task=WRENCH), 0.02)
+    causes = applicable(causes_of(WRENCH), [d.statistic for d in deviations])
+    result = probabilities({c.name: explain(c, deviations) for c in causes})
+    assert max(result, key=lambda name: result[name]) == cause
+    assert result[cause] > 0.8
+
+
+def test_scaled_controls_are_divided_by_their_factor() -> None:
+    wrong = Faults.parse("control_scale=-2").apply(slide(0), 0)
+
+    def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
+        return np.zeros((*controls.shape[:-1], 3))
+
+    inputs = RunInputs(as_external(still, "still", WRENCH), {0: wrong}, 1, frozenset({0}))
+    gains = [
+        Deviation(
+            f"control gain/control {name} {i}/all", value / -2, value, value - 0.01, value + 0.01, 0.0, value < 0, 9
+        )
+        for name, i, value in [("x", 0, -1.0), ("x", 1, 0.01), ("y", 0, 0.01), ("y", 1, -1.0)]
+    ]
+    result = scale_control(inputs, {gain.statistic: gain for gain in gains})
+    assert result is not None
+    np.testing.assert_allclose(result.episodes[0].controls, slide(0).controls, rtol=1e-6)
+
+
+def test_a_camera_behind_the_labels_has_a_cause_beside_labelled_contact() -> None:
+    """The contact shows the delay of the wrench better."""
+    names = {cause.name for cause in causes_of(WRENCH)}
+    assert {"camera.delay", "wrench.delay"} <= names
+    assert "haptics.delay" in names, "of the catalog"
+
+
+def test_models_of_sensors_with_own_names_may_have_faulty_sensors() -> None:
+    titles = {cause.name: cause.title for cause in causes_of(WRENCH)}
+    assert titles["model.haptics.broken"] == "Sensors or model of haptics broken"
+    assert {"weights.ignores_camera", "weights.ignores_haptics"} <= titles.keys()
+    assert [cause.title for cause in causes_of(DOOR) if cause.name == "model.haptics.broken"] == [
+        "Haptics model broken"
+    ]
+
+
+def test_inverted_dynamics_are_not_frozen() -> None:
+    def slope(value: float) -> list[Deviation]:
+        numbers = (value, 1.0, 0.9, 1.1, 0.0, True, 20.0 * (value - 1.0))
+        return [Deviation(f"dynamics slope/{name}/all", *numbers) for name in "xy"]
+
+    inverted, frozen = ranked(WRENCH, *slope(-1.0)), ranked(WRENCH, *slope(0.1))
+    assert inverted["dynamics.inverted"] > 0.7
+    assert frozen["dynamics.frozen"] > 0.7 > 0.1 > frozen["dynamics.inverted"]
