@@ -21,7 +21,7 @@ from beliefscope.filters.external.adapter import Adapter, unchanged
 def fingerprint(adapter: Adapter) -> str:
     """SHA-256 of the adapter's settings, the filter's class or function, its source code and its parameters.
 
-    Parameters are a module's state dictionary, or the arrays, numbers and text in the attributes of another object, or
+    Parameters are a module's state dictionary with the numbers and text in its attributes, or the arrays, numbers and text in the attributes of another object, or
     in the variables that a function encloses. Code is that of the files of its classes, or of the cells of a notebook.
     """
     settings = [[*values] for values in (adapter.components, adapter.mean, adapter.std, adapter.modalities)]
@@ -35,7 +35,10 @@ def fingerprint(adapter: Adapter) -> str:
     for part in parts:
         if _file_of(part) is None:
             digest.update(_source(part).encode())
-    values = filter_.state_dict() if isinstance(filter_, nn.Module) else dict(_leaves(_variables(filter_), "", set()))
+    if isinstance(filter_, nn.Module):
+        values = {**filter_.state_dict(), **_attributes(filter_)}
+    else:
+        values = dict(_leaves(_variables(filter_), "", set()))
     for key, value in sorted(values.items()):
         digest.update(key.encode())
         if isinstance(value, Tensor):
@@ -47,6 +50,18 @@ def fingerprint(adapter: Adapter) -> str:
         else:
             digest.update(repr(value).encode())
     return digest.hexdigest()
+
+
+def _attributes(module: nn.Module) -> dict[str, Any]:
+    """Numbers and text in the public attributes of a module and its submodules; its arrays may change in every step."""
+    return {
+        f"attribute {path}": value
+        for name, part in module.named_modules()
+        for key, attribute in vars(part).items()
+        if not key.startswith("_") and key != "training"
+        for path, value in _leaves(attribute, f"{name}.{key}", set())
+        if not isinstance(value, Tensor | np.ndarray)
+    }
 
 
 def _code_of(filter_: object) -> Any:

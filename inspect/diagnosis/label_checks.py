@@ -50,7 +50,7 @@ def label_statistics(trace: Trace) -> dict[str, float]:
 def _lag(task: Task, labels: Array, measured: Array, keep: Mask) -> float:
     """Steps by which changes of the labels follow those of measured values (T, n), from the components that move.
 
-    Without a measured hand, those that a modality does not measure, such as a small rotation, would hide the others.
+    Without a measured hand, components that a modality does not measure, such as a small rotation, would hide others.
     """
     on_map = [component.name in task.map_components for component in task.components]
     smallest = np.where(on_map, min(SMALLEST_MOTION, SMALLEST_SHARE * task.map_half_width), SMALLEST_MOTION)

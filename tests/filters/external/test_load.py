@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, type_name
@@ -28,7 +29,7 @@ def episode() -> Episode:
 
 FILE = """
 import torch
-from torch import nn
+from torch import Tensor, nn
 class Filter(nn.Module):
     value = {value}
     def initialize_beliefs(self, mean, covariance): self.at = 0
@@ -96,6 +97,26 @@ def test_hash_depends_on_weights_code_and_adapter(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1] != hashes[2]
     first, second = Adapter(nn.Linear(2, 2), std=(1, 1, 1)), Adapter(nn.Linear(2, 2), std=(1, 1, 2))
     assert ExternalFilter(first, DOOR, "a").hash != ExternalFilter(second, DOOR, "a").hash
+
+
+def test_hash_covers_numbers_of_modules_and_not_their_state() -> None:
+    """Modules with the same weights that differ in a setting are other filters; a step leaves the hash as it is."""
+
+    class Scaled(nn.Module):
+        def __init__(self, scale: float) -> None:
+            super().__init__()
+            self.options, self.head = {"scale": scale}, nn.Identity()
+
+        def initialize_beliefs(self, *, mean: Tensor, covariance: Tensor) -> None:
+            self.mean = mean
+
+        def forward(self, *, observations: object, controls: Tensor) -> Tensor:
+            return self.mean
+
+    first, second = Scaled(1.0), Scaled(1.0)
+    second.initialize_beliefs(mean=torch.ones(1, 3), covariance=torch.eye(3))
+    hashes = [as_external(module, "scaled", DOOR).hash for module in (first, second, Scaled(2.0))]
+    assert hashes[0] == hashes[1] != hashes[2]
 
 
 def test_hash_is_the_same_in_python_and_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
