@@ -113,11 +113,18 @@ def with_functions(task: Task, source: Task) -> Task:
 
 
 def difference(task: Task, other: Task) -> str:
-    """The first difference of ``other`` in the name and the arrays of episodes; empty if there is none."""
+    """The first difference of ``other`` in the name and the arrays of episodes; empty if there is none.
+
+    Units for display may differ: those of imported logs depend on the span of the positions.
+    """
     if task is other:
         return ""
     for name in LAYOUT:
         expected, value = (_plain(getattr(t, name)) for t in (task, other))
+        if name == "components":
+            expected, value = ([{**part, "display": None} for part in parts] for parts in (expected, value))
+            pairs = zip(expected, value, strict=False)
+            value = next(([v] for e, v in pairs if v != e), value) if value != expected else value
         if value != expected:
             same = name != "name" and f" with the same name {task.name!r} but other {name}"
             return f"a task{same}: {value!r:.200}" if same else f"task {other.name!r}"

@@ -163,14 +163,19 @@ class BeliefScene:
         if "particles" in available:
             points, colors = self._belief.particles(0, self._layers.tint)
             self._particles = self._server.scene.add_point_cloud(
-                "/particles", points, colors, point_size=0.006, point_shape="circle", precision="float32"
+                "/particles",
+                points,
+                colors,
+                point_size=0.006 * self._belief.scale,
+                point_shape="circle",
+                precision="float32",
             )
             self._roots["particles"] = [self._particles]
         if "force" in available:
             self._force = ForceArrow(self._server, self._trace)
         if "map" in available:
             # Below all contours; without an outline, the belief lies on the floor and the map below it.
-            below = self._belief.level - 2.0 * DISC_SPACING * len(self._belief.names)
+            below = self._belief.level - 2.0 * self._belief.scale * DISC_SPACING * len(self._belief.names)
             floor = below if self._belief.outline is None else FLOOR_MAP_HEIGHT
             self._floor_map = FloorMap(self._server, self._trace, {"floor": floor, "belief": below})
         if "camera" in available:
@@ -180,7 +185,7 @@ class BeliefScene:
         text = "estimate" if name == "fused" and len(self._trace.modalities) < 2 else layer_label(name)
         text = text if self._labels else ""
         color, height = rgb(name, self._trace), self._belief.pole_height(index)
-        return Pole(self._server, f"/estimates/{name}", text, height, POLE_RADIUS, color)
+        return Pole(self._server, f"/estimates/{name}", text, height, POLE_RADIUS * self._belief.scale, color)
 
     def _add_discs(self) -> Any:
         """Contours as discs: instances of one mesh, because viser recompiles lines whose points change."""

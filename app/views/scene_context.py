@@ -249,5 +249,5 @@ def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:
         server.scene.add_line_segments(path, lines, GRAY, thickness=thickness, thickness_units="screen")
     unit, factor = task.main_error.conversion
     for name, axis, edge in zip(task.map_components, floor.axes, floor.high, strict=True):
-        text = f"{display_name(name)} {factor * edge:.0f} {unit}"
+        text = f"{display_name(name)} {round(factor * edge, 6):g} {unit}"
         server.scene.add_label(f"/plane/{name}", text, position=axis[1], **SMALL_LABEL)

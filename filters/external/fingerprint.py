@@ -21,8 +21,9 @@ from beliefscope.filters.external.adapter import Adapter, unchanged
 def fingerprint(adapter: Adapter) -> str:
     """SHA-256 of the adapter's settings, the filter's class or function, its source code and its parameters.
 
-    Parameters are a module's state dictionary with the numbers and text in its attributes, or the arrays, numbers and text in the attributes of another object, or
-    in the variables that a function encloses. Code is that of the files of its classes, or of the cells of a notebook.
+    Parameters are a module's state dictionary with the numbers and text in its attributes, or the arrays, numbers and
+    text in the attributes of another object, or in the variables that a function encloses. Code is that of the files of
+    its classes, or of the cells of a notebook.
     """
     settings = [[*values] for values in (adapter.components, adapter.mean, adapter.std, adapter.modalities)]
     filter_ = adapter.module

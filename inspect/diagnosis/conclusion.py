@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
+from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.names import PRETRAINED
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
@@ -163,7 +166,19 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
         return f"This filter does not use the {sensor} sensor and is unaffected; repair the sensor for other filters."
     if isinstance(checkpoint, ExternalFilter) and cause.name == "particles.few":
         return "Use more particles in the filter's own code."
-    return cause.next.format(task=checkpoint.task.name, filter=checkpoint.name)
+    text = cause.next.format(task=checkpoint.task.name, filter=_argument(checkpoint))
+    if checkpoint.task.name not in TASKS and "--data" not in text:  # without a sample set
+        text = text.replace(" -o tuned", " --data DATA -o tuned")
+    # The loss of an external filter selects what is trained.
+    return re.sub(r" --train [\w-]+", "", text) if isinstance(checkpoint, ExternalFilter) else text
+
+
+def _argument(checkpoint: Checkpoint) -> str:
+    """A checkpoint as the value of ``--filter``: the name of a pretrained one, else that of its file, or its source."""
+    if isinstance(checkpoint, ExternalFilter):
+        return checkpoint.source
+    path = checkpoint.path
+    return checkpoint.name if path is None or path.parent.resolve() == PRETRAINED.resolve() else path.name
 
 
 def is_unused(cause: Cause, checkpoint: Checkpoint) -> bool:
@@ -215,10 +230,10 @@ def _search(case: Case, count: int) -> str:
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
     external = isinstance(checkpoint, ExternalFilter)
-    source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
     return (
         f"{f'{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search' if external else 'Search'} for data slices with "
-        f"large errors, in the tab Failures or with `beliefscope slices {checkpoint.task.name} --filter {source}`."
+        "large errors, in the tab Failures or with "
+        f"`beliefscope slices {checkpoint.task.name} --filter {_argument(checkpoint)}`."
     )
 
 

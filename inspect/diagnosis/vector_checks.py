@@ -40,6 +40,9 @@ LAWFUL = 0.005
 CALMER = 0.2
 """Relative variation of the force with the contact flag below which the flag is inverted."""
 
+ROUGH = 0.5
+"""Roughness above which readings are mostly noise."""
+
 MIN_CONTACT = 3
 """Smallest number of steps in contact that show a delay."""
 
@@ -128,7 +131,8 @@ def size_statistics(episode: Episode) -> dict[str, float]:
 def own_size_statistics(episode: Episode, key: str) -> dict[str, float]:
     """Standard deviation of each axis of a sensor in contact, and its roughness, as ``size_statistics`` of the force.
 
-    Without ``contact_flag``, in the whole episode.
+    Without ``contact_flag``, in the whole episode. The size of readings that are mostly noise (``ROUGH``) is unknown:
+    it does not separate more noise from a gain.
     """
     at = in_contact(episode) & episode.present(key)
     if at.sum() < MIN_STEPS:
@@ -138,7 +142,7 @@ def own_size_statistics(episode: Episode, key: str) -> dict[str, float]:
     values: dict[str, float] = {}
     for i in range(readings.shape[1]):
         axis = axis_name(key, i, readings.shape[1])
-        values[f"size/{axis}/contact"] = float(size[i])
+        values[f"size/{axis}/contact"] = float(size[i]) if noise[i] < ROUGH * size[i] else np.nan
         values[f"roughness/{axis}/contact"] = float(noise[i] / size[i]) if size[i] > 0.0 else np.nan
     return values
 

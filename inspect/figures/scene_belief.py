@@ -23,6 +23,7 @@ SIGMAS = 2.0  # size of the contours
 BELIEF_HEIGHT = 0.10  # m from the anchor to the plane of particles and contours
 POLE_STEP = 0.06  # m, height difference between poles, so that their labels do not overlap
 DISC_SPACING = 0.002  # m between contours; discs in the same plane would flicker
+FULL_SIZE = 0.1  # m, half width of a map below which poles, points and spacings are smaller in proportion
 MIN_AXIS = 1e-6  # m, half axis of a contour
 GRAY_LEVEL = 130.0  # gray value of a particle without weight
 MIN_STRENGTH = 0.25  # least color strength of particles colored by modality
@@ -61,18 +62,19 @@ class DrawnBelief:
         self.outline = None if task.outline is None else task.outline(states)
         flat = np.concatenate([on_floor(task, states), np.zeros_like(states[..., :1])], axis=-1)
         self.anchors: Array = flat if self.outline is None else self.outline.anchor
+        self.scale = min(1.0, task.map_half_width / FULL_SIZE) if task.floor is not None else 1.0
         self.above = 0.0 if self.outline is None else BELIEF_HEIGHT
         self.level = float(self.anchors[0, 0, 2]) + self.above
 
     def pole_height(self, index: int) -> float:
         """Height in m of the pole of an estimate."""
-        return float(self.anchors[0, index, 2]) + self.above + POLE_STEP * (len(self.names) - index)
+        return float(self.anchors[0, index, 2]) + self.above + self.scale * POLE_STEP * (len(self.names) - index)
 
     def discs(self, step: int) -> tuple[Array, Array, Array]:
         """Positions (S, 3), orientations (S, 4) and scales (S, 3) of contour discs of all estimates but the truth."""
         axes, turn = contours(self._covariances[step])
         count, zero = len(turn), np.zeros(len(turn))
-        levels = self.level - DISC_SPACING * np.arange(1, count + 1)
+        levels = self.level - self.scale * DISC_SPACING * np.arange(1, count + 1)
         wxyz = np.stack([np.cos(turn / 2.0), zero, zero, np.sin(turn / 2.0)], axis=1)
         scales = np.concatenate([SIGMAS * np.maximum(axes, MIN_AXIS), np.ones((count, 1))], axis=1)
         return np.column_stack([self._means[step], levels]), wxyz, scales

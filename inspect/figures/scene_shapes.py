@@ -23,7 +23,7 @@ UP = np.array([0.0, 0.0, 1.0])
 DASHES = 5  # per edge, with gaps of the same length
 SHORT_EDGE = 0.03  # m: of shorter edges, every second one is drawn without gaps
 LOG_RANGE = 40.0  # nats below the peak at the lower end of a map's colors, as on the page
-GRID_CELLS = (0.05, 0.1, 0.25, 1.0)  # m, candidate cell sizes of the grid
+GRID_CELLS = (0.002, 0.005, 0.01, 0.05, 0.1, 0.25, 1.0)  # m, candidate cell sizes of the grid
 MAX_GRID_CELLS = 14  # per side
 
 # A unit disc in the plane z = 0: vertices on its rim, then its center; and the triangles between them.

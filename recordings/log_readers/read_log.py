@@ -38,8 +38,8 @@ Array = NDArray[np.float64]
 IRREGULAR = 0.01
 """Deviation of a time from a constant step, relative to the step, above which the times are kept."""
 
-LARGE = 5.0
-"""m, span of the positions above which they are displayed in m."""
+LARGE, SMALL = 5.0, 0.05
+"""m, span of the positions above which they are displayed in m, and below which in mm."""
 
 AUTO = {8: "val", 9: "test"}
 """Last digit of an episode's number -> its split; the others are for training."""
@@ -369,11 +369,12 @@ def _task(
 ) -> Task:
     units = [component.unit for component in mapping.components]
     spans = np.ptp(np.nan_to_num(states), axis=0)
-    large = max((span for span, unit in zip(spans, units, strict=True) if unit == "m"), default=0.0) > LARGE
+    span = max((span for span, unit in zip(spans, units, strict=True) if unit == "m"), default=0.0)
+    display = ("m", 1.0) if span > LARGE else ("mm", 1e3) if 0.0 < span < SMALL else None
     components = tuple(
         replace(
             component,
-            display=("m", 1.0) if component.unit == "m" and large else component.display,
+            display=display if component.unit == "m" and display else component.display,
             wraps=bool(span > np.pi) and component.unit == "rad" and not component.rotation,
         )
         for component, span in zip(mapping.components, spans, strict=True)

@@ -49,6 +49,11 @@ def test_functions_come_only_from_tasks_of_the_same_layout() -> None:
 def test_differences_are_named() -> None:
     assert difference(DOOR, replace(DOOR, map_half_width=1.0)) == ""
     assert difference(DOOR, find_task("push")) == "task 'push'"
+    x, y, angle = DOOR.components
+    assert difference(DOOR, replace(DOOR, components=(replace(x, display=("mm", 1e3)), y, angle))) == ""
+    message = difference(DOOR, replace(DOOR, components=(x, y, replace(angle, wraps=True))))
+    assert "hinge_x" not in message
+    assert "'name': 'angle'" in message
     other = replace(DOOR, control_size=3)
     assert difference(DOOR, other) == "a task with the same name 'door' but other control_size: 3"
 

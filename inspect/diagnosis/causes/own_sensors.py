@@ -181,7 +181,8 @@ def _controls(task: Task) -> tuple[Cause, ...]:
     """
     if not task.control_size or commands_hand(task):
         return ()
-    changed = f"control gain/*|lag/dynamics/*|{DYNAMICS}|{LABELS}"
+    # Updates of single modalities, which stand in for measurements, depend on the prediction.
+    changed = f"control gain/*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
     used = Symptom("dynamics slope/*|dynamics spread/*|control gain/*", 0, optional=True)
     return (
         Cause(
@@ -212,7 +213,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
             "dynamics.inverted",
             "Dynamics inverted: predicted changes have the wrong sign",
             (Symptom("dynamics slope/*", target="mirrored"),),
-            f"opposed/control*|lag/dynamics/*|{DYNAMICS}",
+            f"opposed/control*|lag/dynamics/*|{LABELS}|{DYNAMICS}",
             "Check the sign of the controls in the dynamics model.",
             prior=0.2,
         ),

@@ -127,6 +127,8 @@ def test_a_sensor_of_a_users_task_has_causes(
 def test_built_in_tasks_have_the_causes_of_the_catalog() -> None:
     for name in ("door", "push-field", "door-field"):
         assert causes_of(load_task(name)) == CAUSES
-    own = [cause.name for cause in causes_of(TASK)[len(CAUSES) :] if not cause.name.startswith("model.")]
-    sensors = [f"{key}.{mechanism}" for key in STD for mechanism in ("stuck", "noise", "saturation")]
-    assert own == [*sensors, *(f"{modality}.delay" for modality in TASK.modalities)]
+    own = {cause.name for cause in causes_of(TASK)} - {cause.name for cause in CAUSES}
+    mechanisms = ("stuck", "noise", "saturation", "bias", "gain", "delay")
+    models = [f"model.{k}.{m}" for k in STD for m in ("bias", "overconfident", "underconfident", "broken")]
+    sensors = [f"{key}.{mechanism}" for key in STD for mechanism in mechanisms]
+    assert own == {*sensors, *models, "weights.ignores_near", "weights.ignores_far", "dynamics.inverted"}

@@ -169,6 +169,13 @@ def test_models_of_sensors_with_own_names_may_have_faulty_sensors() -> None:
     ]
 
 
+def test_single_modality_updates_behind_the_labels_are_a_consequence_of_wrong_controls() -> None:
+    gain = Deviation("control gain/control x 0/all", 1.0, -1.0, -1.1, -0.9, 0.0, True, 20.0)
+    late = Deviation("lag/labels camera/all", -9.0, 0.0, -0.5, 0.5, 0.0, True, -10.0)
+    result = ranked(WRENCH, gain, late)
+    assert result["control.scale"] > 0.8 > 0.3 > result["camera.delay"]
+
+
 def test_inverted_dynamics_are_not_frozen() -> None:
     def slope(value: float) -> list[Deviation]:
         numbers = (value, 1.0, 0.9, 1.1, 0.0, True, 20.0 * (value - 1.0))

@@ -87,3 +87,11 @@ def test_a_first_map(tmp_path: Path) -> None:
 def test_data_sets_are_no_logs() -> None:
     with pytest.raises(BadInput, match=r"door\.h5 is a data set already: pass it as --data"):
         preview_columns(Path("datasets/samples/door.h5"))
+
+
+@pytest.mark.parametrize(("span", "unit"), [(0.04, "mm"), (0.4, "cm"), (40.0, "m")])
+def test_units_for_display_follow_the_span_of_the_positions(tmp_path: Path, span: float, unit: str) -> None:
+    columns = {"t": np.arange(3.0), "x": span * np.array([0.0, 0.5, 1.0]), "z": np.zeros(3)}
+    mapping = read_map(map_of(tmp_path, 'time = "t"\n[state]\nx = "x"\n[sensors]\nz = "z"\n'))
+    (episode,) = read_log(columns, mapping, "log")
+    assert episode.task.components[0].conversion[0] == unit

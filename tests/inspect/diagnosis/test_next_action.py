@@ -1,0 +1,36 @@
+"""Commands of next actions can be run: they name the file or source of the filter, and the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from beliefscope.datasets.task import Component, Task
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.filters.external.load import ExternalFilter, as_external
+from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.conclusion import next_action
+
+TASK = Task("peg", (Component("x", "m"),), {"wrench": (2,)}, {"touch": ("wrench",)}, 0, 0.1)
+
+
+def test_of_checkpoints() -> None:
+    checkpoint = load_checkpoint(PRETRAINED / "door-crossmodal-ekf.safetensors")
+    (cause,) = (cause for cause in causes_of(checkpoint.task) if cause.name == "model.haptics.bias")
+    command = "`beliefscope finetune door --filter {} --train haptics-only -o tuned.safetensors`"
+    assert command.format("crossmodal-ekf") in next_action(cause, checkpoint)
+    own = replace(checkpoint, path=Path("runs/mine.safetensors"))
+    assert command.format("mine.safetensors") in next_action(cause, own)
+
+
+def test_of_an_external_filter_whose_loss_selects_what_is_trained() -> None:
+    def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
+        return np.zeros((*controls.shape[:-1], 1))
+
+    adapter = as_external(still, "still", TASK).adapter
+    external = ExternalFilter(adapter, TASK, "own-still", "own.py:still")
+    (cause,) = (cause for cause in causes_of(TASK) if cause.name == "model.touch.bias")
+    command = "`beliefscope finetune peg --filter own.py:still --data DATA -o tuned.safetensors`"
+    assert command in next_action(cause, external)
