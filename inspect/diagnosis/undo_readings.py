@@ -266,11 +266,11 @@ def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
 
 
 def _scale(deviations: Deviations, channel: int, size: int) -> float:
-    """Healthy over actual gain on the component that a channel changes most; without one, actual over healthy size."""
+    """Healthy over actual gain on the component that a channel changes most, or actual over healthy size."""
     gains = [d for name, d in deviations.items() if fnmatch(name, f"control gain/control * {channel}/all")]
     gain = max(gains, key=lambda d: abs(d.healthy) / max(d.high - d.low, 1e-12), default=None)
-    if gain is not None:
-        return gain.healthy / gain.value if gain.alarm and gain.value else 1.0
+    if gain is not None and gain.alarm and gain.value:
+        return gain.healthy / gain.value
     name = f"size/{axis_name('control', channel, size)}/all"
     return (_ratio(deviations, name) or 1.0) if name in deviations and deviations[name].alarm else 1.0
 
