@@ -1,11 +1,9 @@
 """Messages from the page over the socket of a view, as validated models (docs/api.md)."""
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, TypeAdapter
 
-from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.inspect.maps.likelihood_map import MapOptions, Quantity
 from beliefscope.inspect.maps.plane import Others
@@ -46,6 +44,7 @@ class Cursor(_Message):
             of the components off the maps (``MapEngine.map``).
     """
 
+    type: Literal["cursor"] = "cursor"
     serial: NonNegativeInt
     task: str
     filter: str
@@ -78,6 +77,7 @@ class SceneLayers(_Message):
         scale, range, colours: as for the page's maps.
     """
 
+    type: Literal["scene_layers"] = "scene_layers"
     hidden: Annotated[frozenset[SceneLayer], Field(strict=False)] = frozenset()
     ground: str = "fused"
     height: Literal["floor", "belief"] = "floor"
@@ -90,33 +90,19 @@ class SceneLayers(_Message):
 class MoveViewpoint(_Message):
     """Move the viewpoint of the 3D scene."""
 
+    type: Literal["viewpoint"] = "viewpoint"
     at: Viewpoint
 
 
 class Theme(_Message):
     """The page's color theme."""
 
+    type: Literal["theme"] = "theme"
     dark: bool = False
 
 
 ViewMessage = Cursor | SceneLayers | MoveViewpoint | Theme
-_MODELS: dict[str, type[ViewMessage]] = {
-    "cursor": Cursor,
-    "scene_layers": SceneLayers,
-    "theme": Theme,
-    "viewpoint": MoveViewpoint,
-}
-
-
-def parse_view_message(message: Mapping[str, Any]) -> ViewMessage:
-    """Validate a decoded JSON message. Raises BadInput naming the first invalid field."""
-    type_ = message.get("type")
-    if not isinstance(type_, str) or type_ not in _MODELS:
-        raise unknown_name("message type", str(type_), _MODELS)
-    try:
-        return _MODELS[type_].model_validate(message)
-    except ValidationError as error:
-        raise BadInput(f"{type_}.{describe_error(error)}.") from None
+VIEW_MESSAGE: TypeAdapter[ViewMessage] = TypeAdapter(Annotated[ViewMessage, Field(discriminator="type")])
 
 
 def describe_error(error: Any) -> str:

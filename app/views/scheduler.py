@@ -2,11 +2,10 @@
 
 import asyncio
 import os
-import threading
 import time
 from collections.abc import Callable, Hashable
-from contextlib import suppress
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -16,27 +15,25 @@ T = TypeVar("T")
 class _Task:
     deadline: float
     resources: frozenset[Hashable]
-    work: Callable[[], Any]
-    future: asyncio.Future[Any]
+    start: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class DeadlineExecutor:
     """Thread pool that runs the task with the earliest deadline first.
 
     Two tasks that need the same resource never run at the same time. Each client awaits its task before it submits the
-    next one, so the queue holds at most one task per client. Threads start with the first tasks.
+    next one, so the queue holds at most one task per client. Threads start with the first tasks. All methods but
+    ``close`` are called in the event loop.
 
     threads: number of threads; by default one per processor, between 2 and 4, because more would only compete for
     Python's global lock.
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        self._max_threads = threads or min(4, max(2, os.cpu_count() or 2))
-        self._threads: list[threading.Thread] = []
-        self._condition = threading.Condition()
-        self._pending: set[_Task] = set()  # waiting or running
+        self._max_running = threads or min(4, max(2, os.cpu_count() or 2))
+        self._threads = ThreadPoolExecutor(self._max_running, "deadline-executor")
         self._waiting: list[_Task] = []
-        self._busy: set[Hashable] = set()  # resources of running tasks
+        self._running: list[_Task] = []
         self._closed = False
 
     async def run(self, work: Callable[[], T], within: float, resources: frozenset[Hashable] = frozenset()) -> T:
@@ -45,64 +42,44 @@ class DeadlineExecutor:
         within: deadline, in s from now. resources: used exclusively while the task runs. Raises RuntimeError if the
         executor is closed.
         """
-        loop = asyncio.get_running_loop()
-        task = _Task(time.monotonic() + within, resources, work, loop.create_future())
-        with self._condition:
-            if self._closed:
-                raise RuntimeError("the server is stopping")
-            self._waiting.append(task)
-            self._pending.add(task)
-            if len(self._threads) < self._max_threads:
-                self._threads.append(threading.Thread(target=self._work, name="deadline-executor", daemon=True))
-                self._threads[-1].start()
-            self._condition.notify()
+        if self._closed:
+            raise RuntimeError("the server is stopping")
+        task = _Task(time.monotonic() + within, resources)
+        self._waiting.append(task)
+        self._start_tasks()
         try:
-            return await task.future
-        finally:
-            with self._condition:
-                self._pending.remove(task)
-                if task in self._waiting:
-                    self._waiting.remove(task)
+            await task.start.wait()
+        except asyncio.CancelledError:
+            self._end(task)
+            raise
+        loop, running = asyncio.get_running_loop(), self._threads.submit(work)
+        running.add_done_callback(lambda _: loop.call_soon_threadsafe(self._end, task))
+        return await asyncio.wrap_future(running)
 
     def overdue(self) -> float:
-        """Time in s since the earliest deadline of all pending tasks; 0 if none has passed."""
-        with self._condition:
-            return max([0.0, *(time.monotonic() - task.deadline for task in self._pending)])
+        """Time in s since the earliest deadline of all waiting and running tasks; 0 if none has passed."""
+        return max([0.0, *(time.monotonic() - task.deadline for task in self._waiting + self._running)])
 
     def close(self) -> None:
         """Discard waiting tasks and end the threads after their current ones. Blocks."""
-        with self._condition:
-            self._closed = True
-            self._waiting.clear()
-            self._condition.notify_all()
-        for thread in self._threads:
-            thread.join()
+        self._closed = True
+        self._threads.shutdown(cancel_futures=True)
 
-    def _work(self) -> None:
-        while (task := self._next()) is not None:
-            result, error = None, None
-            try:
-                result = task.work()
-            except BaseException as exception:
-                error = exception
-            with self._condition:
-                self._busy -= task.resources
-                self._condition.notify_all()
-            _resolve(task.future, result, error)
-            del task, result, error  # an idle thread must not keep the last trace in memory
+    def _start_tasks(self) -> None:
+        while len(self._running) < self._max_running and not self._closed:
+            busy = frozenset[Any]().union(*(task.resources for task in self._running))
+            runnable = [task for task in self._waiting if not task.resources & busy]
+            if not runnable:
+                return
+            task = min(runnable, key=lambda task: task.deadline)
+            self._waiting.remove(task)
+            self._running.append(task)
+            task.start.set()
 
-    def _next(self) -> _Task | None:
-        """Wait for the next task; None once the executor is closed."""
-        with self._condition:
-            while not self._closed:
-                runnable = [task for task in self._waiting if not task.resources & self._busy]
-                if runnable:
-                    task = min(runnable, key=lambda task: task.deadline)
-                    self._waiting.remove(task)
-                    self._busy |= task.resources
-                    return task
-                self._condition.wait()
-        return None
+    def _end(self, task: _Task) -> None:
+        """Remove a task that is done or cancelled."""
+        (self._running if task in self._running else self._waiting).remove(task)
+        self._start_tasks()
 
 
 class FairLock:
@@ -123,16 +100,3 @@ class FairLock:
     async def __aexit__(self, *_: object) -> None:
         pause = min(self._pause * (time.monotonic() - self._acquired), self._max_pause)
         asyncio.get_running_loop().call_later(pause, self._lock.release)
-
-
-def _resolve(future: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
-    def resolve() -> None:
-        if future.done():
-            return
-        if error is None:
-            future.set_result(result)
-        else:
-            future.set_exception(error)
-
-    with suppress(RuntimeError):  # the event loop is closed
-        future.get_loop().call_soon_threadsafe(resolve)

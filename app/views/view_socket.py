@@ -9,10 +9,18 @@ from collections.abc import AsyncIterator, Callable
 from functools import partial
 from typing import Any
 
+from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from beliefscope.app.protocol.map_format import EncodedMaps
-from beliefscope.app.protocol.messages import Cursor, MoveViewpoint, SceneLayers, Theme, parse_view_message
+from beliefscope.app.protocol.messages import (
+    VIEW_MESSAGE,
+    Cursor,
+    MoveViewpoint,
+    SceneLayers,
+    Theme,
+    describe_error,
+)
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -82,10 +90,8 @@ class View:
         serial = None
         try:
             decoded = read_json(text)
-            if not isinstance(decoded, dict):
-                raise BadInput("A message is a JSON object.")
-            serial = decoded.get("serial")
-            match message := parse_view_message(decoded):
+            serial = decoded.get("serial") if isinstance(decoded, dict) else None
+            match message := VIEW_MESSAGE.validate_python(decoded):
                 case Cursor():
                     self._newest = message
                     self._cursor_arrived.set()
@@ -95,8 +101,8 @@ class View:
                     await asyncio.to_thread(self.scene.set_viewpoint, message.at)
                 case Theme():
                     await asyncio.to_thread(self.scene.set_dark, message.dark)
-        except BadInput as error:
-            await _send_error(websocket, serial, str(error))
+        except ValidationError as error:
+            await _send_error(websocket, serial, f"{describe_error(error)}.")
         except ValueError as error:
             await _send_error(websocket, serial, f"Not JSON: {error}.")
 

@@ -145,8 +145,8 @@ def test_outdated_cursors_are_skipped(
     ("text", "error"),
     [
         ("not json", "Not JSON"),
-        ("[1]", "JSON object"),
-        ("{}", "message type 'None' does not exist. Available: cursor, scene_layers,"),
+        ("[1]", "Input should be a valid dictionary"),
+        ("{}", "Unable to extract tag using discriminator 'type'"),
         (json.dumps(cursor(task="nothing")), "task 'nothing' does not exist"),
         (json.dumps(cursor(filter="nothing")), "filter 'nothing' does not exist"),
         (json.dumps(cursor(filter=3)), "cursor.filter: Input should be a valid string."),
