@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 from beliefscope.app.protocol import map_format, messages
-from beliefscope.app.runs.sweep_filters import HASH_DIGITS
+from beliefscope.app.runs.result_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from beliefscope.app.api.models import FilterName, Number, Reply
 from beliefscope.app.api.studies import catalog_names
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.runs.sweep_filters import load_sweep_filter, sweep_folders
+from beliefscope.app.runs.result_filters import result_filter_name, sweep_folders
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.diagnostics.views import as_json
@@ -151,11 +151,14 @@ def routes(store: TraceStore) -> APIRouter:
 
     @router.post("/api/experiments/{sweep}/{checkpoint}")
     def open_checkpoint(sweep: str, checkpoint: str) -> FilterName:
-        name, loaded = load_sweep_filter(tables(sweep), checkpoint, store.settings)
-        listed = catalog_names(store).get((loaded.task.name, checkpoint))
-        if listed is None:
-            store.add_filter(loaded.task.name, name, loaded, first=False)
-        return FilterName(filter=listed or name)
+        query = "SELECT task, name FROM checkpoints WHERE checkpoint = ?"
+        row = next(iter(tables(sweep).query(query, [checkpoint]).to_pylist()), None)
+        if row is None:
+            raise NotFound(f"Sweep {sweep!r} has no checkpoint with hash {checkpoint[:12]}.")
+        names = catalog_names(store)
+        name = names.get((row["task"], checkpoint)) or result_filter_name(row["name"], checkpoint)
+        store.checkpoint(row["task"], name)  # adds it
+        return FilterName(filter=name)
 
     return router
 

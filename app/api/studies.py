@@ -10,8 +10,8 @@ from pydantic import ConfigDict
 from beliefscope.app.api.models import FilterName, JobReply, Reply
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
+from beliefscope.app.runs.result_filters import all_studies, result_filter_name
 from beliefscope.app.runs.saved_filters import refresh_saved_filters
-from beliefscope.app.runs.study_filters import all_studies, load_study_filter, study_filter_name
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.studies import Results, Study
 from beliefscope.datasets.errors import BadInput, check_name
@@ -106,15 +106,12 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.post("/api/studies/{name}/{task}/{filter}/{seed}")
     def open_checkpoint(name: str, task: str, filter: str, seed: int) -> FilterName:
-        study = studies().get(name)
-        cell = f"{task}/{filter}/seed{seed}"
+        study, cell = studies().get(name), f"{task}/{filter}/seed{seed}"
         hash_ = None if study is None else study.read().checkpoints.get(cell)
-        if study is None or hash_ is None:
+        if hash_ is None:
             raise NotFound(f"Study {name!r} has no checkpoint {cell!r}.")
-        catalog_name = catalog_names(store).get((task, hash_))
-        if catalog_name is None:
-            catalog_name = study_filter_name(cell, hash_)
-            store.add_filter(task, catalog_name, load_study_filter(study, cell, hash_, store.settings), first=False)
+        catalog_name = catalog_names(store).get((task, hash_)) or result_filter_name(cell, hash_)
+        store.checkpoint(task, catalog_name)  # adds it
         return FilterName(filter=catalog_name)
 
     return router

@@ -10,7 +10,6 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cached_property, lru_cache, partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -21,10 +20,9 @@ from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
 from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
+from beliefscope.app.runs.result_filters import candidates
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.study_filters import study_candidates
-from beliefscope.app.runs.sweep_filters import sweep_candidates
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.workspace.json_files import RecordCache, read_record
@@ -283,8 +281,7 @@ class TraceStore:
         if name in self._catalog(task).filters:
             return
         problems = []
-        in_sweeps, in_studies = (f(task, name, self.settings) for f in (sweep_candidates, study_candidates))
-        for source, load in chain(in_sweeps, in_studies):
+        for source, load in candidates(task, name, self.settings):
             try:
                 self.add_filter(task, name, load(), first=False)
                 return

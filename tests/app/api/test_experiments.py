@@ -79,7 +79,7 @@ def test_checkpoints_are_added_to_the_catalog_once(
         rows = client.get("/api/experiments/mine").json()["rows"]
         assert {row["catalog_name"] for row in rows} == {name, "image-ekf"}
         assert {row["data_name"] for row in rows} == {None}, "the episodes are not served"
-        assert client.post(f"/api/experiments/mine/{'0' * 64}").status_code == 400
+        assert client.post(f"/api/experiments/mine/{'0' * 64}").status_code == 404
         assert client.get("/api/experiments/none").status_code == 404
 
 
@@ -111,7 +111,7 @@ def test_names_of_checkpoints_are_valid_in_another_server(
         with open_client(new_server) as client:
             filters, (problem,) = catalog(client)
             assert name not in filters
-            assert "mine.safetensors' was changed after the sweep" in problem
+            assert "mine.safetensors' was changed after its evaluation" in problem
             assert problem in client.get(f"/api/trace/door/{name}/0").json()["error"]
         file.unlink()
         with open_client(new_server) as client:

@@ -14,7 +14,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.study_filters import all_studies
+from beliefscope.app.runs.result_filters import all_studies
 from beliefscope.app.workspace.studies import BUILT_IN, FILE, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
@@ -125,7 +125,7 @@ def test_name_of_a_checkpoint_is_valid_in_another_server(
         filters, (problem,) = catalog(client)
         assert name not in filters
         assert problem.startswith(f"filter '{name}' of study 'renamed': ")
-        assert problem.endswith("is not the checkpoint that study 'renamed' evaluated")
+        assert "seed0.safetensors' was changed after its evaluation" in problem
         assert problem in client.get(f"/api/trace/door/{name}/0").json()["error"]
     file.unlink()
     with open_client(new_server) as client:
@@ -139,7 +139,7 @@ def test_checkpoint_with_another_hash_is_refused(
     with open_client(replace(settings, studies={"mine": folder})) as client:
         answer = client.post(f"/api/studies/mine/door/{FILTER}/0")
     assert answer.status_code == 400
-    assert "is not the checkpoint that study 'mine' evaluated" in answer.json()["error"]
+    assert "was changed after its evaluation" in answer.json()["error"]
 
 
 def test_order_of_studies(settings: Settings, folder: Path, open_client: Callable[..., TestClient]) -> None:
