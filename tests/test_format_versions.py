@@ -16,9 +16,9 @@ from safetensors.numpy import load_file, save
 from starlette.testclient import TestClient
 
 from beliefscope.app.jobs.queue import Job, Jobs
-from beliefscope.app.runs.saved_filters import SavedFilter, save_filter
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
+from beliefscope.app.workspace.saved_filters import SavedFilter
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
@@ -132,7 +132,7 @@ def test_a_workspace_of_a_later_version_is_readable_and_kept(
         store = client.app.state.store  # type: ignore[attr-defined]
         new = SavedFilter("door", "mine", str(pretrained_path("door", "image-ekf")), default=True)
         with pytest.raises(BadInput, match=r"kept\.json' is damaged or was written by another version: move it away"):
-            save_filter(store, new)
+            store.saved.save(new)
     assert {name: (tmp_path / "ws" / name).read_text() for name in LATER} == LATER
 
 

@@ -15,9 +15,9 @@ from beliefscope.app.api.weaknesses import Weakness, weaknesses_of
 from beliefscope.app.jobs.finetune import catalog_name
 from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.protocol.permalinks import page_link
-from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
+from beliefscope.app.workspace.saved_filters import SavedFilter
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.finetuning.choices import Choices, choices
 from beliefscope.filters.finetuning.loop import Validation
@@ -180,10 +180,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         if reason and action != "discard":
             raise HTTPException(409, f"Run {run!r} cannot be used as a new filter. {reason}")
         if action == "discard":
-            remove_filter(store, record.task, name)
+            store.saved.remove(record.task, name)
         else:
             path = str(runs.file(run, "finetuned.safetensors"))
-            save_filter(store, SavedFilter(record.task, name, path, action == "promote"))
+            store.saved.save(SavedFilter(record.task, name, path, action == "promote"))
         return info(record)
 
     def summary(run: FineTuneRun) -> dict[str, Any]:
@@ -206,7 +206,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     def info(run: FineTuneRun) -> FineTuneRunInfo:
         name = finetuned_name(run)
-        saved = {f.name: f for f in read_saved_filters(store.settings.workspace) if f.task == run.task}
+        saved = {f.name: f for f in store.saved.all() if f.task == run.task}
         return FineTuneRunInfo(
             **vars(run),
             job=jobs.find("finetune", run.run),

@@ -12,7 +12,6 @@ from fastapi.responses import Response
 from beliefscope import __version__
 from beliefscope.app.api.models import Number, Reply
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.runs.saved_filters import refresh_saved_filters
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.errors import BadInput
@@ -51,7 +50,6 @@ def routes(store: TraceStore) -> APIRouter:
 
     @router.get("/api/lineage/{task}")
     def lineage(task: str) -> Lineage:
-        refresh_saved_filters(store)
         names = {checkpoint.hash: name for name, checkpoint in store.filters(task).items()}
         members = _lineage(store, task).members.values()
         return Lineage(members=[_member(member, names, store) for member in members if member.task == task])

@@ -22,7 +22,6 @@ from beliefscope import __version__
 from beliefscope.app.api.models import DeletedId, Freed, JobReply, Reply, RequestBody
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.jobs.recording import write
-from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.protocol.messages import READ_ONLY
 from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, display_name
@@ -43,7 +42,6 @@ POLL_INTERVAL = 0.2  # s between checks whether the client of an upload has canc
 CHECK_INTERVAL = 1 << 24  # uploaded bytes between checks of the free space
 MAGIC = b"RRF"  # first bytes of all versions of Rerun's files
 MAX_MATCHES = 4096  # recordings whose data set is remembered
-FREE_ROUNDING = 10**7  # bytes; keeps the ETag of the list stable
 
 
 class RunNames(Reply):
@@ -112,18 +110,17 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
     router = APIRouter()
     matcher = RunMatcher(store)
 
-    @router.get("/api/recordings", response_model=RecordingList)
-    def list_recordings(request: Request) -> Response:
+    @router.get("/api/recordings")
+    def list_recordings() -> RecordingList:
         recordings = files.list_recordings()
-        free = free_space(files.folder) // FREE_ROUNDING * FREE_ROUNDING
-        reply = RecordingList(
+        free = free_space(files.folder)
+        return RecordingList(
             recordings=[matcher.entry(recording) for recording in recordings],
             deleted=files.trash.list_deleted(),
             bytes=sum(recording.bytes for recording in recordings),
             free=free,
             largest=max(0, min(MAX_UPLOAD, free - RESERVED_SPACE)),
         )
-        return tagged_json(request, reply.model_dump())
 
     @router.post("/api/recordings", status_code=201)
     def write_recording(body: RecordingRequest, request: Request, response: Response) -> WrittenRecording | JobReply:

@@ -10,7 +10,6 @@ from pydantic import Field, NonNegativeInt
 from beliefscope.app.api.models import DeletedId, Freed, JobReply, Reply, RequestBody
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.jobs.queue import Jobs
-from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.reports import ReportEntry, ReportFolder
 from beliefscope.app.workspace.trash import DeletedFile
@@ -57,10 +56,9 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
     reports = ReportFolder(store.settings.workspace / "reports")
 
-    @router.get("/api/reports", response_model=ReportList)
-    def list_reports(request: Request) -> Response:
-        reply = ReportList(reports=reports.list_reports(), deleted=reports.trash.list_deleted())
-        return tagged_json(request, reply.model_dump())
+    @router.get("/api/reports")
+    def list_reports() -> ReportList:
+        return ReportList(reports=reports.list_reports(), deleted=reports.trash.list_deleted())
 
     @router.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def write_report(

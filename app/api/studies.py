@@ -11,7 +11,6 @@ from beliefscope.app.api.models import FilterName, JobReply, Reply
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.result_filters import all_studies, result_filter_name
-from beliefscope.app.runs.saved_filters import refresh_saved_filters
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.studies import Results, Study
 from beliefscope.datasets.errors import BadInput, check_name
@@ -200,7 +199,6 @@ def _key(study: Study, results: Results) -> object:
 
 
 def catalog_names(store: TraceStore) -> CatalogNames:
-    """Names of all filters in the catalog, with the present saved filters of the workspace."""
-    refresh_saved_filters(store)
+    """Names of all filters in the catalog."""
     filters = {task: store.filters(task) for task in store.tasks()}
     return {(task, filter_.hash): name for task in filters for name, filter_ in filters[task].items()}

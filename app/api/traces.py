@@ -12,7 +12,6 @@ from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
 from beliefscope.app.protocol.messages import SceneLayer
 from beliefscope.app.runs.examples import Example
-from beliefscope.app.runs.saved_filters import refresh_saved_filters
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -129,7 +128,6 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
 
     @router.get("/api/catalog", response_model=Catalog)
     def catalog(request: Request, task: str = "", filter: Annotated[tuple[str, ...], Query()] = ()) -> dict[str, Any]:
-        refresh_saved_filters(store)
         server = {"version": __version__, "read_only": request.app.state.read_only, "faults": fault_catalog()}
         return {**server, **store.catalog(task, filter)}
 

@@ -1,6 +1,6 @@
 """Job that runs a filter over a data set, ranks its failure events by every score and searches for slices."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from typing import Any
 
@@ -8,18 +8,13 @@ from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
 from beliefscope.inspect.failures.survey_json import survey_document
 from beliefscope.inspect.slices.covariates import EpisodeCovariates
-from beliefscope.inspect.slices.report import check_episodes, slices_of_survey
+from beliefscope.inspect.slices.report import describe_slices
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
-
-MAX_STEPS = 200_000
-"""Largest number of steps in which slices are searched; limits memory."""
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -62,17 +57,5 @@ def failure_document(
     covariates = [covariates for _, covariates in parts]
     for score in document["scores"]:
         if not score["why_not"]:
-            score["slices"] = _slices(survey, covariates, score["name"])
+            score["slices"] = describe_slices(survey, covariates, score["name"])
     return document
-
-
-def _slices(survey: Survey, covariates: Sequence[EpisodeCovariates], by: str) -> dict[str, Any]:
-    """The slices of a score, or why they were not searched."""
-    try:
-        check_episodes(len(covariates))
-        if len(survey.step) > MAX_STEPS:
-            raise BadInput(f"{len(survey.step)} steps; slices are searched in at most {MAX_STEPS}")
-        slices = slices_of_survey(survey, covariates, by)
-    except BadInput as error:
-        return {"summary": f"Slices were not searched: {error}.", "rows": []}
-    return {"summary": slices.summary, "rows": as_json(slices.slices)}

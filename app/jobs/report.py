@@ -10,6 +10,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
+from beliefscope.filters.checkpoint import PRETRAINED
 from beliefscope.inspect.maps.map_engine import missing_quantities
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 from beliefscope.recordings.report.pdf import browser
@@ -27,8 +28,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         traced = store.request(selection)
         trace, task = traced.trace, traced.checkpoint.task
         settings = store.settings
-        checkpoint, data = settings.checkpoints.get(selection.filter), settings.data.get(selection.data)
-        path = str(checkpoint) if isinstance(checkpoint, Path) else ""
+        source, data = traced.checkpoint.path, settings.data.get(selection.data)
+        path = "" if source is None or source.parent == PRETRAINED else str(source)
         map_option = [] if quantity == "likelihood" else ["--map", quantity]
         quantity = None if quantity in missing_quantities(traced.checkpoint, trace) else quantity
         serve = serve_command(filter(None, [path]), data, settings.seed)

@@ -1,9 +1,6 @@
 """Responses with an ETag, for browser caches."""
 
-import hashlib
-import json
 from collections.abc import Callable
-from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -20,9 +17,3 @@ def tagged(
     if headers["etag"] in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
     return Response(content(), media_type=media_type, headers=headers)
-
-
-def tagged_json(request: Request, value: Any) -> Response:
-    """A JSON value tagged with its hash."""
-    body = json.dumps(value).encode()
-    return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")

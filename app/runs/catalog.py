@@ -8,6 +8,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+from beliefscope.app.workspace.saved_filters import SavedFilters
 from beliefscope.datasets import episode_list
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
@@ -40,29 +41,36 @@ DEFAULT_FILTERS = ("information-ekf", "crossmodal-pf")
 class TaskCatalog:
     """Filters and data sets of one task by name. Pretrained filters and sample data are loaded on first use.
 
-    secondary: filters of the user that do not replace the default filter: listed after it, and after the user's
-    other filters. removed: names of filters that were removed since the server started.
+    saved: the saved filters of the workspace. opened: checkpoints of studies and sweeps.
     """
 
     task: Task
+    saved: SavedFilters | None = None
     user_filters: dict[str, Checkpoint] = field(default_factory=dict)
     user_data: dict[str, Dataset] = field(default_factory=dict)
-    secondary: set[str] = field(default_factory=set)
-    removed: set[str] = field(default_factory=set)
+    opened: dict[str, Checkpoint] = field(default_factory=dict)
+
+    @property
+    def filters(self) -> dict[str, Checkpoint]:
+        """The user's filters or the first included one, then saved and opened ones, then the other included ones."""
+        saved = [] if self.saved is None else list(self.saved.of_task(self.task))
+        filters = {entry.name: checkpoint for entry, checkpoint in saved if entry.default} | self.user_filters
+        included = list(self._included.items())
+        others = [(entry.name, checkpoint) for entry, checkpoint in saved]
+        for name, checkpoint in (*(included[:1] if not filters else ()), *others, *self.opened.items(), *included):
+            filters.setdefault(name, checkpoint)
+        return filters
 
     @cached_property
-    def filters(self) -> dict[str, Checkpoint]:
-        filters = {name: filter_ for name, filter_ in self.user_filters.items() if name not in self.secondary}
-        first = max(1, len(filters))
+    def _included(self) -> dict[str, Checkpoint]:
+        """Pretrained filters, and external ones that are always listed."""
+        filters: dict[str, Checkpoint] = {}
         for name in dict.fromkeys((*DEFAULT_FILTERS, *filters_of(self.task))):
-            if name not in self.user_filters:
-                with suppress(BadInput):  # not every filter is pretrained
-                    filters[name] = _pretrained(pretrained_path(self.task, name))
+            with suppress(BadInput):  # not every filter is pretrained
+                filters[name] = _pretrained(pretrained_path(self.task, name))
         for name, source in EXTERNAL.get(self.task.name, {}).items():
-            filters.setdefault(name, _external(source, self.task))
-        listed = list(filters.items())
-        last = [(name, filter_) for name, filter_ in self.user_filters.items() if name in self.secondary]
-        return dict([*listed[:first], *last, *listed[first:]])
+            filters[name] = _external(source, self.task)
+        return filters
 
     @cached_property
     def data(self) -> dict[str, Dataset]:
@@ -72,31 +80,12 @@ class TaskCatalog:
                 data[SAMPLE] = _sample(sample_path(self.task), self.task)
         return data
 
-    def add_filter(self, name: str, checkpoint: Checkpoint, first: bool) -> None:
-        """Add a filter as the default, or after the default and the user's other filters."""
-        (self.secondary.discard if first else self.secondary.add)(name)
-        others = {key: value for key, value in self.user_filters.items() if key != name}
-        self.user_filters = {name: checkpoint, **others} if first else {**others, name: checkpoint}
-        self.removed.discard(name)
-        vars(self).pop("filters", None)
-
-    def remove_filter(self, name: str) -> None:
-        """Remove one of the user's filters, if it exists."""
-        if self.user_filters.pop(name, None) is not None:
-            self.removed.add(name)
-        self.secondary.discard(name)
-        vars(self).pop("filters", None)
-
     def filter(self, name: str) -> Checkpoint:
-        """Raises BadInput for an unknown name, and for a filter that was removed."""
-        if name in self.removed and name not in self.filters:
-            raise BadInput(
-                f"filter {name!r} was removed from the saved filters of the workspace; to list it again, save it in "
-                f"the Fine-tune tab. Available: {', '.join(self.filters)}."
-            )
-        if name not in self.filters:
-            raise unknown_name("filter", name, self.filters)
-        return self.filters[name]
+        """Raises BadInput for an unknown name."""
+        filters = self.filters
+        if name not in filters:
+            raise unknown_name("filter", name, filters)
+        return filters[name]
 
     def dataset(self, name: str) -> Dataset:
         """The data set with the name; the first one for an empty name. Raises BadInput for an unknown name."""
@@ -158,29 +147,25 @@ def task_catalogs(
     checkpoints: Mapping[str, Path | Checkpoint],
     data: Mapping[str, Path],
     tasks: Sequence[Task] = (),
-    secondary: Collection[str] = (),
+    saved: SavedFilters | None = None,
 ) -> tuple[dict[str, TaskCatalog], list[str]]:
     """Catalogs of all tasks, those with filters or data of the user first; and one line for each unusable input.
 
     checkpoints: displayed name -> checkpoint file, or a loaded filter. data: displayed name -> file or folder of
-    episodes. tasks: user-defined tasks, as for ``stored_task``. secondary: the checkpoints that are not listed
-    first, and whose task is not either.
+    episodes. tasks: user-defined tasks, as for ``stored_task``. saved: of the workspace.
     """
     catalogs: dict[str, TaskCatalog] = {}
     problems: list[str] = []
     for name, source in checkpoints.items():
         with _collect_error(problems):
             checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source, tasks)
-            catalog = _catalog_of(catalogs, checkpoint.task, name)
-            catalog.user_filters[name] = checkpoint
-            if name in secondary:
-                catalog.secondary.add(name)
+            _catalog_of(catalogs, checkpoint.task, saved, name).user_filters[name] = checkpoint
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
     for name, path in data.items():
         with _collect_error(problems):
             episodes = open_dataset(path, given=tasks)
             initial_view(episodes)  # the page opens it there: damage of these episodes is a problem of the data set
-            _catalog_of(catalogs, episodes.task, name).user_data[name] = episodes
+            _catalog_of(catalogs, episodes.task, saved, name).user_data[name] = episodes
             # A file of the MIT Push data set fits several tasks: offer it for each one that the user has filters for.
             for task in tasks_with_filters:
                 if task != episodes.task:
@@ -196,15 +181,15 @@ def task_catalogs(
     own = {
         name: catalog
         for name, catalog in catalogs.items()
-        if name not in TASKS or catalog.user_data or catalog.user_filters.keys() - catalog.secondary
+        if name not in TASKS or catalog.user_data or catalog.user_filters
     }
-    built_in = {name: catalogs.get(name, TaskCatalog(task)) for name, task in TASKS.items()}
+    built_in = {name: catalogs.get(name, TaskCatalog(task, saved)) for name, task in TASKS.items()}
     return own | {name: catalog for name, catalog in built_in.items() if name not in own}, problems
 
 
-def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, source: str) -> TaskCatalog:
+def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, saved: SavedFilters | None, source: str) -> TaskCatalog:
     """The catalog of a task, added if missing. Raises BadInput if another task has the same name."""
-    catalog = catalogs.setdefault(task.name, TaskCatalog(task))
+    catalog = catalogs.setdefault(task.name, TaskCatalog(task, saved))
     if other := difference(catalog.task, task):
         raise BadInput(f"{source} has {other}; names of tasks must be unique in a server")
     return catalog

@@ -13,6 +13,9 @@ from beliefscope.datasets.task_json import task_to_json
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter, load_external
 
+FOLDERS = ("data", "studies", "sweeps")
+"""Fields with files and folders by name."""
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -23,8 +26,6 @@ class Settings:
         data: displayed name -> file or folder of episodes, listed before the sample sets.
         checkpoints: displayed name -> checkpoint file or external filter; listed before the pretrained filters, of
             which it replaces those with the same name.
-        secondary: names of checkpoints that are listed after the default filter of their task.
-        saved: names of checkpoints that are from the workspace's list of saved filters.
         hosts: additional host names that the server answers to.
         views: maximum number of pages open at a time.
         tasks: user-defined tasks, as accepted by ``load_task``.
@@ -41,8 +42,6 @@ class Settings:
     tasks: tuple[str, ...] = ()
     studies: Mapping[str, Path] = field(default_factory=dict)
     sweeps: Mapping[str, Path] = field(default_factory=dict)
-    secondary: frozenset[str] = frozenset()
-    saved: frozenset[str] = frozenset()
 
     @property
     def definitions(self) -> list[Task]:
@@ -53,7 +52,7 @@ class Settings:
         """Everything a job needs, as JSON values. External filters are represented by their source."""
         return {
             "workspace": str(self.workspace),
-            "data": {name: str(path) for name, path in self.data.items()},
+            **{name: {key: str(path) for key, path in getattr(self, name).items()} for name in FOLDERS},
             "checkpoints": {
                 name: {"source": filter_.source, "task": task_to_json(filter_.task)}
                 if isinstance(filter_, ExternalFilter)
@@ -73,13 +72,14 @@ class Settings:
         def external(filter_: Mapping[str, Any]) -> ExternalFilter:
             return load_external(filter_["source"], stored_task(filter_["task"], given))
 
+        folders: Any = {name: {key: Path(path) for key, path in values[name].items()} for name in FOLDERS}
         return cls(
             Path(values["workspace"]),
-            {name: Path(path) for name, path in values["data"].items()},
-            {
+            checkpoints={
                 name: Path(filter_) if isinstance(filter_, str) else external(filter_)
                 for name, filter_ in values["checkpoints"].items()
             },
+            **folders,
             particles=values["particles"],
             seed=values["seed"],
             tasks=tuple(values["tasks"]),

@@ -26,6 +26,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.workspace.json_files import RecordCache, read_record
+from beliefscope.app.workspace.saved_filters import SavedFilters
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
@@ -55,6 +56,7 @@ class TraceStore:
         """worker: process that runs the filters; without one, they run in a thread."""
         self.settings = settings
         self.live = LiveRuns(settings.workspace / "live", settings.definitions)
+        self.saved = SavedFilters(settings.workspace, settings.definitions)
         self._records = RecordCache(partial(read_record, RECORD))
         self._worker = worker
         self._lock = threading.RLock()
@@ -69,7 +71,7 @@ class TraceStore:
     @cached_property
     def _catalogs(self) -> tuple[dict[str, TaskCatalog], list[str]]:
         settings = self.settings
-        return task_catalogs(settings.checkpoints, settings.data, settings.definitions, settings.secondary)
+        return task_catalogs(settings.checkpoints, settings.data, settings.definitions, self.saved)
 
     def problems(self) -> list[str]:
         """One line for each filter or data set of the settings that cannot be used."""
@@ -236,25 +238,6 @@ class TraceStore:
             catalog = self._catalog(task)
             return name or next(iter(catalog.data)), catalog.dataset(name)
 
-    def add_filter(self, task: str, name: str, checkpoint: Checkpoint, first: bool, saved: bool = False) -> None:
-        """Add a filter to the catalog and the settings, so that jobs find it by its name.
-
-        saved: whether it is from the list of saved filters.
-        """
-        with self._lock:
-            self._catalog(task).add_filter(name, checkpoint, first)
-            source = checkpoint.path or checkpoint
-            checkpoints = {**self.settings.checkpoints, name: source}
-            names = self.settings.saved | ({name} if saved else set())
-            self.settings = replace(self.settings, checkpoints=checkpoints, saved=names)
-
-    def remove_filter(self, task: str, name: str) -> None:
-        """Remove a filter from the catalog and the settings."""
-        with self._lock:
-            self._catalog(task).remove_filter(name)
-            others = {key: source for key, source in self.settings.checkpoints.items() if key != name}
-            self.settings = replace(self.settings, checkpoints=others, saved=self.settings.saved - {name})
-
     def close(self) -> None:
         """Stop the computations and close the data sets."""
         self._closing = True
@@ -283,7 +266,7 @@ class TraceStore:
         problems = []
         for source, load in candidates(task, name, self.settings):
             try:
-                self.add_filter(task, name, load(), first=False)
+                self._catalog(task).opened[name] = load()
                 return
             except BadInput as error:
                 problems.append(f"filter {name!r} of {source}: {error}")
@@ -377,11 +360,6 @@ def _run_in_worker(worker: TraceWorker, request: RunRequest, progress: Callable[
         with suppress(BadInput):
             return load_trace(path)
         path.unlink()
-    if not request.external and not Path(request.checkpoint).is_file():
-        raise BadInput(
-            f"filter {request.filter!r} cannot run: its checkpoint {request.checkpoint!r} was deleted or moved; reload "
-            "the page and select another filter"
-        )
     worker.run(request, progress)
     try:
         return load_trace(path)

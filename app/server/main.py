@@ -39,7 +39,6 @@ from beliefscope.app.api.models import Error
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import InProgress, NameTaken, NotFound, QueueFull
 from beliefscope.app.protocol.messages import MAP_SIZES, describe_error
-from beliefscope.app.runs.saved_filters import with_saved_filters
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.trace_worker import TraceWorker
@@ -75,7 +74,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     with contextlib.suppress(FileExistsError):  # reported by the code that needs the folder
         settings.workspace.mkdir(mode=0o700, parents=True)
     delete_abandoned_parts(settings.workspace)
-    store = TraceStore(with_saved_filters(settings), TraceWorker() if subprocess else None)
+    store = TraceStore(settings, TraceWorker() if subprocess else None)
     views = Views(store, settings.views)
     jobs = Jobs(settings.workspace / "jobs", settings=lambda: store.settings.to_json())
     viewer = WebViewer(settings.workspace / "cache")

@@ -14,9 +14,7 @@ from beliefscope.app.protocol.errors import NameTaken, NotFound
 
 RETENTION_DAYS = 14
 
-ID = re.compile(r"(?P<milliseconds>[0-9a-f]{1,16})-[0-9a-f]{8}")
-METADATA = ".about"
-"""Name under which earlier versions stored the metadata of a deleted file."""
+ID = re.compile(r"[0-9a-f]{1,16}-[0-9a-f]{8}")  # ms since 1970, and a random part
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class Trash:
     def _path(self, id: str) -> Path | None:
         with suppress(OSError):
             if ID.fullmatch(id):
-                return next((path for path in (self._folder / id).iterdir() if path.name != METADATA), None)
+                return next((self._folder / id).iterdir(), None)
         return None
 
     def _delete(self, id: str) -> None:

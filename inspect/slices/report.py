@@ -26,6 +26,9 @@ from beliefscope.inspect.traces.batch import trace_all
 MIN_SEARCHED = 8
 """Smallest number of episodes in which a search without a request by the user is worthwhile."""
 
+MAX_STEPS = 200_000
+"""Largest number of steps in such a search; limits memory."""
+
 
 @dataclass(frozen=True)
 class ErrorSlice:
@@ -190,6 +193,18 @@ def check_episodes(count: int) -> None:
     """Raise BadInput if a search in this number of episodes is unlikely to find a slice."""
     if count < MIN_SEARCHED:
         raise BadInput(f"{count} episode{'s' * (count != 1)}; a search for slices needs at least {MIN_SEARCHED}")
+
+
+def describe_slices(survey: Survey, episodes: Sequence[EpisodeCovariates], by: str) -> dict[str, Any]:
+    """The slices of a score as JSON values, or why they were not searched."""
+    try:
+        check_episodes(len(episodes))
+        if len(survey.step) > MAX_STEPS:
+            raise BadInput(f"{len(survey.step)} steps; slices are searched in at most {MAX_STEPS}")
+        slices = slices_of_survey(survey, episodes, by)
+    except BadInput as error:
+        return {"summary": f"Slices were not searched: {error}.", "rows": []}
+    return {"summary": slices.summary, "rows": as_json(slices.slices)}
 
 
 def slices_of_survey(

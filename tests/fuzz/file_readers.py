@@ -28,9 +28,9 @@ from valid_files import PAPER_LAYOUTS, episodes, write_episodes, write_paper_fil
 
 from beliefscope.app.api.finetune import routes as finetune_routes
 from beliefscope.app.jobs.queue import Job, Jobs
-from beliefscope.app.runs import saved_filters
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.workspace import saved_filters
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import FAULT_PRESETS, Faults
 from beliefscope.datasets.store import open_dataset
@@ -194,9 +194,9 @@ def write_saved_filters(path: Path) -> None:
 
 def read_saved_filters(path: Path) -> None:
     shutil.copy(path, path.parent / saved_filters.FILE)
-    settings = saved_filters.with_saved_filters(Settings(path.parent))
-    check_serializable(settings.to_json())
-    if not settings.checkpoints:
+    saved = saved_filters.SavedFilters(path.parent).all()
+    check_serializable([asdict(filter_) for filter_ in saved])
+    if not saved:
         raise BadInput("not a list of saved filters")
 
 

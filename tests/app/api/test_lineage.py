@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.runs.saved_filters import SavedFilter, save_filter
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.workspace.saved_filters import SavedFilter
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.filters.finetuning.choices import choices
 
@@ -70,7 +70,7 @@ def test_saved_filter_has_its_catalog_name(settings: Settings, client: TestClien
     hash_ = finetune(Path(str(settings.checkpoints["crossmodal-pf"])), settings.workspace, "only", 3)
     path = settings.workspace / "finetune/only/finetuned.safetensors"
     store: TraceStore = client.app.state.store  # type: ignore[attr-defined]
-    save_filter(store, SavedFilter("door", "crossmodal-pf-c0ffee", str(path), default=False))
+    store.saved.save(SavedFilter("door", "crossmodal-pf-c0ffee", str(path), default=False))
     names = {m["hash"]: m["catalog_name"] for m in client.get("/api/lineage/door").json()["members"]}
     assert names[hash_] == "crossmodal-pf-c0ffee"
 

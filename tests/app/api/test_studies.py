@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.result_filters import all_studies
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace.studies import BUILT_IN, FILE, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
