@@ -1,3 +1,5 @@
+import tempfile
+from contextlib import closing
 from pathlib import Path
 
 from beliefscope.app.cli import options as opt
@@ -23,16 +25,13 @@ def mcp(
       beliefscope mcp
       beliefscope mcp --data door.h5 --filter mine.safetensors --url http://127.0.0.1:8000
     """
-    from beliefscope.app.cli.commands.serve import filters_of_command_line
-    from beliefscope.app.runs.catalog import SAMPLE, short_names, task_catalogs
+    from beliefscope.app.cli.commands.serve import settings_of_command_line
+    from beliefscope.app.runs.trace_store import TraceStore
     from beliefscope.app.server.assistant import Assistant, build_server
-    from beliefscope.datasets.catalog import load_task
 
-    checkpoints = filters_of_command_line(filter or (), task or (), data or ())
-    own = opt.own_definitions(data or ())
-    tasks = [own.get(name) or load_task(name) for name in task or ()]
-    catalogs, problems = task_catalogs(checkpoints, short_names(data or (), {SAMPLE}), tasks)
-    if problems:
-        raise BadInput("; ".join(problems))
-    base = url and f"{url.rstrip('/')}/"
-    build_server(Assistant(catalogs, base, seed, particles)).run()
+    with tempfile.TemporaryDirectory(prefix="beliefscope-") as workspace:
+        settings = settings_of_command_line(Path(workspace), task, data, filter, seed=seed, particles=particles)
+        with closing(TraceStore(settings)) as store:
+            if problems := store.problems():
+                raise BadInput("; ".join(problems))
+            build_server(Assistant(store, url and f"{url.rstrip('/')}/")).run()

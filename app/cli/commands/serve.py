@@ -5,7 +5,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from beliefscope.app.cli import console, options as opt
 
@@ -62,8 +62,7 @@ def serve(
       beliefscope serve --task door --filter examples/04_own_filter.py:build
       beliefscope serve --task examples/own_task.py:TASK --data own.h5 --filter own.safetensors
     """
-    from beliefscope.app.runs.catalog import SAMPLE, short_names
-    from beliefscope.app.runs.settings import Settings
+    from beliefscope.app.runs.catalog import short_names
     from beliefscope.app.server import logs
     from beliefscope.app.server.auth import Access, host_names, token_for
     from beliefscope.app.workspace.studies import BUILT_IN, Study
@@ -71,14 +70,14 @@ def serve(
     opt.check_workspace(workspace)
     access = Access(token_for(host, token, os.environ), read_only)
     logs.configure(log_level, log_format, access.token)
-    settings = Settings(
-        workspace=workspace,
-        data=short_names(data or (), {SAMPLE}),
-        checkpoints=filters_of_command_line(filter or (), task or (), data or ()),
+    settings = settings_of_command_line(
+        workspace,
+        task,
+        data,
+        filter,
         hosts=(*host_names(host), *(allow_host or ())),
         seed=seed,
         views=views,
-        tasks=tuple(name for name in task or () if name not in opt.own_definitions(data or ())),
         studies=short_names(study or (), {BUILT_IN}),
         sweeps=short_names(sweep or ()),
     )
@@ -113,20 +112,25 @@ def serve_page(
         signal.signal(number, signal.SIG_IGN)  # the server has stopped; do not interrupt interpreter shutdown
 
 
-def filters_of_command_line(
-    filters: Sequence[str], tasks: Sequence[str], data: Sequence[Path] = ()
-) -> dict[str, Path | Checkpoint]:
-    """Displayed name -> checkpoint file or external filter; the page opens the first one.
+def settings_of_command_line(
+    workspace: Path,
+    tasks: Sequence[str] | None,
+    data: Sequence[Path] | None,
+    filters: Sequence[str] | None,
+    **others: Any,
+) -> Settings:
+    """Settings with tasks (names, definitions in files, or names that the data define), data sets and filters.
 
-    tasks: names, definitions in files, or names that the data define. data: files whose tasks the filters may name.
+    The page opens the first filter. others: further settings.
     """
-    from beliefscope.app.runs.catalog import PRETRAINED, short_names
+    from beliefscope.app.runs.catalog import PRETRAINED, SAMPLE, short_names
+    from beliefscope.app.runs.settings import Settings
     from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.names import is_code
 
-    needed = any(map(is_code, filters)) or any(":" not in name for name in tasks)
-    own = opt.own_definitions(data) if needed else {}
+    tasks, data, filters = tasks or (), data or (), filters or ()
+    own = opt.own_definitions(data) if tasks or any(map(is_code, filters)) else {}
     given = [own.get(name) or load_task(name) for name in tasks]
     files = short_names((Path(name) for name in filters if not is_code(name)), PRETRAINED)
     names = {path.resolve(): name for name, path in files.items()}
@@ -138,7 +142,8 @@ def filters_of_command_line(
         else:
             name = names[Path(text).resolve()]
             checkpoints[name] = files[name]
-    return checkpoints
+    named = tuple(name for name in tasks if name not in own)
+    return Settings(workspace, short_names(data, {SAMPLE}), checkpoints, tasks=named, **others)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from beliefscope.app.cli.commands.serve import _browser_opener, filters_of_command_line
+from beliefscope.app.cli.commands.serve import _browser_opener, settings_of_command_line
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server import timeouts
@@ -30,6 +30,7 @@ from beliefscope.app.server.main import create_app
 from beliefscope.app.server.timeouts import HTTPProtocol
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 
 pytestmark = pytest.mark.slow
@@ -101,7 +102,8 @@ def test_other_signals_end_the_jobs(tmp_path: Path) -> None:
 def test_filters_keep_their_order(tmp_path: Path) -> None:
     """The page opens the first one, whether it is a file or code."""
     code = "examples/04_own_filter.py:build"
-    filters = filters_of_command_line([str(tmp_path / "b.safetensors"), code, str(tmp_path / "a.safetensors")], [])
+    texts = [str(tmp_path / "b.safetensors"), code, str(tmp_path / "a.safetensors")]
+    filters = settings_of_command_line(tmp_path, [], [], texts).checkpoints
     assert [type(source).__name__ for source in filters.values()] == ["PosixPath", "ExternalFilter", "PosixPath"]
     assert [name for name in filters if len(name) == 1] == ["b", "a"]
 
@@ -122,16 +124,22 @@ def test_data_define_the_task_of_filters(tmp_path: Path) -> None:
         write_dataset(tmp_path / "own.h5", own, [replace(sample[0], task=own)])
     code = tmp_path / "own_filters.py"
     code.write_text(OWN)
+
+    def filters(function: str, tasks: list[str]) -> Iterable[Path | Checkpoint]:
+        return settings_of_command_line(
+            tmp_path, tasks, [tmp_path / "own.h5"], [f"{code}:{function}"]
+        ).checkpoints.values()
+
     for function in ("build", "named"):
         for tasks in ([], ["own"]):
-            (external,) = filters_of_command_line([f"{code}:{function}"], tasks, [tmp_path / "own.h5"]).values()
+            (external,) = filters(function, tasks)
             assert isinstance(external, ExternalFilter)
             assert external.task.name == "own"
-    (external,) = filters_of_command_line([f"{code}:named"], ["push"], [tmp_path / "own.h5"]).values()
+    (external,) = filters("named", ["push"])
     assert isinstance(external, ExternalFilter)
     assert external.task.name == "own"
     with pytest.raises(BadInput, match="task 'other' does not exist"):
-        filters_of_command_line([f"{code}:build"], ["other"], [tmp_path / "own.h5"])
+        filters("build", ["other"])
 
 
 def test_workspace_is_private(settings: Settings) -> None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import anyio
 import numpy as np
 import pytest
 
-from beliefscope.app.runs.catalog import task_catalogs
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.server.assistant import Assistant
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
@@ -26,8 +29,9 @@ RUN = {"task": "door", "filter": "crossmodal-ekf", "episode": 9, "faults": "blac
 
 
 @pytest.fixture(scope="module")
-def assistant() -> Assistant:
-    return Assistant(task_catalogs({}, {})[0], "http://127.0.0.1:8000/")
+def assistant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Assistant]:
+    with closing(TraceStore(Settings(tmp_path_factory.mktemp("workspace")))) as store:
+        yield Assistant(store, "http://127.0.0.1:8000/")
 
 
 def test_answers_agree_with_the_trace(assistant: Assistant) -> None:
