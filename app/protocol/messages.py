@@ -29,7 +29,7 @@ def _parse_faults(value: Any) -> Any:
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 class Cursor(_Message):

@@ -87,11 +87,8 @@ class View:
                 self._socket, self.idle_since = None, time.monotonic()
 
     async def _receive(self, websocket: WebSocket, text: str) -> None:
-        serial = None
         try:
-            decoded = read_json(text)
-            serial = decoded.get("serial") if isinstance(decoded, dict) else None
-            match message := VIEW_MESSAGE.validate_python(decoded):
+            match message := VIEW_MESSAGE.validate_json(text):
                 case Cursor():
                     self._newest = message
                     self._cursor_arrived.set()
@@ -102,9 +99,10 @@ class View:
                 case Theme():
                     await asyncio.to_thread(self.scene.set_dark, message.dark)
         except ValidationError as error:
+            serial = None
+            with contextlib.suppress(ValueError, AttributeError):  # not JSON, or not an object
+                serial = read_json(text).get("serial")
             await _send_error(websocket, serial, f"{describe_error(error)}.")
-        except ValueError as error:
-            await _send_error(websocket, serial, f"Not JSON: {error}.")
 
     async def _answer_cursors(self, websocket: WebSocket) -> None:
         while True:

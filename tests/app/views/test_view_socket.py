@@ -144,8 +144,8 @@ def test_outdated_cursors_are_skipped(
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("not json", "Not JSON"),
-        ("[1]", "Input should be a valid dictionary"),
+        ("not json", "Invalid JSON"),
+        ("[1]", "Input should be an object"),
         ("{}", "Unable to extract tag using discriminator 'type'"),
         (json.dumps(cursor(task="nothing")), "task 'nothing' does not exist"),
         (json.dumps(cursor(filter="nothing")), "filter 'nothing' does not exist"),
@@ -163,7 +163,7 @@ def test_outdated_cursors_are_skipped(
         (json.dumps(cursor(faults="delay=touch")), "modality of task 'door' 'touch' does not exist."),
         (json.dumps(cursor(size=10**6)), "cursor.size: Input should be 41 or 135."),
         (json.dumps(cursor(angle="wide")), "cursor.angle: Input should be a valid number."),
-        (json.dumps(cursor(angle=float("nan"))), "Not JSON: NaN is not a JSON number."),
+        (json.dumps(cursor(angle=float("nan"))), "cursor.angle: Input should be a finite number."),
     ],
 )
 def test_invalid_messages_are_answered_with_an_error(
