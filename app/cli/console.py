@@ -7,16 +7,13 @@ import os
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from beliefscope.app.jobs.remaining_time import RemainingTime
-
-if TYPE_CHECKING:
-    from beliefscope.inspect.diagnostics.views import Table
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -65,25 +62,14 @@ class Result:
         print(text if json_destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
 
 
-def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]], note: str = "") -> str:
-    """Format a table with a title and a note."""
-    from beliefscope.inspect.diagnostics.views import format_table
-
-    return format_table(title, columns, rows, note)
-
-
 def arrow(title: str, rows: Any) -> str:
     """Format an Arrow table; hashes are shortened."""
+    from beliefscope.inspect.diagnostics.views import format_table
 
     def short(value: Any) -> Any:
         return value[:12] if isinstance(value, str) and len(value) == 64 else value
 
-    return grid(title, rows.column_names, [list(map(short, row.values())) for row in rows.to_pylist()])
-
-
-def grids(tables: Iterable[Table]) -> list[str]:
-    """Format several tables."""
-    return [grid(table.title, table.columns, table.rows, table.note) for table in tables]
+    return format_table(title, rows.column_names, [list(map(short, row.values())) for row in rows.to_pylist()])
 
 
 @contextmanager

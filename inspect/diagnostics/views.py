@@ -39,6 +39,10 @@ class Table:
     rows: tuple[tuple[Value, ...], ...]
     note: str = ""
 
+    def __str__(self) -> str:
+        """The table as text."""
+        return format_table(self.title, self.columns, self.rows, self.note)
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -117,6 +121,11 @@ class Views(ABC):
     def tables(self) -> list[Table]:
         """The numbers as tables."""
         return []
+
+    @property
+    def text(self) -> str:
+        """Verdict and tables."""
+        return "\n\n".join([self.verdict, *map(str, self.tables())])
 
     def curves(self) -> list[Curve]:
         """Curves over the steps of one trace; empty for results over several traces."""

@@ -35,4 +35,4 @@ def calibrate(
         data_hash = data.hash
     report = fit([by_index[i] for i in fitted], [by_index[i] for i in tested], level, data_hash)
     save_calibration(report.calibration, output)
-    return console.Result(report.to_dict(), "\n\n".join([report.verdict, *console.grids(report.tables())]), output)
+    return console.Result(report.to_dict(), report.text, output)

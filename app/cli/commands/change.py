@@ -78,7 +78,6 @@ def change(
         "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
         "serve": serve_command([text for text in (before, after) if is_path(text)], data, seed),
     }
-    text = "\n\n".join([report.verdict, *console.grids(report.tables())])
     if output is not None:
-        write_comparison(output, document, text, report.plot())
-    return console.Result(document, text)
+        write_comparison(output, document, report.text, report.plot())
+    return console.Result(document, report.text)

@@ -45,6 +45,7 @@ def collect(
     from beliefscope.datasets.dataset_statistics import PAPER_DATA, comparison_table, default_size, statistics
     from beliefscope.datasets.simulation.collect import collect as simulate
     from beliefscope.datasets.store import open_dataset
+    from beliefscope.inspect.diagnostics.views import format_table
 
     name = load_task(task).name
     count, length = (value or default for value, default in zip((episodes, steps), default_size(name), strict=True))
@@ -66,5 +67,5 @@ def collect(
             "data_hash": data.hash,
         }
     summary = f"{count} episodes of {length} steps, {ours['contact_fraction']:.0%} in contact"
-    table = console.grid("Statistics over all steps", *comparison_table(ours, paper))
+    table = format_table("Statistics over all steps", *comparison_table(ours, paper))
     return console.Result(document, f"{summary}\n\n{table}", output)

@@ -64,4 +64,4 @@ def counterfactual(
         **result.to_dict(),
         "intervention": intervention.to_json(),
     }
-    return console.Result(document, "\n\n".join([result.verdict, *console.grids(result.tables())]))
+    return console.Result(document, result.text)

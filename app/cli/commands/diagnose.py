@@ -90,7 +90,7 @@ def diagnose(
             workers=workers,
             progress=advance,
         )
-    document, parts = result.to_json(), [result.headline, *console.grids(result.tables())]
+    document, parts = result.to_json(), [result.headline, *map(str, result.tables())]
     if failed is not None:
         run_ = trace(checkpoint, failed, repair or 0, seed=runs.seed, particles=runs.particles, faults=faults)
         smallest = smallest_repair(checkpoint, run_, healthy_bound(profile.statistics), failed if faults else None)

@@ -80,4 +80,4 @@ def evaluate(
     }
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episodes"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
-    return console.Result(document, "\n\n".join(console.grids(accuracy_tables(title, metrics))))
+    return console.Result(document, "\n\n".join(map(str, accuracy_tables(title, metrics))))

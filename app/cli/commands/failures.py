@@ -61,7 +61,7 @@ def failures(
         "events": [as_json(event) | {"link": link} for event, link in zip(events, links, strict=True)],
         "serve": serve_command([runs.filter] if is_path(runs.filter) else [], runs.data, runs.seed),
     }
-    text = "\n\n".join([report.verdict, *console.grids([report.phase_table(), report.event_table(events)])])
+    text = "\n\n".join([report.verdict, str(report.phase_table()), str(report.event_table(events))])
     if url is not None:
         text = "\n".join([text, f"Permalinks, for {document['serve']}", *links])
     if runs.particles != 300 and report.particles:

@@ -234,13 +234,14 @@ def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) ->
 def _summary(record: dict[str, Any]) -> list[str]:
     """Lines about training, errors before and after, and frozen tensors."""
     from beliefscope.filters.finetuning.report import held_out_rows, training_summary
+    from beliefscope.inspect.diagnostics.views import format_table
 
     frozen = record["frozen"]
     unchanged = f"Frozen: {frozen['tensors']} tensors, unchanged (hash {frozen['after'][:12]})."
     return [
         training_summary(record),
         "",
-        console.grid("On held-out episodes", ["", "before", "after", "change"], held_out_rows(record)),
+        format_table("On held-out episodes", ["", "before", "after", "change"], held_out_rows(record)),
         "",
         unchanged if frozen["tensors"] else "No tensor was frozen.",
     ]

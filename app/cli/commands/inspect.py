@@ -56,10 +56,7 @@ def inspect(
         figures.mkdir(parents=True, exist_ok=True)
         for name, result in results.items():
             write_figure(result.plot(traces[0].episode.time), figures / f"{name}.{format}")
-    text = [
-        "\n\n".join([f"{DIAGNOSTICS[name].title}: {result.verdict}", *console.grids(result.tables())])
-        for name, result in results.items()
-    ]
+    text = [f"{DIAGNOSTICS[name].title}: {result.text}" for name, result in results.items()]
     text += [f"{DIAGNOSTICS[name].title}: not available: {reason}" for name, reason in reasons.items()]
     document = {
         "task": traces[0].task.name,

@@ -24,6 +24,7 @@ def modules(
     from beliefscope.filters.finetuning.module_selection import module_change, module_tree, presets, select_parameters
     from beliefscope.filters.finetuning.report import module_table
     from beliefscope.filters.open_filter import open_filter
+    from beliefscope.inspect.diagnostics.views import format_table
 
     checkpoint = open_filter(task, filter)
     module = checkpoint.adapter.module if isinstance(checkpoint, ExternalFilter) else checkpoint.filter
@@ -37,6 +38,6 @@ def modules(
         "modules": [node.to_json() | module_change(node.name, parts) for node in nodes],
     }
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}): {nodes[0].parameters:,} parameters"
-    lines = [console.grid(title, *module_table(nodes, parts, depth)), "", "Presets for --train"]
+    lines = [format_table(title, *module_table(nodes, parts, depth)), "", "Presets for --train"]
     lines += [f"  {name}: {', '.join(patterns)}" for name, patterns in groups.items()]
     return console.Result(document, "\n".join(lines))

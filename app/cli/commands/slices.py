@@ -35,4 +35,4 @@ def slices(
             **runs.settings(faults),
             progress=advance,
         )
-    return console.Result(report.to_dict(), "\n\n".join([report.verdict, *console.grids(report.tables())]))
+    return console.Result(report.to_dict(), report.text)

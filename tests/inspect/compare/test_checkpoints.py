@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 
-from beliefscope.app.cli import console
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -300,9 +299,7 @@ def test_views_and_figure() -> None:
     assert all(len(row) == len(t["columns"]) for t in views["tables"] for row in t["rows"])
     explained = {t["title"]: t["note"].partition(" ")[0] for t in views["tables"] if t["note"]}
     assert explained == {"Regressions": "change:", "Beliefs by slice": "effect"}
-    assert "NLL: difference / number of state components" in "\n".join(console.grids(result.tables())).replace(
-        "\n  ", " "
-    )
+    assert "NLL: difference / number of state components" in "\n".join(map(str, result.tables())).replace("\n  ", " ")
     assert json.loads(json.dumps(result.to_dict(), allow_nan=False))["verdict"] == result.verdict
     assert [axes.get_title(loc="left") for axes in result.plot().axes][:2] == [
         "Position by slice",
