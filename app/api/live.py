@@ -94,8 +94,10 @@ def routes(store: TraceStore) -> APIRouter:
         await websocket.accept()
         try:
             while True:
-                request = _parse_request(await websocket.receive_text())
+                request = StepsRequest.model_validate_json(await websocket.receive_text())
                 await websocket.send_bytes(await _next_block(runs, name, request))
+        except ValidationError as error:
+            await websocket.close(4000, close_reason(f"invalid request for steps: {describe_error(error)}"))
         except BadInput as error:
             await websocket.close(4000, close_reason(str(error)))
         except (WebSocketDisconnect, KeyError):  # KeyError: a binary message
@@ -112,13 +114,6 @@ def routes(store: TraceStore) -> APIRouter:
         return StreamingResponse(_follow_file(run, path), media_type="application/octet-stream")
 
     return router
-
-
-def _parse_request(text: str) -> StepsRequest:
-    try:
-        return StepsRequest.model_validate_json(text)
-    except ValidationError as error:
-        raise BadInput(f"invalid request for steps: {describe_error(error)}") from None
 
 
 async def _next_block(runs: LiveRuns, name: str, request: StepsRequest) -> bytes:

@@ -14,7 +14,9 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from html import escape
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import urlencode
+
+from starlette.requests import cookie_parser
 
 from beliefscope.app.server.plain_pages import plain_page
 from beliefscope.datasets.errors import BadInput
@@ -87,8 +89,7 @@ class SignIn:
     def has_cookie(self, host: str, cookies: str) -> bool:
         """Whether the cookies of a request to ``host`` contain the valid one."""
         # Not http.cookies, which drops all cookies if one, possibly of another server, is malformed.
-        pairs = (part.strip().partition("=") for part in cookies.split(";"))
-        value = {name: value for name, _, value in pairs}.get(_cookie_name(host), "")
+        value = cookie_parser(cookies).get(_cookie_name(host), "")
         return hmac.compare_digest(value.encode(), self._cookie.encode())
 
     def accepts(self, token: str, address: str) -> bool:
@@ -121,17 +122,6 @@ def _cookie_name(host: str) -> str:
     # Browsers ignore the port of cookies; without it in the name, servers on one machine would overwrite each other's.
     port = host.rpartition(":")[2] if ":" in host and not host.endswith("]") else "80"
     return f"beliefscope-{port}"
-
-
-def token_from_query(query: str) -> str:
-    """The token in a query string, or empty."""
-    return dict(parse_qsl(query, keep_blank_values=True)).get("token", "")
-
-
-def address_without_token(query: str) -> str:
-    """The page's address with the query string except the token."""
-    rest = [(key, value) for key, value in parse_qsl(query, keep_blank_values=True) if key != "token"]
-    return "/?" + urlencode(rest) if rest else "/"
 
 
 def redirect_page(address: str) -> str:

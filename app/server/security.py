@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import URL, Headers, MutableHeaders, QueryParams
 from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -25,11 +25,9 @@ from beliefscope.app.server.auth import (
     Access,
     SignIn,
     TooManyAttempts,
-    address_without_token,
     is_address,
     redirect_page,
     sign_in_page,
-    token_from_query,
 )
 
 HOST = re.compile(r"(?P<name>\[[^\[\]]*\]|[^:\[\]]*)(:\d{0,5})?")
@@ -151,26 +149,25 @@ class Guard:
         """The response to an unauthenticated request, or the cookie for a valid token; None if authenticated."""
         is_page = scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and scope["path"] == "/"
         query = scope.get("query_string", b"").decode("latin-1")
-        token = bearer or (token_from_query(query) if is_page else "")
+        token = bearer or (QueryParams(query).get("token", "") if is_page else "")
+        address = str(URL(f"/?{query}").remove_query_params("token"))
         uncached = {"cache-control": "no-store"}
         try:
             if not token or not sign_in.accepts(token, _address(scope)):
                 if not bearer and sign_in.has_cookie(host, cookies):
-                    return Reply(303, "", {"location": address_without_token(query)}) if token else None
+                    return Reply(303, "", {"location": address}) if token else None
                 reason = "The token is wrong." if token else "This server requires a token."
                 reason += " Open the link that `beliefscope serve` printed, or enter the token."
                 challenge = uncached | {"www-authenticate": "Bearer"}
-                return Reply(
-                    401, reason, challenge, sign_in_page(reason, address_without_token(query)) if is_page else ""
-                )
+                return Reply(401, reason, challenge, sign_in_page(reason, address) if is_page else "")
         except TooManyAttempts as error:
             wait = f"{max(1.0, error.args[0]):.0f}"
             reason = f"Too many wrong tokens from this address; try again in {wait} s."
-            page = sign_in_page(reason, address_without_token(query)) if is_page else ""
+            page = sign_in_page(reason, address) if is_page else ""
             return Reply(429, reason, uncached | {"retry-after": wait}, page)
         if bearer:
             return None
-        page = redirect_page(address_without_token(query))
+        page = redirect_page(address)
         return Reply(200, "", uncached | {"set-cookie": sign_in.cookie(host)}, page)
 
 

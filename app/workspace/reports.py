@@ -4,38 +4,17 @@ import re
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, TypeAdapter
+from pydantic import TypeAdapter
 
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.workspace.json_files import RecordCache, read_record
+from beliefscope.app.workspace.json_files import RecordCache, content
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.app.workspace.trash import Trash, disk_usage
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.io.strict_json import read_json
 
 NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
-
-
-class ManifestRun(BaseModel):
-    """The run of a report."""
-
-    episode: int
-    faults: Any
-
-
-class Manifest(BaseModel):
-    """Fields of a report's manifest (``recordings.report``). made: ISO 8601. files: SHA-256 by name."""
-
-    title: str
-    made: str
-    task: str
-    filter: str
-    traces: Annotated[list[ManifestRun], Field(min_length=1, max_length=1)]
-    files: dict[str, str]
-
-
-MANIFEST = TypeAdapter(Manifest)
 
 
 @dataclass(frozen=True)
@@ -52,6 +31,9 @@ class ReportEntry:
     faults: str
     bytes: int
     pdf: str | None
+
+
+ENTRY = TypeAdapter(ReportEntry)
 
 
 class ReportFolder:
@@ -79,17 +61,20 @@ class ReportFolder:
 
 
 def _read_entry(path: Path) -> ReportEntry:
-    """A report from its manifest. Raises OSError or ValueError."""
-    manifest, name = read_record(MANIFEST, path), path.parent.name
-    return ReportEntry(
-        name=name,
-        url=f"/api/reports/{name}.html",
-        title=manifest.title,
-        created=manifest.made,
-        task=manifest.task,
-        filter=manifest.filter,
-        episode=manifest.traces[0].episode,
-        faults=str(Faults.from_json(manifest.traces[0].faults)),
-        bytes=disk_usage(path.parent),
-        pdf=f"/api/reports/{name}.pdf" if "report.pdf" in manifest.files else None,
-    )
+    """A report from its manifest (``recordings.report``). Raises OSError or ValueError."""
+    manifest, name = read_json(content(path)), path.parent.name
+    try:
+        (run,) = manifest["traces"]
+        entry = {
+            "name": name,
+            "url": f"/api/reports/{name}.html",
+            **{key: manifest[key] for key in ("title", "task", "filter")},
+            "created": manifest["made"],
+            "episode": run["episode"],
+            "faults": str(Faults.from_json(run["faults"])),
+            "bytes": disk_usage(path.parent),
+            "pdf": f"/api/reports/{name}.pdf" if "report.pdf" in manifest["files"] else None,
+        }
+    except (LookupError, TypeError) as error:
+        raise ValueError(f"invalid manifest: {error}") from None
+    return ENTRY.validate_python(entry, strict=True)
