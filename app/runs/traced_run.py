@@ -12,7 +12,7 @@ from beliefscope.app.protocol.map_format import EncodedMaps, encode_maps
 from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.out_of_distribution import data_warning
-from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
+from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap, MapEngine, missing_quantities, no_maps
 from beliefscope.inspect.trace import Trace, arrays_of

@@ -77,4 +77,4 @@ def _read_entry(path: Path) -> ReportEntry:
         }
     except (LookupError, TypeError) as error:
         raise ValueError(f"invalid manifest: {error}") from None
-    return ENTRY.validate_python(entry, strict=True)
+    return ENTRY.validate_python(entry)

@@ -36,8 +36,8 @@ from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
 from beliefscope.inspect.diagnosis.undo import brings_back
 from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
-from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
-from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile, profile_document
+from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -189,17 +189,6 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
             f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
         )
     return profile
-
-
-def no_diagnosis(checkpoint: Checkpoint) -> str | None:
-    """Reason why a filter has no diagnosis; None if it has one."""
-    lacking = "no healthy record"
-    if (document := profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)) is not None:
-        count = document.get("episodes") if isinstance(document, dict) else None
-        if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
-            return None
-        lacking = f"a healthy record of {count} episodes, fewer than the {MIN_HEALTHY} needed"
-    return f"this filter has {lacking}"
 
 
 def confirm(

@@ -16,7 +16,8 @@ import numpy as np
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
-from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile, profile_document
 from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LEVER, LOST, RISING, label_of, unit_of
 from beliefscope.inspect.diagnostics.views import Table
 
@@ -295,3 +296,14 @@ def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
 
 def _number(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 10 else f"{value:.0f}"
+
+
+def no_diagnosis(checkpoint: Checkpoint) -> str | None:
+    """Reason why a filter has no diagnosis; None if it has one."""
+    lacking = "no healthy record"
+    if (document := profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)) is not None:
+        count = document.get("episodes") if isinstance(document, dict) else None
+        if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
+            return None
+        lacking = f"a healthy record of {count} episodes, fewer than the {MIN_HEALTHY} needed"
+    return f"this filter has {lacking}"

@@ -105,8 +105,7 @@ def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:
     clean: number of held-out episodes that are known to be clean.
     """
     from beliefscope.datasets.store import sample_path
-    from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
-    from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
+    from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, no_diagnosis
 
     if reason := no_diagnosis(checkpoint):
         data = str(runs.data or sample_path(checkpoint.task)) if clean >= MIN_HEALTHY else "CLEAN.h5"

@@ -33,8 +33,9 @@ from beliefscope.inspect.diagnosis.deviations import (
     focus,
     observe,
 )
-from beliefscope.inspect.diagnosis.diagnose import diagnose, no_diagnosis, preliminary
+from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
+from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.trace import Trace
