@@ -14,7 +14,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -110,7 +110,7 @@ class Jobs:
         kinds: Mapping[str, str] = KINDS,
         max_running: int = MAX_RUNNING,
         max_waiting: int = MAX_WAITING,
-        settings: Callable[[], Mapping[str, Any]] = dict,
+        settings: Mapping[str, Any] | None = None,
     ) -> None:
         self._folder, self._settings, self._kinds = folder, settings, kinds
         self._max_running, self._max_active = max_running, max_running + max_waiting
@@ -200,7 +200,7 @@ class Jobs:
             self._save(job)
             self._jobs[id] = job
             begun = threading.Event()
-            self._executor.submit(self._run, id, {**arguments, "settings": self._settings()}, begun)
+            self._executor.submit(self._run, id, {**arguments, "settings": self._settings}, begun)
             for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
                 self._delete(job.id)
         if active < self._max_running:

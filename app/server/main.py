@@ -76,7 +76,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     delete_abandoned_parts(settings.workspace)
     store = TraceStore(settings, TraceWorker() if subprocess else None)
     views = Views(store, settings.views)
-    jobs = Jobs(settings.workspace / "jobs", settings=lambda: store.settings.to_json())
+    jobs = Jobs(settings.workspace / "jobs", settings=settings.to_json())
     viewer = WebViewer(settings.workspace / "cache")
     files = RecordingFolder(settings.workspace / "recordings")
 
