@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,16 @@ QUANTITIES = {
     "effector_step": "effector displacement per step",
 }
 MEASURES = {"std": "standard deviation"}
+
+
+def component_ranges(episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
+    """Unit, smallest and largest finite value of each state component, which show wrong units."""
+    states = np.concatenate([episode.states for episode in episodes])
+    return {
+        component.name: {"unit": component.unit, "min": float(finite.min()) + 0.0, "max": float(finite.max()) + 0.0}
+        for component, values in zip(episodes[0].task.components, states.T, strict=True)
+        if len(finite := values[np.isfinite(values)])
+    }
 
 
 @dataclass(frozen=True)

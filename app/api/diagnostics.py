@@ -11,7 +11,6 @@ from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models import JobReply, Progress, Reply, ResultViews, fields_of
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
-from beliefscope.app.protocol.diagnostic_options import parse_options
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
@@ -59,7 +58,7 @@ def _entry(name: str) -> Entry:
 
 
 def _options(name: str, request: Request) -> dict[str, Any]:
-    return parse_options(_entry(name), {k: v for k, v in request.query_params.items() if k not in RUN_PARAMETERS})
+    return _entry(name).parse_options({k: v for k, v in request.query_params.items() if k not in RUN_PARAMETERS})
 
 
 RequestedEntry = Annotated[Entry, Depends(_entry)]

@@ -8,12 +8,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import find_profile
@@ -91,6 +91,25 @@ class Entry:
             for name, meaning in self.options.items()
         ]
         return {name: getattr(self, name) for name in ("name", "title", "question", "slow")} | {"options": options}
+
+    def parse_options(self, texts: Mapping[str, str]) -> dict[str, Any]:
+        """Convert texts, such as those of a query string, to the types of the options; an empty text is the default.
+
+        Raises BadInput for an unknown option or an invalid value.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        hints = get_type_hints(self.run)
+        options: dict[str, Any] = {}
+        for name, text in texts.items():
+            check_name(f"option of {self.name}", name, self.options)
+            try:
+                if text:
+                    options[name] = TypeAdapter(hints.get(name, str)).validate_strings(text)
+            except ValidationError as error:
+                option = f"option {name!r} of {self.name} ({self.options[name]})"
+                raise BadInput(f"{option} is {text!r}: {error.errors()[0]['msg']}.") from None
+        return options
 
     def refusal(self, trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         """One-line reason why the diagnostic cannot be computed, or None."""

@@ -8,7 +8,6 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
 
 if TYPE_CHECKING:
-    from beliefscope.datasets.episode import Episode
     from beliefscope.inspect.trace import Trace
 
 RECORDINGS = (".rrd", ".live")
@@ -60,6 +59,7 @@ def import_(
       beliefscope import drive.mcap --map map.toml -o drive.h5
     """
     from beliefscope.datasets.dataset import SPLITS
+    from beliefscope.datasets.dataset_statistics import component_ranges
     from beliefscope.datasets.store import write_dataset
     from beliefscope.recordings.log_readers.column_map import read_map
     from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
@@ -87,12 +87,12 @@ def import_(
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
         result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
-        ranges = _ranges([episodes[episode]])
+        ranges = {"dt": episodes[episode].dt, "ranges": component_ranges([episodes[episode]])}
         return replace(result, document={**result.document, **ranges}, text=f"{result.text}, {_values(ranges)}")
     check_complete(episodes)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
-    ranges = _ranges(episodes)
+    ranges = {"dt": episodes[0].dt, "ranges": component_ranges(episodes)}
     document = {"task": mapping.task, "episodes": len(episodes), "steps": steps} | ranges
     count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
     splits = {name: sum(episode.split == name for episode in episodes) for name in SPLITS}
@@ -101,21 +101,8 @@ def import_(
     return console.Result(document, f"{count} of {mapping.task}, {steps} steps, {_values(ranges)}", output)
 
 
-def _ranges(episodes: list[Episode]) -> dict[str, Any]:
-    """Duration of a step, and the smallest and largest value of each component: they show wrong units."""
-    import numpy as np
-
-    states = np.concatenate([episode.states for episode in episodes])
-    ranges = {
-        component.name: {"unit": component.unit, "min": float(finite.min()) + 0.0, "max": float(finite.max()) + 0.0}
-        for component, values in zip(episodes[0].task.components, states.T, strict=True)
-        if len(finite := values[np.isfinite(values)])
-    }
-    return {"dt": episodes[0].dt, "ranges": ranges}
-
-
 def _values(document: dict[str, Any]) -> str:
-    """``_ranges`` as text."""
+    """Duration of a step and ranges of the components as text."""
     parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in document["ranges"].items()]
     return "; ".join([f"{document['dt']:.4g} s each", *parts])
 

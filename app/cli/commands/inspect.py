@@ -30,7 +30,6 @@ def inspect(
       beliefscope inspect run.trace --only saliency --option step=68 --option target=beta:image
       beliefscope inspect run.trace --filter mine.safetensors --all --json -
     """
-    from beliefscope.app.protocol.diagnostic_options import parse_options
     from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
     from beliefscope.inspect.diagnostics.plotting import write_figure
     from beliefscope.recordings.open_trace import open_traces
@@ -43,7 +42,7 @@ def inspect(
     for name in values:
         check_name("option", name, available)
     parsed = {
-        name: parse_options(entry, {option: values[option] for option in entry.options if option in values})
+        name: entry.parse_options({option: values[option] for option in entry.options if option in values})
         for name, entry in entries.items()
     }
     opt.check_folder(figures, "--figures")
