@@ -35,6 +35,18 @@ def check_array(stored: h5py.Dataset, place: str) -> None:
         raise BadInput(f"{place} declares {declared} bytes of numbers, but the file stores {size}.")
 
 
+def numeric_arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """All arrays of numbers by their path in the file."""
+    arrays: dict[str, h5py.Dataset] = {}
+
+    def visit(name: str, item: h5py.HLObject) -> None:
+        if isinstance(item, h5py.Dataset) and item.shape and item.dtype.kind in "biuf":
+            arrays[name] = item
+
+    file.visititems(visit)
+    return arrays
+
+
 def read_array(stored: h5py.Dataset, place: str) -> NDArray[Any]:
     """Read an array after ``check_array``."""
     check_array(stored, place)

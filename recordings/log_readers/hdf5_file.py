@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.readers.hdf5_guard import open_hdf5
-from beliefscope.datasets.readers.hdf5_limits import check_array, read_array
+from beliefscope.datasets.readers.hdf5_limits import check_array, numeric_arrays, read_array
 from beliefscope.recordings.log_readers.arrays import Wanted, check_size, unread
 
 SUFFIXES = (".h5", ".hdf5")
@@ -28,13 +27,7 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     with open_hdf5(path) as file:
         if "format" in file.attrs and str(file.attrs["format"]).startswith("beliefscope"):
             raise BadInput(f"{path.name} is a data set already: pass it as --data")
-        arrays: dict[str, h5py.Dataset] = {}
-
-        def visit(name: str, item: h5py.HLObject) -> None:
-            if isinstance(item, h5py.Dataset) and item.shape and item.dtype.kind in "biuf":
-                arrays[name] = item
-
-        file.visititems(visit)
+        arrays = numeric_arrays(file)
         groups = _episodes(list(arrays))
         if not groups:
             return {name: _values(name, stored, wanted(name)) for name, stored in arrays.items()}
@@ -58,13 +51,13 @@ def _episodes(names: list[str]) -> list[str]:
     return []
 
 
-def _of_group(path: Path, arrays: dict[str, h5py.Dataset], group: str, name: str, wanted: bool) -> NDArray[Any]:
+def _of_group(path: Path, arrays: dict[str, Any], group: str, name: str, wanted: bool) -> NDArray[Any]:
     if (stored := arrays.get(f"{group}/{name}")) is None:
         raise BadInput(f"{path.name} has no array {group}/{name}, which other episodes have")
     return _values(name, stored, wanted)
 
 
-def _values(name: str, stored: h5py.Dataset, wanted: bool) -> NDArray[Any]:
+def _values(name: str, stored: Any, wanted: bool) -> NDArray[Any]:
     if wanted:
         return read_array(stored, f"array {name!r}")
     check_array(stored, f"array {name!r}")
