@@ -227,13 +227,16 @@ def _draw_effector(axes: Axes, effector: NDArray[np.float32]) -> None:
 def weights_figure(trace: Trace) -> Figure:
     """Estimates of the map components, and the weights below, over steps with shaded contact.
 
-    Component-wise weights are drawn for the map components. Raises BadInput for a trace without weights.
+    Component-wise weights are drawn for the map components. Raises BadInput for a trace without weights; the network's
+    output beta suffices.
     """
-    if why := weight_audit.why_not(trace):
+    effective, beta = trace.effective_weights, trace.weights
+    if (why := weight_audit.why_not(trace)) and (effective is not None or beta is None):
         raise BadInput(f"no weights to draw: {why}")
-    assert trace.effective_weights is not None
+    weights = effective if effective is not None else beta
+    assert weights is not None
     task = trace.task
-    component_wise = trace.effective_weights.shape[-1] > 1
+    component_wise = weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)
     with rc_context(STYLE):
         legends = 2.0 * legend_height([*map(measures.layer_label, measures.layers(trace)), "truth"])
@@ -272,17 +275,18 @@ def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
 
 
 def _draw_weights(axes: Axes, trace: Trace, column: int) -> None:
-    assert trace.effective_weights is not None
-    steps, beta = _step_axis(trace).positions, trace.weights
-    beta_is_effective = beta is not None and np.allclose(beta, trace.effective_weights, atol=1e-3)
+    steps, beta, effective = _step_axis(trace).positions, trace.weights, trace.effective_weights
+    beta_is_effective = beta is not None and (effective is None or np.allclose(beta, effective, atol=1e-3))
     for k, modality in enumerate(trace.modalities):
         shade = colour(modality, trace.modalities)
         if beta is not None:
             axes.plot(steps, beta[:, k, column], label=f"{modality} beta", color=shade, lw=1.1)
-        if not beta_is_effective:
-            share = trace.effective_weights[:, k, column]
-            axes.plot(steps, share, label=f"{modality} effective", color=shade, lw=0.8, ls=(0, (2, 1.5)))
-    low, high = float(trace.effective_weights.min()), float(trace.effective_weights.max())
+        if not beta_is_effective and effective is not None:
+            axes.plot(
+                steps, effective[:, k, column], label=f"{modality} effective", color=shade, lw=0.8, ls=(0, (2, 1.5))
+            )
+    drawn = beta if effective is None else effective
+    low, high = (0.0, 1.0) if drawn is None else (float(drawn.min()), float(drawn.max()))
     axes.set_ylim(
         min(low, 0.0) - 0.03, max(high, 1.0) + 0.03
     )  # effective weights of a product of experts may exceed 0..1

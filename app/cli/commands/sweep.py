@@ -59,6 +59,9 @@ def sweep(
     cells = inputs.cells(block)
     opt.check_output(output / "results.parquet" if output.is_dir() else output)
     output.mkdir(exist_ok=True)
+    used = {cell.checkpoint for cell in cells}
+    if idle := [path.name for path in inputs.checkpoints if path not in used]:
+        console.note(f"Warning: no data of their tasks, or copies of other checkpoints: {', '.join(idle)}")
     console.note(f"{len(cells)} cells; if interrupted, the same command resumes")
     with console.bars() as update:
         table = run_sweep(

@@ -192,3 +192,10 @@ def test_refusals(tmp_path: Path) -> None:
         paper.weights_figure(unweighted)
     with pytest.raises(BadInput, match="the trace is from checkpoint"):
         paper.maps_figure(checkpoint, replace(traced, checkpoint_hash="other"), {True: 40}, SIZE)
+
+
+def test_weights_without_effective_ones_are_the_output_of_the_network() -> None:
+    """An external filter may report its fusion weights only."""
+    _, traced = run("crossmodal-ekf")
+    axes = paper.weights_figure(replace(traced, effective_weights=None)).axes[-1]
+    assert {line.get_label() for line in axes.lines} == {"image beta", "haptics beta"}
