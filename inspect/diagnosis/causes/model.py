@@ -16,7 +16,7 @@ def causes_of(modality: str, title: str, check: str = "", belief: str = FILTER) 
     module = f"*{modality}*"
     finetune = "`beliefscope finetune {task} --filter {filter} --train"
     retrain = f"{check}Fine-tune it: {finetune} {modality}-only -o tuned.safetensors`."
-    calibrate = f"Calibrate it: {finetune} noise-only -o tuned.safetensors`."
+    calibrate = f"{check}Calibrate it: {finetune} noise-only -o tuned.safetensors`."
     return (
         Cause(
             f"{name}.bias",

@@ -152,9 +152,13 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
 
 
 def _models(task: Task) -> tuple[Cause, ...]:
-    """Causes in measurement models of modalities that the catalog does not have, or whose sensors it does not have."""
+    """Causes in measurement models of modalities that the catalog does not have, or whose sensors it cannot check.
+
+    These are sensors of other names and, without a measured hand, force and torque: their signs and axes.
+    """
     check = "Check the calibration of its sensors, whose offsets and scales have the same symptoms. "
-    names = [name for name, keys in task.modalities.items() if name not in MODALITIES or not {*keys} & {*KNOWN}]
+    checked = {*KNOWN} if HAND in task.observations else {"image"}
+    names = [name for name, keys in task.modalities.items() if name not in MODALITIES or not {*keys} & checked]
     title = "Sensors or model of {}"  # their fusion weights may depend on their models
     return tuple(c for n in names for c in model.causes_of(n, title.format(display_name(n)), check, WEIGHTS))
 

@@ -164,6 +164,12 @@ def test_models_of_sensors_with_own_names_may_have_faulty_sensors() -> None:
     titles = {cause.name: cause.title for cause in causes_of(WRENCH)}
     assert titles["model.haptics.broken"] == "Sensors or model of haptics broken"
     assert {"weights.ignores_camera", "weights.ignores_haptics"} <= titles.keys()
+    forces = replace(WRENCH, observations={"force": (3,)}, modalities={"haptics": ("force",)})
+    (sign,) = (cause for cause in causes_of(forces) if cause.name == "model.haptics.underconfident")
+    assert sign.title == "Sensors or model of haptics underconfident", (
+        "without a hand, no law shows the sign of a force"
+    )
+    assert sign.next.startswith("Check the calibration of its sensors")
     assert [cause.title for cause in causes_of(DOOR) if cause.name == "model.haptics.broken"] == [
         "Haptics model broken"
     ]
@@ -183,4 +189,7 @@ def test_inverted_dynamics_are_not_frozen() -> None:
 
     inverted, frozen = ranked(WRENCH, *slope(-1.0)), ranked(WRENCH, *slope(0.1))
     assert inverted["dynamics.inverted"] > 0.7
+    gain = Deviation("control gain/control x 0/all", 1.0, -1.0, -1.1, -0.9, 0.0, True, 20.0)
+    wrong = ranked(WRENCH, *slope(-1.0), gain)
+    assert wrong["control.scale"] > 0.7 > 0.3 > wrong["dynamics.inverted"], "the controls themselves are inverted"
     assert frozen["dynamics.frozen"] > 0.7 > 0.1 > frozen["dynamics.inverted"]
