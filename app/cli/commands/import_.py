@@ -60,11 +60,10 @@ def import_(
     """
     from beliefscope.datasets.dataset import SPLITS
     from beliefscope.datasets.dataset_statistics import component_ranges
-    from beliefscope.datasets.store import write_dataset
     from beliefscope.recordings.log_readers.column_map import read_map
     from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
     from beliefscope.recordings.log_readers.guess import guess_map
-    from beliefscope.recordings.log_readers.read_log import check_complete, read_log, recorded_trace
+    from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
     from beliefscope.recordings.open_trace import open_recording
 
     if guess:
@@ -89,16 +88,25 @@ def import_(
         result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
         ranges = {"dt": episodes[episode].dt, "ranges": component_ranges([episodes[episode]])}
         return replace(result, document={**result.document, **ranges}, text=f"{result.text}, {_values(ranges)}")
+    return _data_set(episodes, output)
+
+
+def _data_set(episodes: list[Episode], output: Path) -> console.Result:
+    from beliefscope.datasets.dataset import SPLITS
+    from beliefscope.datasets.dataset_statistics import component_ranges
+    from beliefscope.datasets.store import write_dataset
+    from beliefscope.recordings.log_readers.read_log import check_complete
+
     check_complete(episodes)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
     ranges = {"dt": episodes[0].dt, "ranges": component_ranges(episodes)}
-    document = {"task": mapping.task, "episodes": len(episodes), "steps": steps} | ranges
+    document = {"task": episodes[0].task.name, "episodes": len(episodes), "steps": steps} | ranges
     count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
     splits = {name: sum(episode.split == name for episode in episodes) for name in SPLITS}
     document["splits"] = splits
     count += " (" + ", ".join(f"{number} {name}" for name, number in splits.items() if number) + ")"
-    return console.Result(document, f"{count} of {mapping.task}, {steps} steps, {_values(ranges)}", output)
+    return console.Result(document, f"{count} of {episodes[0].task.name}, {steps} steps, {_values(ranges)}", output)
 
 
 def _values(document: dict[str, Any]) -> str:
