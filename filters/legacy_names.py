@@ -11,6 +11,9 @@ SETTINGS = {"nominal": "clean_weight", "pull": "l2_sp", "moments": "events"}
 PLAN = {"pictures": "images", "alone": "single"}
 """Fields of a training schedule."""
 
+SCORE = {"shown": "display_unit"}
+"""Fields of a failure score, in the results of failure jobs."""
+
 SLICES = {"nominal": "clean", "no contact": "free motion"}
 """Data slices. In addition, ``MODALITY alone`` is now ``MODALITY only``."""
 
@@ -18,6 +21,11 @@ SLICES = {"nominal": "clean", "no contact": "free motion"}
 def rename_keys(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
     """A copy with each old key replaced by the present one."""
     return {names.get(key, key): value for key, value in values.items()}
+
+
+def failure_result(result: Mapping[str, Any]) -> dict[str, Any]:
+    """The result of a failure job with present keys."""
+    return {**result, "scores": [rename_keys(score, SCORE) for score in result["scores"]]}
 
 
 def slice_name(name: str) -> str:

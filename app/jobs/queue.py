@@ -28,11 +28,13 @@ from beliefscope import __version__
 from beliefscope.app.jobs.remaining_time import RemainingTime
 from beliefscope.app.protocol.errors import NotFound, QueueFull
 from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess, memory_in_use, redirect_output
-from beliefscope.app.workspace.json_files import read_record
+from beliefscope.app.workspace.json_files import content, read_record
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.io.atomic_write import write_atomically, write_error
+from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.filters.legacy_names import SCORE, failure_result
 
 KINDS: dict[str, str] = {
     "diagnosis": "beliefscope.app.jobs.diagnosis:run",
@@ -352,7 +354,16 @@ def _read_jobs(folder: Path) -> list[Job]:
             job = read_record(RECORD, path)
             if job.id == path.parent.name and not (job.active and _is_other_process(job.server)):
                 jobs.append(job)
+                if job.kind == "failures" and (result := file_within(folder, f"{job.id}/result.json")):
+                    _rename_keys(result)
     return jobs
+
+
+def _rename_keys(path: Path) -> None:
+    """Rewrite the result of a failure job if an earlier version stored it with other keys."""
+    data = content(path)
+    if any(f'"{key}"'.encode() in data for key in SCORE):
+        write_atomically(path, json.dumps(failure_result(read_json(data))).encode())
 
 
 def _is_other_process(pid: int) -> bool:

@@ -44,14 +44,16 @@ class Selection:
 
     def to_json(self) -> dict[str, Any]:
         """The selection as JSON values."""
-        intervention = None if self.intervention is None else self.intervention.to_json()
-        return {**vars(self), "faults": self.faults.to_json(), "intervention": intervention}
+        values = {**vars(self), "faults": self.faults.to_json()}
+        intervention = values.pop("intervention")
+        return {**values, "edit": None if intervention is None else intervention.to_json()}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Inverse of ``to_json``."""
-        intervention = None if values["intervention"] is None else Intervention.from_json(values["intervention"])
-        return cls(**{**values, "faults": Faults.from_json(values["faults"]), "intervention": intervention})
+        rest = {key: value for key, value in values.items() if key != "edit"}
+        intervention = None if values["edit"] is None else Intervention.from_json(values["edit"])
+        return cls(**{**rest, "faults": Faults.from_json(values["faults"]), "intervention": intervention})
 
     def comparison(self, text: str) -> Selection:
         """The comparison run that ``text`` describes by its differences from this run.

@@ -155,7 +155,7 @@ def serve(
     Raises BadInput if the address is not available or not allowed, or if a file cannot be used.
     """
     if host not in LOOPBACK and not access.token:
-        raise BadInput(f"{host} is reachable from other machines: a token is required, in Access or in {VARIABLE}.")
+        raise BadInput(f"{host} is reachable from other machines: set a token in {VARIABLE}.")
     limit_malloc_arenas()
     with listen(host, port) as listener:  # before anything is created
         app = create_app(settings, subprocess=True, access=access)

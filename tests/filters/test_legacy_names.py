@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
 from beliefscope.filters.finetuning.slices import Slice
-from beliefscope.filters.legacy_names import training_record
+from beliefscope.filters.legacy_names import failure_result, training_record
 
 OLD_SETTINGS = {
     "nominal": 0.2,
@@ -40,3 +40,10 @@ def test_old_records_are_read() -> None:
     assert record["validations"] == [{"step": 0, "slices": {"clean": metrics, "image only": metrics}}]
     assert record["held_out"] == {"before": {"clean": metrics}, "after": {"free motion": metrics}}
     assert training_record(record) == record
+
+
+def test_scores_of_old_failure_results_are_renamed() -> None:
+    score = {"name": "error", "unit": "m"}
+    old = {"filter": "pf", "scores": [{**score, "shown": "cm"}]}
+    new = {"filter": "pf", "scores": [{**score, "display_unit": "cm"}]}
+    assert failure_result(old) == failure_result(new) == new

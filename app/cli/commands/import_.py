@@ -8,6 +8,7 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
 
 if TYPE_CHECKING:
+    from beliefscope.datasets.episode import Episode
     from beliefscope.inspect.trace import Trace
 
 RECORDINGS = (".rrd", ".live")

@@ -176,7 +176,7 @@ def test_token_is_required_beyond_loopback(settings: Settings, host: str) -> Non
     token = token_for(host, False, {})
     assert len(token) >= 40
     assert token != token_for(host, False, {})
-    with pytest.raises(BadInput, match=f"needs a token.*{VARIABLE}"):
+    with pytest.raises(BadInput, match=f"set a token in {VARIABLE}"):
         serve(settings, host=host, port=0)
 
 

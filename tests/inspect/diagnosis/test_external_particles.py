@@ -131,4 +131,11 @@ def test_built_in_tasks_have_the_causes_of_the_catalog() -> None:
     mechanisms = ("stuck", "noise", "saturation", "bias", "gain", "delay")
     models = [f"model.{k}.{m}" for k in STD for m in ("bias", "overconfident", "underconfident", "broken")]
     sensors = [f"{key}.{mechanism}" for key in STD for mechanism in mechanisms]
-    assert own == {*sensors, *models, "weights.ignores_near", "weights.ignores_far", "dynamics.inverted"}
+    assert own == {
+        *sensors,
+        *models,
+        "weights.ignores_near",
+        "weights.ignores_far",
+        "control.sign",
+        "dynamics.inverted",
+    }
