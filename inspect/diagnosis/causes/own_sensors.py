@@ -181,7 +181,8 @@ def _controls(task: Task) -> tuple[Cause, ...]:
     """Causes in controls that do not command a measured hand, and in their use.
 
     Two things show such controls: the changes of the labels, where a regression on the controls explains them, and the
-    dynamics model of a filter. Inverted dynamics are also frozen ones, by their slope; the prior prefers them.
+    dynamics model of a filter. An opposite sign is also a wrong scale, and inverted dynamics, by their slope, are also
+    frozen ones: the prior prefers them.
     """
     if not task.control_size or commands_hand(task):
         return ()
@@ -199,19 +200,23 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         ),
         Cause(
             "control.scale",
-            "Controls with a wrong scale or order",
+            "Controls with a wrong scale, sign or order",
             (Symptom("control gain/*", 0, otherwise=(Symptom("size/control*", 0),)), used),
             f"control lag/*|size/control*|{changed}",
-            "Check the units and the order of the controls.",
+            "Check the units, signs and order of the controls.",
             "scale control",
         ),
         Cause(
             "control.sign",
             "Controls with the opposite sign",
-            (Symptom("opposed/control*"), Symptom("control gain/*", 0, optional=True)),
+            (
+                Symptom("opposed/control*", otherwise=(Symptom("control gain/*", target="mirrored"),)),
+                Symptom("control gain/*", 0, optional=True),
+            ),
             f"control lag/*|{changed}",
             "Check the sign convention of the controls.",
-            "negate control",
+            "negate control|scale control",
+            prior=0.2,
         ),
         Cause(
             "dynamics.inverted",

@@ -118,7 +118,7 @@ RECORD = [sensor_statistics(slide(seed), None) for seed in range(30)]
         ("sensor_gain=wrench:factor=0.5", "wrench.gain"),
         ("sensor_noise=wrench:std=1", "wrench.noise"),
         ("sensor_bias=wrench:offset=0.02", "wrench.bias"),
-        ("control_scale=-1", "control.scale"),
+        ("control_scale=-1", "control.sign"),
         ("control_scale=0.1", "control.scale"),
         ("control_delay=4", "control.delay"),
     ],
@@ -179,7 +179,7 @@ def test_single_modality_updates_behind_the_labels_are_a_consequence_of_wrong_co
     gain = Deviation("control gain/control x 0/all", 1.0, -1.0, -1.1, -0.9, 0.0, True, 20.0)
     late = Deviation("lag/labels camera/all", -9.0, 0.0, -0.5, 0.5, 0.0, True, -10.0)
     result = ranked(WRENCH, gain, late)
-    assert result["control.scale"] > 0.8 > 0.3 > result["camera.delay"]
+    assert result["control.sign"] > 0.7 > 0.3 > result["camera.delay"]
 
 
 def test_inverted_dynamics_are_not_frozen() -> None:
@@ -191,5 +191,5 @@ def test_inverted_dynamics_are_not_frozen() -> None:
     assert inverted["dynamics.inverted"] > 0.7
     gain = Deviation("control gain/control x 0/all", 1.0, -1.0, -1.1, -0.9, 0.0, True, 20.0)
     wrong = ranked(WRENCH, *slope(-1.0), gain)
-    assert wrong["control.scale"] > 0.7 > 0.3 > wrong["dynamics.inverted"], "the controls themselves are inverted"
+    assert wrong["control.sign"] > 0.7 > 0.3 > wrong["dynamics.inverted"], "the controls themselves are inverted"
     assert frozen["dynamics.frozen"] > 0.7 > 0.1 > frozen["dynamics.inverted"]
