@@ -12,6 +12,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import task_to_json
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter, load_external
+from beliefscope.filters.names import is_code
 
 FOLDERS = ("data", "studies", "sweeps")
 """Fields with files and folders by name."""
@@ -49,7 +50,7 @@ class Settings:
         return [load_task(task) for task in self.tasks]
 
     def to_json(self) -> dict[str, Any]:
-        """Everything a job needs, as JSON values. External filters are represented by their source."""
+        """What other processes need, as JSON values, such as the sources of external filters."""
         return {
             "workspace": str(self.workspace),
             **{name: {key: str(path) for key, path in getattr(self, name).items()} for name in FOLDERS},
@@ -58,6 +59,7 @@ class Settings:
                 if isinstance(filter_, ExternalFilter)
                 else str(filter_.path if isinstance(filter_, Checkpoint) else filter_)
                 for name, filter_ in self.checkpoints.items()
+                if runs_in_processes(filter_)
             },
             "tasks": list(self.tasks),
             "particles": self.particles,
@@ -84,3 +86,10 @@ class Settings:
             seed=values["seed"],
             tasks=tuple(values["tasks"]),
         )
+
+
+def runs_in_processes(filter_: Path | Checkpoint) -> bool:
+    """Whether other processes can load a filter: it is in a file, or an external one given by its build function."""
+    if isinstance(filter_, ExternalFilter):
+        return is_code(filter_.source)
+    return isinstance(filter_, Path) or filter_.path is not None

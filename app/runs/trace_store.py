@@ -22,7 +22,7 @@ from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.result_filters import candidates
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.settings import Settings, runs_in_processes
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.workspace.json_files import RecordCache, read_record
@@ -319,7 +319,7 @@ class TraceStore:
         try:
             request = self._run_request(selection, run.checkpoint)
             # The first run is complete in this process before the worker has started.
-            if self._worker is not None and self._worker.started:
+            if self._worker is not None and self._worker.started and runs_in_processes(run.checkpoint):
                 result = _run_in_worker(self._worker, request, progress)
             else:
                 episode = self._episode(selection)
@@ -360,6 +360,11 @@ def _run_in_worker(worker: TraceWorker, request: RunRequest, progress: Callable[
         with suppress(BadInput):
             return load_trace(path)
         path.unlink()
+    if not request.external and not Path(request.checkpoint).is_file():
+        raise BadInput(
+            f"filter {request.filter!r} cannot run: its checkpoint {request.checkpoint!r} was deleted or moved; reload "
+            "the page and select another filter"
+        )
     worker.run(request, progress)
     try:
         return load_trace(path)
