@@ -140,6 +140,8 @@ def label_of(statistic: str) -> str:
     kind, subject, phase = statistic.split("/")
     title = KINDS[kind][0] if kind in KINDS else kind
     name, _, axis = subject.partition(" ")
+    if (kind, name) == ("lag", "labels"):
+        return f"delay of the labels in steps behind {display_name(axis) or 'all modalities'}"
     owner, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
     title = title.format(of=owner + axis, axis=axis) if "{" in title else title + owner + axis
     before, after = PHASES.get(phase, ("", f" in {phase}"))

@@ -8,7 +8,28 @@ from beliefscope.datasets.catalog import TASKS
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
-from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, OF_COMPONENTS, OF_KINDS, OF_READINGS, unit_of
+from beliefscope.inspect.diagnostics.statistic_kinds import (
+    KINDS,
+    OF_COMPONENTS,
+    OF_KINDS,
+    OF_READINGS,
+    label_of,
+    unit_of,
+)
+
+
+@pytest.mark.parametrize(
+    ("statistic", "label"),
+    [
+        ("weight/image hinge_x/contact", "effective weight of image (hinge x) in contact"),
+        ("lag/image/all", "delay of image in steps behind the other sensors"),
+        ("lag/labels wrist_cam/all", "delay of the labels in steps behind wrist cam"),
+        ("lag/labels/all", "delay of the labels in steps behind all modalities"),
+        ("opposed/control x/all", "evidence for the opposite sign of control (x)"),
+    ],
+)
+def test_label(statistic: str, label: str) -> None:
+    assert label_of(statistic) == label
 
 
 @pytest.mark.parametrize(
