@@ -32,11 +32,15 @@ since eight colours are too many for some colour vision deficiencies."""
 
 
 def colour(source: str, modalities: Sequence[str]) -> str:
-    """``#RRGGBB`` of ``truth``, ``fused``, ``contact`` or a modality."""
+    """``#RRGGBB`` of ``truth``, ``fused``, ``contact`` or a modality.
+
+    Without a modality ``image``, the first one with another name has its colour.
+    """
     if source in COLOURS:
         return COLOURS[source]
     unnamed = [modality for modality in modalities if modality not in COLOURS]
-    return SPARE_COLOURS[unnamed.index(source) % len(SPARE_COLOURS)]
+    spare = SPARE_COLOURS if "image" in modalities else (COLOURS["image"], *SPARE_COLOURS)
+    return spare[unnamed.index(source) % len(spare)]
 
 
 @cache

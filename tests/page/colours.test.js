@@ -23,6 +23,9 @@ test('unknown modalities get spare colours', () => {
   assert.equal(cssVariable('image'), '--image');
   assert.equal(cssVariable('sound'), '--spare-0');
   assert.equal(cssVariable('touch'), '--spare-1');
+  assignSpareColours(['haptics', 'camera', 'sound']);
+  assert.equal(cssVariable('camera'), '--image');
+  assert.equal(cssVariable('sound'), '--spare-0');
 });
 
 test('other functions', () => {

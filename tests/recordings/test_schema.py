@@ -43,3 +43,5 @@ def test_every_modality_has_its_colour() -> None:
     modalities = ("image", "sound", "touch")
     assert colour("image", modalities) == COLOURS["image"]
     assert [colour(name, modalities) for name in ("sound", "touch")] == list(SPARE_COLOURS[:2])
+    without_image = ("haptics", "camera", "sound")
+    assert [colour(name, without_image) for name in without_image[1:]] == [COLOURS["image"], SPARE_COLOURS[0]]

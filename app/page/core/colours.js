@@ -37,6 +37,7 @@ const SPARE_DASHES = [
   [10, 2, 4, 2],
   [2, 1],
 ];
+const SPARE_VARIABLES = SPARE_DASHES.map((_, i) => `--spare-${i}`);
 
 const UNIT =
   typeof document === 'undefined'
@@ -91,17 +92,25 @@ export const colour = (name) =>
 
 /** Modalities without a colour of their own. @type {string[]} */
 let unnamed = [];
+/** CSS variables of their colours. */
+let spareColours = SPARE_VARIABLES;
 
 /**
- * Assigns spare colours and dashes to the modalities that have none of their own.
+ * Assigns spare colours and dashes to the modalities that have none of their own. Without a modality `image`, the
+ * first of them has its colour.
  * @param {string[]} modalities of the displayed trace
  */
 export function assignSpareColours(modalities) {
   unnamed = modalities.filter((name) => !Object.hasOwn(DASHES, name));
+  spareColours = modalities.includes('image') ? SPARE_VARIABLES : ['--image', ...SPARE_VARIABLES];
 }
 
-/** @param {string} name */
-const spareIndex = (name) => Math.max(0, unnamed.indexOf(name)) % SPARE_DASHES.length;
+/**
+ * @template T
+ * @param {T[]} list
+ * @param {string} name
+ */
+const spareOf = (list, name) => list[Math.max(0, unnamed.indexOf(name)) % list.length];
 
 /**
  * Returns the CSS variable with the colour of a source.
@@ -109,7 +118,7 @@ const spareIndex = (name) => Math.max(0, unnamed.indexOf(name)) % SPARE_DASHES.l
  */
 export const cssVariable = (name) => {
   const source = name.replace(STANDALONE, '');
-  return Object.hasOwn(DASHES, source) ? `--${source}` : `--spare-${spareIndex(source)}`;
+  return Object.hasOwn(DASHES, source) ? `--${source}` : spareOf(spareColours, source);
 };
 
 /**
@@ -128,7 +137,7 @@ export const translucent = (colour, alpha) =>
  */
 export function lineStyle(name) {
   const source = name.replace(STANDALONE, '');
-  const dash = DASHES[source] ?? SPARE_DASHES[spareIndex(source)];
+  const dash = DASHES[source] ?? spareOf(SPARE_DASHES, source);
   return { stroke: colour(cssVariable(name).slice(2)), dash, width: WIDTHS[name] ?? 1.5 };
 }
 
