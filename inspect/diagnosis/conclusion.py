@@ -100,9 +100,9 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
 
 
 def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
-    """What the diagnosis cannot judge: sensors without statistics, and statistics of sensors that no episode has.
+    """What the diagnosis cannot judge: sensors without statistics, and statistics that the episodes or the record lack.
 
-    The latter are in the record, such as those of free motion, which an episode of contact only lacks.
+    Episodes of contact only lack those of free motion, for example, and records of earlier versions those of new kinds.
 
     Args:
         numbers: of ``statistics_by_subject``.
@@ -114,7 +114,11 @@ def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
         for name, values in case.profile.statistics.items()
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
-    return sensors + absent
+    kinds = {name.partition("/")[0] for name in case.profile.statistics}
+    finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}
+    new = {name for name in finite if name.partition("/")[0] not in kinds}
+    outdated = [f"statistics that the healthy record of an earlier version lacks ({len(new)}): measure it again"]
+    return sensors + absent + (outdated if new else [])
 
 
 def _of_sensors(case: Case) -> set[str]:

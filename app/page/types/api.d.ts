@@ -148,7 +148,7 @@ export interface components {
          *     deviations: largest ones, whatever their cause.
          *     miscalibrated: whether the healthy record itself is over- or underconfident.
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
-         *     unmeasured: sensors without any, and statistics of sensors that the episodes do not have.
+         *     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
          */
         Diagnosis: {
             /**
