@@ -42,6 +42,7 @@ def map_of(folder: Path, text: str = MAP) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_files_of_a_folder_are_episodes(tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     logs.mkdir()
@@ -58,6 +59,7 @@ def test_files_of_a_folder_are_episodes(tmp_path: Path) -> None:
         read_log({n: c[:6] for n, c in read_columns(logs, mapping).items()}, mapping, "logs", "auto")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefix", ["", "data/"])
 def test_groups_of_a_file_are_episodes(tmp_path: Path, prefix: str) -> None:
     with h5py.File(tmp_path / "demos.h5", "w") as file:
@@ -72,6 +74,7 @@ def test_groups_of_a_file_are_episodes(tmp_path: Path, prefix: str) -> None:
         read_columns(tmp_path / "demos.h5", mapping)
 
 
+@pytest.mark.slow
 def test_a_first_map(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "run.h5", "w") as file:
         write_episode(file, 1.0)
