@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
@@ -41,9 +42,6 @@ VIEW = {
 }
 """Mechanisms of causes in the image that other cameras have as well -> title."""
 
-EDGES = "sharpness/{}/*"
-"""Statistics of an image that the edges of an object in front of the camera change."""
-
 
 def own_causes(task: Task) -> tuple[Cause, ...]:
     """Causes in the sensors of a task that have none in the catalog."""
@@ -52,7 +50,7 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
     for key, modality in keys.items():
         changed = f"*/{key}/*|*/{key} */*|lag/*|{_downstream(modality)}"
         for kinds, mechanism, word, action in IMAGE if key in task.images else VECTOR:
-            symptom = Symptom("|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds.split("|")))
+            symptom = Symptom(_patterns(key, *kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
         result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
@@ -61,12 +59,14 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
     return (*result, *(cause for part in parts for cause in part(task)))
 
 
+def _patterns(key: str, *kinds: str) -> str:
+    """Patterns of the statistics of these kinds about a sensor or one of its axes."""
+    return "|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds)
+
+
 def _changed_readings(key: str, modality: str) -> list[Cause]:
     """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio."""
-
-    def of(*kinds: str) -> str:
-        return "|".join(f"{kind}/{key}/*|{kind}/{key} */*" for kind in kinds)
-
+    of = partial(_patterns, key)
     scaled = of(*BIASED, "change", "size", "noise")
     noise = (Symptom(of("noise")), Symptom(of("roughness"), optional=True))
     gain = (Symptom(of("size"), 0), Symptom(of("noise"), 0))
@@ -90,7 +90,10 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
 
 
 def _changed_views(key: str, modality: str) -> list[Cause]:
-    """Causes of ``VIEW`` with the names of the sensor and its modality."""
+    """Causes of ``VIEW`` with the names of the sensor and its modality.
+
+    The edges of an object in front of the camera change the sharpness as well.
+    """
 
     def renamed(patterns: str) -> str:
         return patterns.replace("/image", f"/{key}").replace("*image*", f"*{modality}*")
@@ -101,7 +104,7 @@ def _changed_views(key: str, modality: str) -> list[Cause]:
             name=f"{key}.{mechanism}",
             title=VIEW[mechanism].format(display_name(key)),
             symptoms=tuple(replace(symptom, statistics=renamed(symptom.statistics)) for symptom in cause.symptoms),
-            consequences=f"{renamed(cause.consequences)}|{EDGES.format(key) if mechanism == 'occlusion' else ''}",
+            consequences=renamed(cause.consequences) + (f"|sharpness/{key}/*" if mechanism == "occlusion" else ""),
             lowers=renamed(cause.lowers),
             undo=f"drop {modality}",
         )
