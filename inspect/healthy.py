@@ -14,8 +14,10 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
+from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 from beliefscope.inspect.traces.batch import Progress, trace_all
 
@@ -32,13 +34,15 @@ class SensorRecord:
     """The part of a healthy profile about sensors, which is the same for all filters of a task.
 
     Attributes:
-        rows: statistics of the sensors by episode. Images are compared with a reference of the other groups of
-            episodes, so that the statistics are those of new ones.
+        rows: statistics of the sensors by episode. Images and readings are compared with a reference of the other
+            groups of episodes, so that the statistics are those of new ones.
         reference: images of all episodes.
+        readings: models of the vector sensors of unknown physics.
     """
 
     rows: Sequence[Mapping[str, float]]
     reference: Reference | None
+    readings: tuple[ReadingModel, ...]
 
 
 def sensor_record(episodes: Sequence[Episode], reference: Reference | None = None) -> SensorRecord:
@@ -46,12 +50,12 @@ def sensor_record(episodes: Sequence[Episode], reference: Reference | None = Non
 
     reference: images of other clean episodes of the same camera; default: measured, which takes most of the time.
     """
-    if reference is not None:
-        return SensorRecord([sensor_statistics(episode, reference) for episode in episodes], reference)
+    keys = modelled_sensors(episodes[0].task) if episodes else []
     groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
-    references = [measure_reference(group) for group in groups]
-    rows = [sensor_statistics(episode, references[i % FOLDS]) for i, episode in enumerate(episodes)]
-    return SensorRecord(rows, measure_reference(episodes))
+    models = [fit_reading_models(group, keys) for group in groups]
+    references = [reference or measure_reference(group) for group in groups]
+    rows = [sensor_statistics(e, references[i % FOLDS], models[i % FOLDS]) for i, e in enumerate(episodes)]
+    return SensorRecord(rows, reference or measure_reference(episodes), fit_reading_models(episodes, keys))
 
 
 def profile_of(
@@ -86,7 +90,7 @@ def profile_of(
         raise BadInput(f"{error} (healthy episode {failed})") from None
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return HealthyProfile(data, len(rows), particles, columns, sensors.reference)
+    return HealthyProfile(data, len(rows), particles, columns, sensors.reference, sensors.readings)
 
 
 def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> str | None:

@@ -93,7 +93,9 @@ def deviations(case: Case) -> dict[str, float]:
     """
     profile = HealthyProfile.from_json(case.checkpoint.healthy_profile)
     rows = [
-        episode_statistics(trace, case.checkpoint, sensor_statistics(trace.episode, profile.reference))
+        episode_statistics(
+            trace, case.checkpoint, sensor_statistics(trace.episode, profile.reference, profile.readings)
+        )
         for trace in traces_of(case)
     ]
     groups: dict[str, list[float]] = {}

@@ -15,6 +15,7 @@ from beliefscope.inspect.diagnosis.causes import (
     image,
     model,
     other_sensors,
+    own_models,
     own_sensors,
     particles,
 )
@@ -43,7 +44,7 @@ MODALITIES = {"image": "image"}
 def causes_of(task: Task) -> tuple[Cause, ...]:
     """All causes, and those in sensors that only this task has."""
     modalities = {key: modality for modality, keys in task.modalities.items() for key in keys}
-    own = own_sensors.own_causes(task)
+    own = own_sensors.sensor_causes(task) + own_models.model_causes(task)
     names = {cause.name for cause in own}
     return (*(_of_modality(cause, modalities) for cause in CAUSES if cause.name not in names), *own)
 

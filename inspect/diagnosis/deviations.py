@@ -83,19 +83,22 @@ class Case:
 
 def observe(trace: Trace, checkpoint: Checkpoint, profile: HealthyProfile) -> tuple[dict[str, float], dict[str, float]]:
     """All statistics of a run, and those of its sensors only."""
-    sensors = sensor_statistics(trace.episode, profile.reference)
+    sensors = sensor_statistics(trace.episode, profile.reference, profile.readings)
     return episode_statistics(trace, checkpoint, sensors), sensors
 
 
 def examine_again(case: Case, inputs: RunInputs, traces: Sequence[Trace]) -> Case:
     """Another run of the episodes of a case; statistics of sensors remain where the readings are the same."""
     sensors_by_episode = {id(trace.episode): sensors for trace, sensors in zip(case.traces, case.sensors, strict=True)}
+    profile = case.profile
     rows, sensors = [], []
     for trace in traces:
         same = sensors_by_episode.get(id(trace.episode))
-        sensors.append(sensor_statistics(trace.episode, case.profile.reference) if same is None else same)
+        if same is None:
+            same = sensor_statistics(trace.episode, profile.reference, profile.readings)
+        sensors.append(same)
         rows.append(episode_statistics(trace, inputs.checkpoint, sensors[-1]))
-    return compared(inputs, traces, rows, sensors, case.profile, case.alarm_rate)
+    return compared(inputs, traces, rows, sensors, profile, case.alarm_rate)
 
 
 def compared(

@@ -7,7 +7,7 @@ import numpy as np
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.reference_images import HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, lag
 from beliefscope.inspect.trace import Trace
 
 SMALLEST_MOTION = 1e-2
@@ -50,8 +50,12 @@ def label_statistics(trace: Trace) -> dict[str, float]:
 def _lag(task: Task, labels: Array, measured: Array, keep: Mask) -> float:
     """Steps by which changes of the labels follow those of measured values (T, n), from the components that move.
 
-    Without a measured hand, components that a modality does not measure, such as a small rotation, would hide others.
+    Without a measured hand, the labels themselves, which is more exact where a modality measures the state well.
     """
+    if HAND not in task.observations:
+        unwrapped, angles = labels.copy(), list(task.angles)
+        unwrapped[:, angles] = np.unwrap(labels[:, angles], axis=0)
+        return fitted_lag(unwrapped, unwrapped + measured - labels, keep)
     on_map = [component.name in task.map_components for component in task.components]
     smallest = np.where(on_map, min(SMALLEST_MOTION, SMALLEST_SHARE * task.map_half_width), SMALLEST_MOTION)
     moving = np.ptp(labels[keep], axis=0) > smallest
@@ -60,10 +64,6 @@ def _lag(task: Task, labels: Array, measured: Array, keep: Mask) -> float:
     scale = labels[keep][:, moving].std(0)
     changes = (task.difference(x[BASELINE:], x[:-BASELINE]) for x in (labels, measured))
     late, early = (change[:, moving] / scale for change in changes)
-    if HAND not in task.observations:
-        pairs = [(late[:, [i]], early[:, [i]]) for i in range(late.shape[1])]
-        measured_well = [np.isfinite(lag(*pair, keep[BASELINE:])[0]) for pair in pairs]
-        late, early = (x[:, measured_well] if any(measured_well) else x for x in (late, early))
     return lag(late, early, keep[BASELINE:])[0]
 
 

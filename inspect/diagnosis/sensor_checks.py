@@ -5,6 +5,7 @@ Named ``KIND/SUBJECT/PHASE`` like all statistics of a profile; NaN where one is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.control_checks import control_label_statistics
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
+from beliefscope.inspect.diagnosis.reading_checks import reading_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
     axis_index,
     contact_changes,
@@ -30,6 +32,7 @@ from beliefscope.inspect.diagnosis.window_checks import (
     window_statistics,
     window_values,
 )
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
 
@@ -37,14 +40,16 @@ CONTRAST = {"level": 0.3, "noise": 0.7, "position noise": 0.7, "brightness": 0.5
 """Kind of statistic -> largest size of its deviation in the other steps, relative to the affected ones."""
 
 
-def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
-    """All statistics of sensors and controls; some of images only with a reference."""
+def sensor_statistics(
+    episode: Episode, reference: Reference | None, readings: Sequence[ReadingModel] = ()
+) -> dict[str, float]:
+    """All statistics of sensors and controls; some of images only with a reference, of others only with a model."""
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
     values |= vector_statistics(episode) | law_statistics(episode)
     values |= contact_distance_statistics(episode, reference) | control_label_statistics(episode)
-    values |= window_statistics(episode, reference)
+    values |= window_statistics(episode, reference) | reading_statistics(episode, readings)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1
     return {name: np.nan if ambiguous and name.startswith("opposition/") else value for name, value in values.items()}

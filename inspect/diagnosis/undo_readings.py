@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
+from beliefscope.inspect.diagnosis.reading_checks import delayed_correlations
 from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
 from beliefscope.inspect.diagnosis.vector_checks import (
@@ -76,13 +77,15 @@ def _with_labels(inputs: RunInputs, change: Callable[[NDArray[Any]], NDArray[Any
 def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """A delayed image, the delayed haptics, controls or labels, advanced by their delay.
 
-    Of a sensor with a delay behind the labelled contact: each such sensor by its own delay.
+    Of a sensor with a delay behind the labelled contact or the labels: each such sensor by its own delay.
     """
-    behind = {
-        name: round(d.value - d.healthy)
+    kinds = ("contact lag", "reading lag")
+    lags = {
+        name: [deviations[statistic] for kind in kinds if (statistic := f"{kind}/{name}/all") in deviations]
         for name in inputs.checkpoint.task.observations
-        if (d := deviations.get(f"contact lag/{name}/all")) is not None
     }
+    largest = {name: max(behind_by, key=lambda d: d.t) for name, behind_by in lags.items() if behind_by}
+    behind = {name: round(d.value - d.healthy) for name, d in largest.items()}
     if behind.get(key, 0) > 0:
         steps_of = {name: steps for name, steps in behind.items() if steps > 0}
     else:
@@ -195,6 +198,29 @@ def permute_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
             left += [lever(force[:, order], torque)[1] for order in orders]
     order = orders[int(left.argmin())]
     return None if order == (0, 1, 2) else _with_readings(inputs, FORCE, lambda force, episode: force[:, order])
+
+
+def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
+    """Readings with the order and the signs of channels that best agree with the labels; None if they have them."""
+    readings = () if inputs.healthy is None else inputs.healthy.readings
+    model = next((model for model in readings if model.key == key), None)
+    from scipy.optimize import linear_sum_assignment  # takes most of a second
+
+    if model is None:
+        return None
+    total = np.sum([delayed_correlations(inputs.episodes[index], model)[1] for index in inputs.affected], axis=0)
+    sources, channels = linear_sum_assignment(-np.abs(total))  # reading i is of channel j
+    signs = np.where(total[sources, channels] < 0.0, -1.0, 1.0)
+    if (sources == channels).all() and (signs > 0.0).all():
+        return None
+    order = np.array(model.channels)
+
+    def arranged(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
+        result = values.copy()
+        result[:, order[channels]] = signs * values[:, order[sources]]
+        return result
+
+    return _with_readings(inputs, key, arranged)
 
 
 def restore_contact(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:

@@ -19,6 +19,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.names import PRETRAINED
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference
 
 Array = NDArray[np.float64]
@@ -45,6 +46,7 @@ class HealthyProfile:
         statistics: ``KIND/SUBJECT/PHASE`` -> (E,) values by trajectory, SI units; NaN where there is none, such as
             in a phase of too few steps.
         reference: healthy images; None in profiles of format 1 and for tasks without images.
+        readings: models of the vector sensors of unknown physics; none in profiles of earlier versions.
     """
 
     data: str
@@ -52,6 +54,7 @@ class HealthyProfile:
     particles: int | None
     statistics: Mapping[str, Array]
     reference: Reference | None = None
+    readings: tuple[ReadingModel, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, rounded to ``DIGITS``; NaN as null."""
@@ -61,7 +64,8 @@ class HealthyProfile:
         }
         head = {"format": FORMAT, "data": self.data, "episodes": self.episodes, "particles": self.particles}
         reference = None if self.reference is None else self.reference.to_json()
-        return {**head, "statistics": rows, "reference": reference}
+        models = {"readings": [model.to_json() for model in self.readings]} if self.readings else {}
+        return {**head, "statistics": rows, "reference": reference, **models}
 
     @classmethod
     def from_json(cls, document: Any) -> HealthyProfile:
@@ -76,12 +80,13 @@ class HealthyProfile:
             }
             data, images = str(document["data"]), document.get("reference")
             reference = None if images is None else Reference.from_json(images)
+            readings = tuple(ReadingModel.from_json(model) for model in document.get("readings", ()))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"the healthy record is malformed: {error!r}") from None
         for name, values in rows.items():
             if values.shape != (count,) or name.count("/") != 2:
                 raise BadInput(f"the healthy record is malformed: {name!r} has {len(values)} values of {count}")
-        return cls(data, count, None if particles is None else int(particles), rows, reference)
+        return cls(data, count, None if particles is None else int(particles), rows, reference, readings)
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:

@@ -48,6 +48,10 @@ KINDS = {
     "shift": ("shift", False, 0.2),
     "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
     "contact lag": ("delay{of} in steps behind the labelled contact", False, 0.5),
+    "reading lag": ("delay{of} in steps behind the labels", False, 0.5),
+    "reading bias": ("difference{of} from the reading expected from the labels, in standard deviations", False, 0.05),
+    "inverted": ("negative correlation{of} with the reading expected from the labels", False, 0.1),
+    "exchanged": ("evidence for another order of the channels{axis}", False, 0.15),
     "control lag": ("delay{of} in steps behind the true changes", False, 0.5),
     "control gain": ("true change per unit{of}", False, 1e-9),
     "hand offset": ("distance of the hand in the image from its measured position{axis}", False, 0.1),
@@ -106,7 +110,7 @@ PHASES = {
 
 RISING = frozenset(
     {"error", "angle error", "regret", "outside", "black", "losses", "frozen", "stuck", "saturation", "occlusion"}
-    | {"change", "opposition", "opposed", "contact distance error", "contact distance scatter"}
+    | {"change", "opposition", "opposed", "inverted", "exchanged", "contact distance error", "contact distance scatter"}
     | {"module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""

@@ -26,7 +26,7 @@ CAUSES = (
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
         f"{OBJECT}|object match/*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*"
-        "|control lag/*|control gain/*",
+        "|control lag/*|control gain/*|reading lag/*|reading bias/*",
         "Synchronise the clock of the motion capture with the sensors.",
         "advance labels",
     ),
@@ -38,7 +38,8 @@ CAUSES = (
             Symptom(OBJECT, 0, optional=True),
             Symptom("module bias/*", 0, 0.3, "common"),
         ),
-        f"object match/*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
+        f"object match/*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}"
+        "|reading bias/*",
         "Register the frame of the motion capture with the robot's.",
         "shift labels",
     ),

@@ -1,4 +1,4 @@
-"""Causes in sensors and measurement models of a user's task, by the names of its observations and modalities."""
+"""Causes in the sensors of a user's task, by the names of its observations and modalities."""
 
 from __future__ import annotations
 
@@ -7,20 +7,24 @@ from functools import partial
 
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes import data, fusion, image, model
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes import image
+from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
-from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, commands_hand, has_labels_only
+from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
+from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, has_labels_only
 from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")
 """Observations that have their own causes."""
 
-MODALITIES = ("image", "haptics")
-"""Modalities whose measurement models have causes in the catalog."""
+SYNCHRONISE = "Synchronise the clocks of the sensors."
+"""Next action of a delay."""
 
-BIASED = ("level", "drift", "saturation", "contact lag")
+BIASED = ("level", "drift", "saturation", "contact lag", "reading bias")
 """Kinds of statistics of vector sensors that a bias changes."""
+
+DELAYED = (*BIASED, "change", "size", "roughness", "inverted", "exchanged")
+"""As ``BIASED``, of a delay."""
 
 VECTOR = (
     ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
@@ -43,7 +47,7 @@ VIEW = {
 """Mechanisms of causes in the image that other cameras have as well -> title."""
 
 
-def own_causes(task: Task) -> tuple[Cause, ...]:
+def sensor_causes(task: Task) -> tuple[Cause, ...]:
     """Causes in the sensors of a task that have none in the catalog."""
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in KNOWN}
     result = []
@@ -55,7 +59,9 @@ def own_causes(task: Task) -> tuple[Cause, ...]:
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
         result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
         result += _changed_views(key, modality) if key in task.images else []
-    parts = (_moved_cameras, _delays, _delayed_modalities, _models, _labels, _controls, _weights)
+    for key in modelled_sensors(task):
+        result += _wrong_channels(task, key)
+    parts = (_moved_cameras, _delays, _delayed_modalities)
     return (*result, *(cause for part in parts for cause in part(task)))
 
 
@@ -67,13 +73,14 @@ def _patterns(key: str, *kinds: str) -> str:
 def _changed_readings(key: str, modality: str) -> list[Cause]:
     """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio."""
     of = partial(_patterns, key)
-    scaled = of(*BIASED, "change", "size", "noise")
+    scaled = of(*BIASED, "change", "size", "noise", "reading lag")
     noise = (Symptom(of("noise")), Symptom(of("roughness"), optional=True))
+    bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
     gain = (Symptom(of("size"), 0), Symptom(of("noise"), 0))
     rough = f"{scaled}|{of('roughness', 'stuck')}"
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor."),
-        ("bias", "biased", (Symptom(of("level"), 0),), of(*BIASED), "Tare the sensor."),
+        ("bias", "biased", bias, of(*BIASED), "Tare the sensor."),
         ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor."),
     )
     return [
@@ -86,6 +93,20 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             f"drop {modality}",
         )
         for mechanism, words, symptoms, changed, action in entries
+    ]
+
+
+def _wrong_channels(task: Task, key: str) -> list[Cause]:
+    """Inverted and exchanged channels of a vector sensor."""
+    modality = next(name for name, keys in task.modalities.items() if key in keys)
+    changed = f"*/{key}/*|*/{key} */*|lever/*|axes/*|direction/*|{_downstream(modality)}"
+    name, action = display_name(key), "Check the axes and signs of the sensor."
+    entries = [("sign", f"Sensor {name} has inverted channels", "inverted")]
+    entries += [("axes", f"Channels of sensor {name} exchanged", "exchanged")] if task.observations[key][0] > 1 else []
+    undo = f"rearrange {key}|drop {modality}"
+    return [
+        Cause(f"{key}.{m}", title, (Symptom(_patterns(key, kind)),), changed, action, undo)
+        for m, title, kind in entries
     ]
 
 
@@ -141,131 +162,42 @@ def _moved_cameras(task: Task) -> tuple[Cause, ...]:
 def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
     """Modalities behind the labels, of tasks without a measured hand, which shows it better.
 
-    Where contact is labelled, it shows the delay of vector sensors.
+    Where contact is labelled, it shows the delay of vector sensors, as labels show that of a modality's only sensor.
     """
     result = []
     modalities = task.modalities.items() if HAND not in task.observations else ()
     by_contact = {key for key in task.observations if key not in task.images} if has_labels_only(task) else set()
-    for modality in (modality for modality, keys in modalities if not by_contact & {*keys}):
+    alone = [{key} for key in _delayed_sensors(task)]
+    for modality in (name for name, keys in modalities if not by_contact & {*keys} and {*keys} not in alone):
         changed = f"{OBJECT}|object match/*|{_downstream(modality)}"
         title = "Image delayed" if modality == "image" else f"Modality {display_name(modality)} delayed"
-        symptoms, action = (Symptom(f"lag/labels {modality}/*", -1),), "Synchronise the clocks of the sensors."
-        result.append(Cause(f"{modality}.delay", title, symptoms, changed, action, f"advance {modality}"))
+        symptoms = (Symptom(f"lag/labels {modality}/*", -1),)
+        result.append(Cause(f"{modality}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {modality}"))
     return tuple(result)
 
 
-def _models(task: Task) -> tuple[Cause, ...]:
-    """Causes in measurement models of modalities that the catalog does not have, or whose sensors it cannot check.
-
-    These are sensors of other names and, without a measured hand, force and torque: their signs and axes.
-    """
-    check = "Check the calibration of its sensors, whose offsets and scales have the same symptoms. "
-    checked = {*KNOWN} if HAND in task.observations else {"image"}
-    names = [name for name, keys in task.modalities.items() if name not in MODALITIES or not {*keys} & checked]
-    title = "Sensors or model of {}"  # their fusion weights may depend on their models
-    return tuple(c for n in names for c in model.causes_of(n, title.format(display_name(n)), check, WEIGHTS))
-
-
-def _labels(task: Task) -> tuple[Cause, ...]:
-    """Delayed labels of tasks without a measured hand: behind all modalities and, if these cause changes, the controls.
-
-    A faulty sensor can make a single modality appear early.
-    """
-    if HAND in task.observations:
-        return ()
-    (delay,) = (cause for cause in data.CAUSES if cause.name == "labels.delay")
-    (_, dynamics) = delay.symptoms
-    lag = Symptom("lag/labels/*|lag/dynamics/*", 1, 2.0)
-    controls = Symptom("control lag/*", -1, optional=True)
-    return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls)),)
-
-
-def _controls(task: Task) -> tuple[Cause, ...]:
-    """Causes in controls that do not command a measured hand, and in their use.
-
-    Two things show such controls: the changes of the labels, where a regression on the controls explains them, and the
-    dynamics model of a filter. An opposite sign is also a wrong scale, and inverted dynamics, by their slope, are also
-    frozen ones: the prior prefers them.
-    """
-    if not task.control_size or commands_hand(task):
-        return ()
-    # Updates of single modalities, which stand in for measurements, depend on the prediction.
-    changed = f"control gain/*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
-    used = Symptom("dynamics slope/*|dynamics spread/*|control gain/*", 0, optional=True)
-    return (
-        Cause(
-            "control.delay",
-            "Controls delayed",
-            (Symptom("control lag/*", otherwise=(Symptom("lag/dynamics/*", -1),)),),
-            changed,
-            "Synchronise the controls with the sensors.",
-            "advance control",
-        ),
-        Cause(
-            "control.scale",
-            "Controls with a wrong scale, sign or order",
-            (Symptom("control gain/*", 0, otherwise=(Symptom("size/control*", 0),)), used),
-            f"control lag/*|size/control*|{changed}",
-            "Check the units, signs and order of the controls.",
-            "scale control",
-        ),
-        Cause(
-            "control.sign",
-            "Controls with the opposite sign",
-            (
-                Symptom("opposed/control*", otherwise=(Symptom("control gain/*", target="mirrored"),)),
-                Symptom("control gain/*", 0, optional=True),
-            ),
-            f"control lag/*|{changed}",
-            "Check the sign convention of the controls.",
-            "negate control|scale control",
-            prior=0.2,
-        ),
-        Cause(
-            "dynamics.inverted",
-            "Dynamics inverted: predicted changes have the wrong sign",
-            (Symptom("dynamics slope/*", target="mirrored"),),
-            f"opposed/control*|lag/dynamics/*|{LABELS}|{DYNAMICS}",
-            "Check the sign of the controls in the dynamics model.",
-            prior=0.2,
-        ),
-    )
-
-
-def _weights(task: Task) -> tuple[Cause, ...]:
-    """Fusion weights that ignore one of two modalities of other names than those of the catalog."""
-    if len(task.modalities) != 2 or set(task.modalities) == set(MODALITIES):
-        return ()
-    return tuple(
-        Cause(
-            f"weights.ignores_{name}",
-            f"Fusion weights ignore {display_name(name)}",
-            (
-                Symptom(f"beta logit/{name}*", -1, otherwise=(Symptom(f"beta logit/{other}*", 1),)),
-                Symptom("beta logit/*", target="shifted"),
-            ),
-            f"beta spread/*|{FILTER}",
-            fusion.RETRAIN,
-            "healthy beta",
-        )
-        for name, other in zip(task.modalities, reversed([*task.modalities]), strict=True)
-    )
+def _delayed_sensors(task: Task) -> list[str]:
+    """Vector sensors whose delay labelled contact, if no sensor measures it, or the labels show."""
+    vectors = [key for key, shape in task.observations.items() if len(shape) == 1 and key != HAND]
+    return vectors if has_labels_only(task) else modelled_sensors(task)
 
 
 def _delays(task: Task) -> tuple[Cause, ...]:
-    """Delays of vector sensors behind the labelled contact, of tasks without a contact sensor.
+    """Delays of vector sensors behind the labels.
 
     Force and torque are of one sensor: a delay of the force explains that of the torque, and the laws of both.
     """
     result = []
-    for modality, keys in task.modalities.items() if has_labels_only(task) else ():
-        for key in (key for key in keys if len(task.observations[key]) == 1 and key != HAND):
-            changed = f"*/{key}/*|*/{key} */*|lag/*|{_downstream(modality)}"
-            if key in (FORCE, TORQUE):
-                changed += f"|lever/{FORCE}*|axes/{FORCE}/*|size/*/contact"
-            if key == FORCE and TORQUE in task.observations:
-                changed += f"|*/{TORQUE}/*|*/{TORQUE} */*"
-            title, action = f"Sensor {display_name(key)} delayed", "Synchronise the clocks of the sensors."
-            symptoms = (Symptom(f"contact lag/{key}/*"),)
-            result.append(Cause(f"{key}.delay", title, symptoms, changed, action, f"advance {key}"))
+    for key in _delayed_sensors(task):
+        modality = next(name for name, keys in task.modalities.items() if key in keys)
+        changed = f"{_patterns(key, *DELAYED)}|lag/*|{_downstream(modality)}"
+        if key in (FORCE, TORQUE):
+            changed += f"|lever/{FORCE}*|axes/{FORCE}/*|size/*/contact"
+        if key == FORCE and TORQUE in task.observations:
+            changed += f"|*/{TORQUE}/*|*/{TORQUE} */*"
+        alone = HAND not in task.observations and len(task.modalities[modality]) == 1
+        otherwise = (Symptom(f"lag/labels {modality}/*", -1),) if alone else ()
+        symptoms = (Symptom(f"contact lag/{key}/*|reading lag/{key}/*", otherwise=otherwise),)
+        title = f"Sensor {display_name(key)} delayed"
+        result.append(Cause(f"{key}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {key}"))
     return tuple(result)

@@ -14,7 +14,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
-from beliefscope.inspect.diagnosis.causes.own_sensors import own_causes
+from beliefscope.inspect.diagnosis.causes.own_sensors import sensor_causes
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
 from beliefscope.inspect.diagnosis.undo_readings import advance
@@ -70,11 +70,12 @@ def test_delay_behind_labelled_contact(episode: Episode) -> None:
 
 
 def test_causes_of_delays_need_labels_without_a_sensor() -> None:
-    names = {cause.name for cause in own_causes(TASK)}
+    names = {cause.name for cause in sensor_causes(TASK)}
     assert {"force.delay", "torque.delay", "battery.delay"} <= names
-    assert "force.delay" not in {cause.name for cause in own_causes(replace(TASK, covariates={}))}
-    observed = {"observations": TASK.observations | {"contact": (1,)}}
-    assert "force.delay" not in {cause.name for cause in own_causes(replace(TASK, **observed))}
+    hand = {"observations": TASK.observations | {"effector_position": (3,)}}
+    with_hand = replace(TASK, **hand)
+    assert "force.delay" in {cause.name for cause in sensor_causes(with_hand)}
+    assert "force.delay" not in {cause.name for cause in sensor_causes(replace(with_hand, covariates={}))}, "no labels"
 
 
 def test_noisy_sensors_are_dropped_with_their_modality() -> None:

@@ -17,9 +17,11 @@ from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.undo import undo
 from beliefscope.inspect.diagnosis.undo_readings import scale_control
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.healthy import sensor_record
 
 SENSORS = {"image": (8, 8), "gps": (2,)}
 TASK = Task("cart", (Component("x", "m"), Component("y", "m")), SENSORS, {k: (k,) for k in SENSORS}, 0, 0.1)
@@ -108,7 +110,14 @@ def slide(seed: int) -> Episode:
     return Episode(WRENCH, states, controls, {"camera": images, "wrench": wrench}, contact=contact)
 
 
-RECORD = [sensor_statistics(slide(seed), None) for seed in range(30)]
+RECORD = sensor_record([slide(seed) for seed in range(30)])
+
+
+def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
+    return np.zeros((*controls.shape[:-1], 3))
+
+
+STILL = as_external(still, "still", WRENCH)
 
 
 @pytest.mark.parametrize(
@@ -118,6 +127,9 @@ RECORD = [sensor_statistics(slide(seed), None) for seed in range(30)]
         ("sensor_gain=wrench:factor=0.5", "wrench.gain"),
         ("sensor_noise=wrench:std=1", "wrench.noise"),
         ("sensor_bias=wrench:offset=0.02", "wrench.bias"),
+        ("sensor_gain=wrench:factor=-1", "wrench.sign"),
+        ("sensor_swapped=wrench", "wrench.axes"),
+        ("delay=haptics:steps=3", "wrench.delay"),
         ("control_scale=-1", "control.scale"),
         ("control_scale=0.1", "control.scale"),
         ("control_delay=4", "control.delay"),
@@ -125,9 +137,13 @@ RECORD = [sensor_statistics(slide(seed), None) for seed in range(30)]
 )
 def test_faults_of_readings_and_controls_of_a_task_without_a_measured_hand(faults: str, cause: str) -> None:
     """A bias of 0.02 is small for the force of 2 N and large for the torque of 0.02 N m in the same sensor."""
-    values = {name: np.array([row.get(name, np.nan) for row in RECORD]) for name in RECORD[0]}
-    profile = HealthyProfile("peg", len(RECORD), None, values)
-    tested = [sensor_statistics(Faults.parse(faults).apply(slide(seed), seed), None) for seed in range(30, 42)]
+    rows = RECORD.rows
+    values = {name: np.array([row.get(name, np.nan) for row in rows]) for name in rows[0]}
+    profile = HealthyProfile("peg", len(rows), None, values, RECORD.reference, RECORD.readings)
+    tested = [
+        sensor_statistics(Faults.parse(faults).apply(slide(seed), seed), RECORD.reference, RECORD.readings)
+        for seed in range(30, 42)
+    ]
     deviations = with_critical_values(profile, compare(profile, tested, task=WRENCH), 0.02)
     causes = applicable(causes_of(WRENCH), [d.statistic for d in deviations])
     result = probabilities({c.name: explain(c, deviations) for c in causes})
@@ -135,13 +151,23 @@ def test_faults_of_readings_and_controls_of_a_task_without_a_measured_hand(fault
     assert result[cause] > (0.6 if faults == "control_scale=-1" else 0.8), "control.sign is probable as well"
 
 
+def test_wrong_channels_are_put_back() -> None:
+    """The undo restores the readings up to their noise: order and signs, of the affected episodes only."""
+    profile = HealthyProfile("peg", len(RECORD.rows), None, {}, RECORD.reference, RECORD.readings)
+    episode = slide(50)
+    wrong = Faults.parse("sensor_swapped=wrench, sensor_gain=wrench:factor=-1").apply(episode, 0)
+    inputs = RunInputs(STILL, {0: wrong, 1: wrong}, 1, frozenset({0}), healthy=profile)
+    result = undo("rearrange wrench", inputs, {})
+    assert result is not None
+    np.testing.assert_array_equal(result.episodes[0].observations["wrench"], episode.observations["wrench"])
+    assert result.episodes[1] is wrong
+    assert undo("rearrange wrench", replace(inputs, episodes={0: episode}), {}) is None, "nothing to put back"
+    assert undo("rearrange wrench", replace(inputs, healthy=None), {}) is None
+
+
 def test_scaled_controls_are_divided_by_their_factor() -> None:
     wrong = Faults.parse("control_scale=-2").apply(slide(0), 0)
-
-    def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
-        return np.zeros((*controls.shape[:-1], 3))
-
-    inputs = RunInputs(as_external(still, "still", WRENCH), {0: wrong}, 1, frozenset({0}))
+    inputs = RunInputs(STILL, {0: wrong}, 1, frozenset({0}))
     gains = [
         Deviation(
             f"control gain/control {name} {i}/all", value / -2, value, value - 0.01, value + 0.01, 0.0, value < 0, 9

@@ -1,0 +1,119 @@
+"""Causes in the models, labels, controls and fusion weights of a user's task, by the names of its modalities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from beliefscope.datasets.task import Task, display_name
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes import data, fusion, model
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.own_sensors import KNOWN
+from beliefscope.inspect.diagnosis.vector_checks import commands_hand
+from beliefscope.inspect.statistics.reference_images import HAND
+
+MODALITIES = ("image", "haptics")
+"""Modalities whose measurement models have causes in the catalog."""
+
+
+def model_causes(task: Task) -> tuple[Cause, ...]:
+    """Causes beyond the sensors that the catalog does not have for the task."""
+    return tuple(cause for part in (_models, _labels, _controls, _weights) for cause in part(task))
+
+
+def _models(task: Task) -> tuple[Cause, ...]:
+    """Causes in measurement models of modalities that the catalog does not have, or whose sensors it cannot check.
+
+    These are sensors of other names and, without a measured hand, force and torque: their signs and axes.
+    """
+    check = "Check the calibration of its sensors, whose offsets and scales have the same symptoms. "
+    checked = {*KNOWN} if HAND in task.observations else {"image"}
+    names = [name for name, keys in task.modalities.items() if name not in MODALITIES or not {*keys} & checked]
+    title = "Sensors or model of {}"  # their fusion weights may depend on their models
+    return tuple(c for n in names for c in model.causes_of(n, title.format(display_name(n)), check, WEIGHTS))
+
+
+def _labels(task: Task) -> tuple[Cause, ...]:
+    """Delayed labels of tasks without a measured hand: behind all modalities and, if these cause changes, the controls.
+
+    A faulty sensor can make a single modality appear early.
+    """
+    if HAND in task.observations:
+        return ()
+    (delay,) = (cause for cause in data.CAUSES if cause.name == "labels.delay")
+    (_, dynamics) = delay.symptoms
+    lag = Symptom("lag/labels/*|lag/dynamics/*", 1, 2.0, otherwise=(Symptom("reading lag/*", -1),))
+    controls = Symptom("control lag/*", -1, optional=True)
+    return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls)),)
+
+
+def _controls(task: Task) -> tuple[Cause, ...]:
+    """Causes in controls that do not command a measured hand, and in their use.
+
+    Two things show such controls: the changes of the labels, where a regression on the controls explains them, and the
+    dynamics model of a filter. An opposite sign is also a wrong scale, and inverted dynamics, by their slope, are also
+    frozen ones: the prior prefers them.
+    """
+    if not task.control_size or commands_hand(task):
+        return ()
+    # Updates of single modalities, which stand in for measurements, depend on the prediction.
+    changed = f"control gain/*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
+    used = Symptom("dynamics slope/*|dynamics spread/*|control gain/*", 0, optional=True)
+    return (
+        Cause(
+            "control.delay",
+            "Controls delayed",
+            (Symptom("control lag/*", otherwise=(Symptom("lag/dynamics/*", -1),)),),
+            changed,
+            "Synchronise the controls with the sensors.",
+            "advance control",
+        ),
+        Cause(
+            "control.scale",
+            "Controls with a wrong scale, sign or order",
+            (Symptom("control gain/*", 0, otherwise=(Symptom("size/control*", 0),)), used),
+            f"control lag/*|size/control*|{changed}",
+            "Check the units, signs and order of the controls.",
+            "scale control",
+        ),
+        Cause(
+            "control.sign",
+            "Controls with the opposite sign",
+            (
+                Symptom("opposed/control*", otherwise=(Symptom("control gain/*", target="mirrored"),)),
+                Symptom("control gain/*", 0, optional=True),
+            ),
+            f"control lag/*|{changed}",
+            "Check the sign convention of the controls.",
+            "negate control|scale control",
+            prior=0.2,
+        ),
+        Cause(
+            "dynamics.inverted",
+            "Dynamics inverted: predicted changes have the wrong sign",
+            (Symptom("dynamics slope/*", target="mirrored"),),
+            f"opposed/control*|lag/dynamics/*|{LABELS}|{DYNAMICS}",
+            "Check the sign of the controls in the dynamics model.",
+            prior=0.2,
+        ),
+    )
+
+
+def _weights(task: Task) -> tuple[Cause, ...]:
+    """Fusion weights that ignore one of two modalities of other names than those of the catalog."""
+    if len(task.modalities) != 2 or set(task.modalities) == set(MODALITIES):
+        return ()
+    return tuple(
+        Cause(
+            f"weights.ignores_{name}",
+            f"Fusion weights ignore {display_name(name)}",
+            (
+                Symptom(f"beta logit/{name}*", -1, otherwise=(Symptom(f"beta logit/{other}*", 1),)),
+                Symptom("beta logit/*", target="shifted"),
+            ),
+            f"beta spread/*|{FILTER}",
+            fusion.RETRAIN,
+            "healthy beta",
+        )
+        for name, other in zip(task.modalities, reversed([*task.modalities]), strict=True)
+    )

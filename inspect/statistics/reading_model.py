@@ -1,0 +1,180 @@
+"""Linear model of a vector sensor: the readings that the labels lead to expect, fitted to the healthy episodes.
+
+It shows what the readings of a sensor of unknown physics cannot show by themselves: channels that are inverted or
+exchanged, and a delay behind the labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Task
+from beliefscope.inspect.statistics.reference_images import CONTACT
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask
+
+EXPLAINED = 0.5
+"""Smallest share of the variance of a channel within episodes that its model explains in other episodes."""
+
+RIDGE = 1e-3
+"""Penalty of squared coefficients of standardised features, relative to the number of steps."""
+
+MIN_EPISODES = 4
+"""Smallest number of episodes of a model."""
+
+DIGITS = 4
+"""Significant digits of stored coefficients."""
+
+
+@dataclass(frozen=True)
+class ReadingModel:
+    """Expected readings of one sensor.
+
+    Attributes:
+        key: observation key of the sensor.
+        channels: indices of the A channels that the labels explain (``EXPLAINED``).
+        coefficients: (F, A) in units of the readings by those of the ``features``.
+        constants: (A,) in units of the readings.
+        scales: (A,) standard deviations of the readings within episodes.
+    """
+
+    key: str
+    channels: tuple[int, ...]
+    coefficients: Array
+    constants: Array
+    scales: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values."""
+
+        def rounded(values: Array) -> list[float]:
+            return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]
+
+        return {
+            "key": self.key,
+            "channels": list(self.channels),
+            "coefficients": [rounded(row) for row in self.coefficients],
+            "constants": rounded(self.constants),
+            "scales": rounded(self.scales),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> ReadingModel:
+        """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
+        channels = tuple(int(channel) for channel in value["channels"])
+        names = ("coefficients", "constants", "scales")
+        coefficients, constants, scales = (np.array(value[name], dtype=np.float64) for name in names)
+        if coefficients.ndim != 2 or not coefficients.shape[1:] == constants.shape == scales.shape == (len(channels),):
+            raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}")
+        return cls(str(value["key"]), channels, coefficients, constants, scales)
+
+    def compare(self, episode: Episode) -> tuple[Array, Array, Mask]:
+        """Readings and expected readings (T, A), and the steps (T,) that have both.
+
+        None has if the model has the features of another version.
+        """
+        inputs, present = features(episode), _steps(episode, self.key)
+        readings = episode.observations[self.key][:, self.channels].astype(np.float64)
+        if inputs.shape[1] != len(self.coefficients):
+            return readings, readings, np.zeros_like(present)
+        return readings, inputs @ self.coefficients + self.constants, present
+
+    def correlations(self, episode: Episode, delay: int = 0) -> Array:
+        """(A, A): of the reading of each channel with the expected reading of each channel, ``delay`` steps earlier.
+
+        0 for constant channels, and for too few steps.
+        """
+        readings, expected, present = self.compare(episode)
+        steps = np.flatnonzero(present)
+        steps = steps[(steps - delay > 1) & (steps - delay < len(present))]  # expected readings begin at step 2
+        if len(steps) < MIN_STEPS:
+            return np.zeros((len(self.channels), len(self.channels)))
+        a, b = (x - x.mean(0) for x in (readings[steps], expected[steps - delay]))
+        a, b = (x / np.maximum(np.linalg.norm(x, axis=0), 1e-12) for x in (a, b))
+        return np.asarray(a.T @ b)
+
+
+def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
+    """Models of the vector sensors whose readings depend on the labels; none for unlabelled or too few episodes.
+
+    Each half of the episodes decides which channels the model of the other half explains.
+    """
+    if len(episodes) < MIN_EPISODES or not keys or not all(np.isfinite(e.states).all() for e in episodes):
+        return ()
+    inputs = [features(episode) for episode in episodes]
+    result = []
+    for key in keys:
+        rows = [
+            (x[at], episode.observations[key][at].astype(np.float64))
+            for x, episode in zip(inputs, episodes, strict=True)
+            if (at := _steps(episode, key)).sum() >= MIN_STEPS
+        ]
+        if len(rows) < MIN_EPISODES:
+            continue
+        means = [np.mean([row[i].mean(0) for row in rows], axis=0) for i in (0, 1)]
+        rows = [(x - x.mean(0), y - y.mean(0)) for x, y in rows]
+        halves = (_left(rows[1::2], _ridge(rows[::2])), _left(rows[::2], _ridge(rows[1::2])))
+        total = np.square(np.concatenate([y for _, y in rows])).sum(0)
+        channels = np.flatnonzero(halves[0] + halves[1] < (1.0 - EXPLAINED) * total)
+        if len(channels):
+            coefficients = _ridge(rows)[:, channels]
+            constants = means[1][channels] - means[0] @ coefficients
+            scales = np.sqrt(total[channels] / sum(len(y) for _, y in rows))
+            result.append(ReadingModel(key, tuple(channels.tolist()), coefficients, constants, scales))
+    return tuple(result)
+
+
+def _ridge(rows: Sequence[tuple[Array, Array]]) -> Array:
+    """(F, d) coefficients of ridge regression, of pairs of features (S, F) and readings (S, d)."""
+    x, y = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    scale = x.std(0)
+    scale = np.where(scale > 1e-9, scale, np.inf)
+    x = x / scale
+    return np.asarray(np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y) / scale[:, None])
+
+
+def _left(rows: Sequence[tuple[Array, Array]], coefficients: Array) -> Array:
+    """(d,) sum of squares that the coefficients leave unexplained."""
+    return np.asarray(sum(np.square(y - x @ coefficients).sum(0) for x, y in rows))
+
+
+def _steps(episode: Episode, key: str) -> Mask:
+    """(T,): steps with a reading that have two earlier ones, from which their changes are computed."""
+    return np.asarray(episode.present(key) & (np.arange(len(episode)) > 1))
+
+
+def features(episode: Episode) -> Array:
+    """(T, F): the state, its first and second changes by step, changes in the body frame, and all of them in contact.
+
+    Angles that wrap are their cosine and sine, rotations their matrices. Changes are zero where they are unknown, at
+    the first two steps.
+    """
+    task, states = episode.task, episode.states.astype(np.float64)
+    change, second = np.zeros((2, *states.shape))
+    change[1:] = task.difference(states[1:], states[:-1])
+    second[2:] = change[2:] - change[1:-1]
+    values, frames = _values(task, states)
+    in_frames = (frames[:, :, None] * change[:, None]).reshape(len(states), -1)
+    all_ = np.concatenate([values, change, second, in_frames], axis=1)
+    if CONTACT not in task.covariates:
+        return all_
+    contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
+    return np.concatenate([all_, contact, contact * all_], axis=1)
+
+
+def _values(task: Task, states: Array) -> tuple[Array, Array]:
+    """State components (T, V) without jumps, and those (T, R) that turn vectors of the world into the body frame."""
+    frames = [f(states[:, [i]]) for i, c in enumerate(task.components) if c.wraps for f in (np.cos, np.sin)]
+    if task.rotations:
+        from scipy.spatial.transform import Rotation  # takes most of a second
+
+        frames += [Rotation.from_rotvec(states[:, at]).as_matrix().reshape(len(states), 9) for at in task.rotations]
+    turning = {i for i, c in enumerate(task.components) if c.wraps}
+    turning |= {i for at in task.rotations for i in range(at.start, at.stop)}
+    others = [states[:, [i]] for i in range(states.shape[1]) if i not in turning]
+    empty = np.zeros((len(states), 0))
+    return np.concatenate([*others, *frames, empty], axis=1), np.concatenate([*frames, empty], axis=1)

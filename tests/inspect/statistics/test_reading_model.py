@@ -1,0 +1,148 @@
+"""Linear models of sensors: exact on readings that are linear in their features, and none where labels say nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from beliefscope.datasets.covariate import CONTACT
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Component, Task, rotation
+from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors, reading_statistics
+from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
+
+DT, STEPS, NOISE = 0.05, 120, 0.01
+PLANE = Task(
+    name="rover",
+    components=(Component("x", "m"), Component("y", "m"), Component("yaw", "rad", wraps=True)),
+    observations={"gps": (2,), "odometry": (2,), "battery": (1,)},
+    modalities={"gps": ("gps",), "wheels": ("odometry", "battery")},
+    control_size=0,
+    dt=DT,
+    covariates={"contact": CONTACT},
+)
+
+
+def smooth(rng: np.random.Generator, size: int) -> np.ndarray:
+    """(T, size): sums of three sines with random phases and periods of 1 to 4 s."""
+    t = DT * np.arange(STEPS)[:, None, None]
+    return np.sin(2.0 * np.pi * (t / rng.uniform(1.0, 4.0, (size, 3)) + rng.random((size, 3)))).sum(-1)
+
+
+def rove(seed: int) -> Episode:
+    """Position and, in the body frame, the motion of each step; a battery voltage that nothing explains."""
+    rng = np.random.default_rng(seed)
+    position, yaw = 0.5 * smooth(rng, 2), 2.0 * smooth(rng, 1)[:, 0]
+    motion = np.diff(position, axis=0, prepend=position[:1]) / DT
+    forward = np.cos(yaw) * motion[:, 0] + np.sin(yaw) * motion[:, 1]
+    left = -np.sin(yaw) * motion[:, 0] + np.cos(yaw) * motion[:, 1]
+    observations = {
+        "gps": position + np.array([3.0, -2.0]) + rng.normal(0.0, NOISE, (STEPS, 2)),
+        "odometry": np.column_stack([forward, left]) + rng.normal(0.0, NOISE, (STEPS, 2)),
+        "battery": 12.0 + rng.normal(0.0, 0.1, (STEPS, 1)),
+    }
+    states = np.column_stack([position, (yaw + np.pi) % (2.0 * np.pi) - np.pi])
+    return Episode(PLANE, states, np.zeros((STEPS, 0)), observations, contact=np.zeros(STEPS))
+
+
+def with_readings(episode: Episode, key: str, readings: np.ndarray) -> Episode:
+    return replace(episode, observations={**episode.observations, key: readings.astype(np.float32)})
+
+
+EPISODES = [rove(seed) for seed in range(12)]
+MODELS = fit_reading_models(EPISODES, modelled_sensors(PLANE))
+NEW = rove(100)
+GPS, ODOMETRY = MODELS
+
+
+def test_only_sensors_that_the_labels_explain_have_a_model() -> None:
+    assert [(model.key, model.channels) for model in MODELS] == [("gps", (0, 1)), ("odometry", (0, 1))]
+    assert fit_reading_models(EPISODES[:3], ["gps"]) == (), "too few episodes"
+    unlabelled = [replace(e, states=np.full_like(e.states, np.nan)) for e in EPISODES]
+    assert fit_reading_models(unlabelled, ["gps"]) == ()
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.key)
+def test_expected_readings_of_new_episodes_are_the_noise_free_ones(model: ReadingModel) -> None:
+    readings, expected, present = model.compare(NEW)
+    assert (readings - expected)[present].std(0).max() < 1.2 * NOISE + 0.02 * model.scales.max()
+    np.testing.assert_allclose(model.scales, np.mean([e.observations[model.key].std(0) for e in EPISODES], 0), rtol=0.1)
+
+
+def test_readings_in_the_body_of_a_rotation_in_space_are_expected() -> None:
+    """An accelerometer at rest measures gravity in the body frame, whose matrix is a feature."""
+    sensors = {"observations": {"imu": (3,)}, "modalities": {"imu": ("imu",)}}
+    task = replace(PLANE, components=rotation("turn"), **sensors)
+
+    def turn(seed: int) -> Episode:
+        rng = np.random.default_rng(seed)
+        turned = Rotation.from_rotvec(0.7 * smooth(rng, 3))
+        gravity = turned.inv().apply([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.05, (STEPS, 3))
+        return Episode(task, turned.as_rotvec(), np.zeros((STEPS, 0)), {"imu": gravity}, contact=np.zeros(STEPS))
+
+    (model,) = fit_reading_models([turn(seed) for seed in range(8)], ["imu"])
+    readings, expected, present = model.compare(turn(50))
+    assert np.abs(readings - expected)[present].std(0).max() < 0.1
+    assert model.channels == (0, 1, 2)
+
+
+def test_correlations_of_a_signed_permutation_are_that_permutation() -> None:
+    readings = NEW.observations["gps"][:, ::-1] * [1.0, -1.0]
+    result = GPS.correlations(with_readings(NEW, "gps", readings))
+    assert result[0, 1] > 0.99
+    assert result[1, 0] < -0.99
+
+
+@pytest.mark.parametrize("factor", [0.1, 7.0])
+def test_correlations_do_not_depend_on_gain_and_bias(factor: float) -> None:
+    changed = with_readings(NEW, "gps", factor * NEW.observations["gps"] + 5.0)
+    np.testing.assert_allclose(GPS.correlations(changed), GPS.correlations(NEW), atol=1e-5)  # float32 readings
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4, 9])
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.key)
+def test_delays_are_exact(model: ReadingModel, delay: int) -> None:
+    late = NEW.observations[model.key][np.maximum(np.arange(STEPS) - delay, 0)]
+    values = reading_statistics(with_readings(NEW, model.key, late), MODELS)
+    assert values[f"reading lag/{model.key}/all"] == delay
+    assert values[f"inverted/{model.key} x/all"] == 0.0, "correlations are those at the delay"
+
+
+def test_wrong_channels_show_in_their_own_statistics_only() -> None:
+    gps = NEW.observations["gps"]
+
+    def of(readings: np.ndarray) -> dict[str, float]:
+        return reading_statistics(with_readings(NEW, "gps", readings), MODELS)
+
+    clean, inverted, exchanged = of(gps), of(gps * [1.0, -1.0]), of(gps[:, ::-1])
+    assert max(v for name, v in clean.items() if name.startswith(("inverted", "exchanged"))) == 0.0
+    assert inverted["inverted/gps y/all"] > 0.99
+    assert inverted["inverted/gps x/all"] == inverted["exchanged/gps x/all"] == 0.0
+    assert min(exchanged["exchanged/gps x/all"], exchanged["exchanged/gps y/all"]) > 1.0
+    biased = of(gps + GPS.scales)
+    assert biased["reading bias/gps x/all"] - clean["reading bias/gps x/all"] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_absent_readings_do_not_count() -> None:
+    task = replace(PLANE, masks={"gps": "fix"}, covariates={"contact": CONTACT, "fix": CONTACT})
+    fix = (np.arange(STEPS) % 3 == 0).astype(np.float32)
+    readings = np.where(fix[:, None] > 0.0, NEW.observations["gps"], 0.0)
+    episode = replace(with_readings(NEW, "gps", readings), task=task, covariates={"fix": fix})
+    assert np.diagonal(GPS.correlations(episode)).min() > 0.99
+
+
+def test_models_are_stored_as_json() -> None:
+    stored = ReadingModel.from_json(json.loads(json.dumps(GPS.to_json())))
+    np.testing.assert_allclose(stored.compare(NEW)[1], GPS.compare(NEW)[1], rtol=0.0, atol=2e-3)
+    with pytest.raises(ValueError, match="2 channels"):
+        ReadingModel.from_json({**GPS.to_json(), "scales": [1.0]})
+
+
+def test_a_model_of_other_features_has_no_steps() -> None:
+    (other,) = fit_reading_models([replace(e, task=replace(PLANE, covariates={})) for e in EPISODES], ["gps"])
+    assert not other.compare(NEW)[2].any()
+    assert np.isnan(reading_statistics(NEW, [other])["reading bias/gps x/all"])
