@@ -11,8 +11,11 @@ from beliefscope.inspect.statistics.signals import MAX_LAG, MIN_STEPS
 EXPLAINED = 0.5
 """Smallest share of the variance of a component's changes that the controls explain."""
 
-LATER = 0.9
+LATER = 0.5
 """Largest unexplained variance at a lag, relative to that without one."""
+
+SMALLEST = 1e-4
+"""Smallest share of unexplained variance that counts."""
 
 MAX_CHANNELS = 12
 """Maximum number of controls."""
@@ -36,19 +39,18 @@ def control_label_statistics(episode: Episode) -> dict[str, float]:
     if not moved.any():
         return {}
     change = change[:, moved] - change[:, moved].mean(0)
-    fits, left = [], []
-    for lag in range(-MAX_LAG, MAX_LAG + 1):
-        inputs = controls[1 + steps + lag]
-        inputs = inputs - inputs.mean(0)
-        fits.append(np.linalg.lstsq(inputs, change, rcond=1e-6)[0])
-        left.append(np.square(change - inputs @ fits[-1]).mean(0) / np.square(change).mean(0))
-    shares = np.array(left)
+    lags = np.arange(-MAX_LAG, MAX_LAG + 1)
+    inputs = controls[1 + steps + lags[:, None]]  # (L, S, c)
+    inputs = inputs - inputs.mean(1, keepdims=True)
+    fits = np.linalg.pinv(inputs, rcond=1e-6) @ change
+    shares = np.square(change - inputs @ fits).mean(1) / np.square(change).mean(0)  # (L, moved)
     follows = shares.min(0) < 1.0 - EXPLAINED
     if not follows.any():
         return {}
-    total = shares[:, follows].sum(1)
+    # The component that the controls explain best counts most.
+    total = np.log(np.maximum(shares[:, follows], SMALLEST)).sum(1)
     best = int(total.argmin())
-    best = best if total[best] < LATER * total[MAX_LAG] else MAX_LAG
+    best = best if total[best] < total[MAX_LAG] + np.log(LATER) else MAX_LAG
     values = {"control lag/control/all": float(best - MAX_LAG)}
     for i in np.flatnonzero(follows):
         name = task.components[np.flatnonzero(moved)[i]].name
