@@ -65,6 +65,7 @@ class Diagnosis(Reply):
     miscalibrated: whether the healthy record itself is over- or underconfident.
     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
+    outdated: whether an earlier version measured the healthy record, which lacks statistics.
     """
 
     state: Literal["healthy", "fault", "unsure"]
@@ -81,6 +82,7 @@ class Diagnosis(Reply):
     miscalibrated: bool
     statistics: dict[str, int]
     unmeasured: list[str]
+    outdated: bool = False
     alarm_rate: float
 
 

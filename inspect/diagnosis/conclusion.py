@@ -114,11 +114,16 @@ def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
         for name, values in case.profile.statistics.items()
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
+    new = missing_statistics(case)
+    outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
+    return sensors + absent + (outdated if new else [])
+
+
+def missing_statistics(case: Case) -> int:
+    """Number of statistics of kinds that the healthy record does not have, since an earlier version measured it."""
     kinds = {name.partition("/")[0] for name in case.profile.statistics}
     finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}
-    new = {name for name in finite if name.partition("/")[0] not in kinds}
-    outdated = [f"statistics that the healthy record of an earlier version lacks ({len(new)}): measure it again"]
-    return sensors + absent + (outdated if new else [])
+    return sum(name.partition("/")[0] not in kinds for name in finite)
 
 
 def _of_sensors(case: Case) -> set[str]:
@@ -276,5 +281,6 @@ def _provenance(case: Case) -> dict[str, Any]:
         "miscalibrated": _is_miscalibrated(_nees(case.profile)),
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers),
+        "outdated": missing_statistics(case) > 0,
         "alarm_rate": case.alarm_rate,
     }

@@ -11,13 +11,16 @@ from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, axis_name
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import Array, fitted_lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, fitted_lag
 
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
 
-LARGEST = 0.9999
-"""Largest correlation of which the rest is computed."""
+SURELY = 4.0
+"""Smallest number of standard errors of a slope."""
+
+FITS = 9.0
+"""Largest mean square error of readings that fit, relative to the square of the noise."""
 
 
 def modelled_sensors(task: Task) -> list[str]:
@@ -31,40 +34,61 @@ def modelled_sensors(task: Task) -> list[str]:
 
 
 def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict[str, float]:
-    """Of each channel that the labels explain, from the correlations c of readings with expected readings.
+    """Of each channel that the labels explain, against its expected readings.
 
-    ``inverted``: -c, 0 if positive. ``exchanged``: half the log-ratio of 1 - |c|, summed over two channels, to that
-    with these channels exchanged, for the best other channel; 0 if none is better. Gain and bias do not matter.
-    ``reading lag``: steps by which the readings of a sensor follow the expected ones; c is that at this lag.
-    ``reading bias``: mean difference from the expected readings, in healthy standard deviations within episodes.
+    ``reading lag``: steps by which the readings of a sensor follow the expected ones. At this lag, ``inverted``: half
+    the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then fit (``FITS``).
+    ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged, whatever their signs,
+    for the best other channel. ``reading bias``: mean error relative to the noise. ``reading gain``: slope of the
+    readings on the expected ones. ``reading noise``: standard deviation from this line, relative to the noise.
     """
     values: dict[str, float] = {}
     for model in models:
         if model.key not in episode.observations or not np.isfinite(episode.states).all():
             continue
-        delay, correlation = delayed_correlations(episode, model)
-        readings, expected, present = model.compare(episode)
-        bias = (
-            (readings[present] - expected[present]).mean(0) / model.scales if present.any() else model.scales * np.nan
-        )
+        delay, errors = delayed_errors(episode, model)
         values[f"reading lag/{model.key}/all"] = delay
-        own, size = np.diagonal(correlation), np.minimum(np.abs(correlation), LARGEST)
-        rest = 2.0 - np.diagonal(size)[:, None] - np.diagonal(size)
-        evidence = 0.5 * np.log(rest / (2.0 - size - size.T))
+        readings, expected, present = model.compare(episode)
+        line = _line(readings[present], expected[present])
+        least = errors.min(0)
+        own = np.diagonal(least)
+        exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
+        inverted = _evidence(np.diagonal(errors[0]), np.diagonal(errors[1]), FITS)
         count = episode.task.observations[model.key][0]
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
-            values[f"reading bias/{axis}/all"] = float(bias[i])
-            values[f"inverted/{axis}/all"] = max(0.0, -float(own[i]))
+            values[f"reading bias/{axis}/all"] = float(line["bias"][i] / model.noise[i])
+            values[f"reading gain/{axis}/all"] = float(line["gain"][i])
+            values[f"reading noise/{axis}/all"] = float(line["noise"][i] / model.noise[i])
+            values[f"inverted/{axis}/all"] = float(inverted[i])
             if len(model.channels) > 1:
-                values[f"exchanged/{axis}/all"] = max(0.0, float(np.delete(evidence[i], i).max()))
+                values[f"exchanged/{axis}/all"] = float(np.delete(exchanged[i], i).max())
     return values
 
 
-def delayed_correlations(episode: Episode, model: ReadingModel) -> tuple[float, Array]:
-    """Delay of the readings in steps, NaN if they do not follow the expected ones, and correlations (A, A).
+def _line(readings: Array, expected: Array) -> dict[str, Array]:
+    """``bias``, ``gain`` and ``noise`` (A,) of readings (S, A): a line through the expected ones, and what it leaves.
 
-    The correlations are those at the delay.
+    NaN for too few steps. Gains are 1 unless they differ from it by ``SURELY`` standard errors: noise changes them as
+    well. The noise is that before the gain.
     """
+    if len(readings) < MIN_STEPS:
+        return dict.fromkeys(("bias", "gain", "noise"), np.full(readings.shape[1], np.nan))
+    x, y = expected - expected.mean(0), readings - readings.mean(0)
+    power = np.maximum(np.square(x).sum(0), 1e-24)
+    slope = (x * y).sum(0) / power
+    rest = np.sqrt(np.square(y - slope * x).mean(0))
+    gain = np.where(np.abs(slope - 1.0) > SURELY * rest / np.sqrt(power), slope, 1.0)
+    return {"bias": (readings - expected).mean(0), "gain": gain, "noise": rest / np.maximum(np.abs(gain), 1e-3)}
+
+
+def _evidence(error: Array, other: Array, limit: float) -> Array:
+    """Half the log-ratio of errors to others that are below a limit; 0 where they are not, or not smaller."""
+    ratio = error / np.maximum(other, 1e-12)
+    return np.asarray(0.5 * np.log(np.where(other < limit, np.maximum(ratio, 1.0), 1.0)))
+
+
+def delayed_errors(episode: Episode, model: ReadingModel) -> tuple[float, Array]:
+    """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay."""
     delay = fitted_lag(*model.compare(episode))
-    return delay, model.correlations(episode, 0 if np.isnan(delay) else int(delay))
+    return delay, model.errors(episode, 0 if np.isnan(delay) else int(delay))

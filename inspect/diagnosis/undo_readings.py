@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
-from beliefscope.inspect.diagnosis.reading_checks import delayed_correlations
+from beliefscope.inspect.diagnosis.reading_checks import delayed_errors
 from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
 from beliefscope.inspect.diagnosis.vector_checks import (
@@ -208,9 +208,11 @@ def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs 
 
     if model is None:
         return None
-    total = np.sum([delayed_correlations(inputs.episodes[index], model)[1] for index in inputs.affected], axis=0)
-    sources, channels = linear_sum_assignment(-np.abs(total))  # reading i is of channel j
-    signs = np.where(total[sources, channels] < 0.0, -1.0, 1.0)
+    total = np.sum([delayed_errors(inputs.episodes[index], model)[1] for index in inputs.affected], axis=0)
+    if not np.isfinite(total).all():
+        return None
+    sources, channels = linear_sum_assignment(total.min(0))  # reading i is of channel j
+    signs = np.where(total.argmin(0)[sources, channels], -1.0, 1.0)
     if (sources == channels).all() and (signs > 0.0).all():
         return None
     order = np.array(model.channels)

@@ -20,6 +20,9 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask
 EXPLAINED = 0.5
 """Smallest share of the variance of a channel within episodes that its model explains in other episodes."""
 
+SMALLEST_NOISE = 0.01
+"""Smallest noise of a channel, relative to the standard deviation of its readings within episodes."""
+
 RIDGE = 1e-3
 """Penalty of squared coefficients of standardised features, relative to the number of steps."""
 
@@ -39,14 +42,14 @@ class ReadingModel:
         channels: indices of the A channels that the labels explain (``EXPLAINED``).
         coefficients: (F, A) in units of the readings by those of the ``features``.
         constants: (A,) in units of the readings.
-        scales: (A,) standard deviations of the readings within episodes.
+        noise: (A,) standard deviations of the readings from the expected ones, in episodes to which it is not fitted.
     """
 
     key: str
     channels: tuple[int, ...]
     coefficients: Array
     constants: Array
-    scales: Array
+    noise: Array
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -59,18 +62,18 @@ class ReadingModel:
             "channels": list(self.channels),
             "coefficients": [rounded(row) for row in self.coefficients],
             "constants": rounded(self.constants),
-            "scales": rounded(self.scales),
+            "noise": rounded(self.noise),
         }
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReadingModel:
         """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
         channels = tuple(int(channel) for channel in value["channels"])
-        names = ("coefficients", "constants", "scales")
-        coefficients, constants, scales = (np.array(value[name], dtype=np.float64) for name in names)
-        if coefficients.ndim != 2 or not coefficients.shape[1:] == constants.shape == scales.shape == (len(channels),):
+        names = ("coefficients", "constants", "noise")
+        coefficients, constants, noise = (np.array(value[name], dtype=np.float64) for name in names)
+        if coefficients.ndim != 2 or not coefficients.shape[1:] == constants.shape == noise.shape == (len(channels),):
             raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}")
-        return cls(str(value["key"]), channels, coefficients, constants, scales)
+        return cls(str(value["key"]), channels, coefficients, constants, noise)
 
     def compare(self, episode: Episode) -> tuple[Array, Array, Mask]:
         """Readings and expected readings (T, A), and the steps (T,) that have both.
@@ -83,19 +86,20 @@ class ReadingModel:
             return readings, readings, np.zeros_like(present)
         return readings, inputs @ self.coefficients + self.constants, present
 
-    def correlations(self, episode: Episode, delay: int = 0) -> Array:
-        """(A, A): of the reading of each channel with the expected reading of each channel, ``delay`` steps earlier.
+    def errors(self, episode: Episode, delay: int = 0) -> Array:
+        """(2, A, A): mean square of reading i minus plus or minus expected reading j, ``delay`` steps earlier.
 
-        0 for constant channels, and for too few steps.
+        Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
         """
         readings, expected, present = self.compare(episode)
         steps = np.flatnonzero(present)
         steps = steps[(steps - delay > 1) & (steps - delay < len(present))]  # expected readings begin at step 2
         if len(steps) < MIN_STEPS:
-            return np.zeros((len(self.channels), len(self.channels)))
-        a, b = (x - x.mean(0) for x in (readings[steps], expected[steps - delay]))
-        a, b = (x / np.maximum(np.linalg.norm(x, axis=0), 1e-12) for x in (a, b))
-        return np.asarray(a.T @ b)
+            return np.full((2, len(self.channels), len(self.channels)), np.nan)
+        difference = (
+            readings[steps][:, :, None] - np.array([1.0, -1.0])[:, None, None, None] * expected[steps - delay][:, None]
+        )
+        return np.asarray(np.square(difference / self.noise).mean(1))
 
 
 def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
@@ -123,8 +127,9 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
         if len(channels):
             coefficients = _ridge(rows)[:, channels]
             constants = means[1][channels] - means[0] @ coefficients
-            scales = np.sqrt(total[channels] / sum(len(y) for _, y in rows))
-            result.append(ReadingModel(key, tuple(channels.tolist()), coefficients, constants, scales))
+            noise = np.sqrt((halves[0] + halves[1])[channels] / sum(len(y) for _, y in rows))
+            noise = np.maximum(noise, SMALLEST_NOISE * np.sqrt(total[channels] / sum(len(y) for _, y in rows)))
+            result.append(ReadingModel(key, tuple(channels.tolist()), coefficients, constants, noise))
     return tuple(result)
 
 

@@ -196,7 +196,7 @@ export class Diagnosis {
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
     });
-    this.#drawMeasured(result?.healthy_data);
+    this.#drawMeasured(result);
     if (result === this.#listed) return;
     this.#listed = result;
     const causes = (result?.causes ?? []).filter(({ probability }) => probability >= SHOWN);
@@ -245,20 +245,25 @@ export class Diagnosis {
   }
 
   /**
-   * Shows the action that measures a record of the workspace again; none for records stored with the checkpoint.
-   * @param {string | undefined} source episodes of the record in use
+   * Shows the action that measures a record of the workspace again, or one that replaces the record stored with a
+   * checkpoint by an earlier version; none for other stored records.
+   * @param {Result | null | undefined} result
    */
-  #drawMeasured(source) {
+  #drawMeasured(result) {
     const host = html('.record', this.#host);
     const entry = this.#records.get(this.#recordKey);
-    const isInUse = entry.state === 'ready' && entry.result.data === source;
+    const isInUse = entry.state === 'ready' && entry.result.data === result?.healthy_data;
     const trace = this.#trace;
-    const isShown = isInUse || ['active', 'ended', 'error'].includes(entry.state);
+    const isOld = result?.outdated ?? false;
+    const isShown = isInUse || isOld || ['active', 'ended', 'error'].includes(entry.state);
     host.hidden = !this.#starts || !isShown;
     if (host.hidden || !trace) return;
     const { data } = trace.selection;
-    const about = `The record was measured in this workspace. Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
-    html('.verdict', host).textContent = isInUse ? about : stateOf(entry);
+    const source = isOld
+      ? 'The healthy record lacks statistics of this version.'
+      : 'The record was measured in this workspace.';
+    const about = `${source} Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
+    html('.verdict', host).textContent = stateOf(entry) || (isInUse || isOld ? about : '');
     showJobButton(html('.doing', host), entry, {
       action: entry.state === 'active' ? 'Cancel' : 'Measure again',
       progress: 'Progress of the healthy record',

@@ -149,6 +149,7 @@ export interface components {
          *     miscalibrated: whether the healthy record itself is over- or underconfident.
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
          *     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
+         *     outdated: whether an earlier version measured the healthy record, which lacks statistics.
          */
         Diagnosis: {
             /**
@@ -187,6 +188,11 @@ export interface components {
             };
             /** Unmeasured */
             unmeasured: string[];
+            /**
+             * Outdated
+             * @default false
+             */
+            outdated: boolean;
             /** Alarm Rate */
             alarm_rate: number;
         };
