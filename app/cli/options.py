@@ -102,7 +102,7 @@ def output_file(
 DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=...)
 CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=...)
 TRACE_FILTER = option(
-    "NAME|CHECKPOINT",
+    "NAME|CHECKPOINT|MODULE:BUILD",
     "Filter that produced the traces. Default: the pretrained filter with the traces' checkpoint hash.",
     "",
 )

@@ -26,7 +26,9 @@ def diagnose(
     episode: int | None = opt.option(
         "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
     ),
-    base: Path | None = opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None),
+    base: Path | None = opt.option(
+        "NAME|CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None
+    ),
     alarm_rate: float | None = opt.option("P", ALARM_RATE, None),
     profile_from: Path | None = opt.option(
         "DATA", "Clean data; the healthy record is measured on their held-out episodes.", None
