@@ -33,7 +33,7 @@ def collect(
 
     The same seed gives the same data with any number of workers. An interrupted run resumes when the same command is
     run again. Of every ten episodes, eight are for training, one for validation and one for testing, unless --split is
-    given. The output compares the statistics of the data set with the paper's.
+    given. For door and push, the output compares the statistics of the data set with the paper's.
 
     \b
     Examples:

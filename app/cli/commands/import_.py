@@ -42,8 +42,8 @@ def import_(
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
-    run that the page displays. Filters are trained and fine-tuned on the episodes of --split train and evaluated on
-    those of val and test; --split auto makes a data set for all of it.
+    run that the page displays. Filters are trained and fine-tuned on the episodes of --split train, validated on those
+    of val and evaluated on those of test; --split auto makes a data set for all three.
 
     Formats of logs: NumPy (.npz), HDF5 (.h5, .hdf5), CSV and Parquet, also folders of them with one file per episode;
     MCAP, ROS 2 bags (folder or .db3), Zarr replay buffers (folder or .zip), LeRobot data sets (folder, version 3), and
