@@ -172,6 +172,21 @@ def test_readme_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert "'fused'" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_python_of_the_diagnostics_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / "docs" / "diagnostics.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    checkpoint = bs.load_filter("push/crossmodal-ekf")
+    run, other = (bs.trace(checkpoint, "push", 9, faults=faults) for faults in ("", "blackout"))
+    bs.save_trace(run, Path("run.trace"))
+    names: dict[str, object] = {"checkpoint": checkpoint, "run": run, "other": other}
+    for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(example, "diagnostics.md", "exec"), names)
+    assert "(32, 32)" in capsys.readouterr().out
+
+
 def test_key_help_is_complete() -> None:
     page = ROOT / "app" / "page"
     (table,) = re.findall(r"  bindKeys\(\{\n(.*?)\n  \}\);", (page / "core" / "controls.js").read_text(), re.DOTALL)
