@@ -236,7 +236,7 @@ PROPERTIES: dict[str, str] = {
     "filter": "name of the filter",
     "kind": "`ekf`, `ukf`, `pf`, `lstm`, `transformer`, or `external` for an external filter",
     "modalities": "JSON list: the K modalities in order",
-    "episode_index": "index in the dataset",
+    "episode_index": "index in the data set",
     "steps": "T, rows of every path under `trace/` and `observations/` that is not static; -1 during a live run",
     "dt": "seconds per step",
     "seed": "seed of the filter",
