@@ -186,8 +186,8 @@ def summary(trace: Trace) -> Iterator[Row]:
 
     ``error`` is the root mean square of the position error, ``worst`` its maximum, both in ``unit``, at ``worst_step``
     and ``worst_time``, s since the first step, None without timestamps;
-    each component has its own column, such as ``hinge_x_cm``. ``beta_image`` and ``weight_image`` are the mean raw and
-    effective fusion weight.
+    each component has its own column, such as ``hinge_x_cm``. ``beta_image`` and ``weight_image`` are the mean fusion
+    weight beta and effective weight.
     ``nll`` in nats, m and rad; ``nees`` over n, 1 if consistent; ``coverage95`` the share of steps with the truth in
     the 95 % ellipsoid; ``ess`` the effective share of the particles; NaN where a filter lacks the quantity.
     """

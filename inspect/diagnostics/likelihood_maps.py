@@ -271,7 +271,7 @@ def maps(
 ENTRY = Entry(
     name="maps",
     title="Likelihood maps",
-    question="Which positions does each modality consider likely, is its map round, a ridge or a ring, and does a "
+    question="Which positions are likely under each modality, is its map round, a ridge or a ring, and does a "
     "ridge have the direction that the task expects?",
     run=maps,
     why_not=lambda trace, checkpoint: None if checkpoint is None else no_maps(checkpoint, trace),

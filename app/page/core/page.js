@@ -385,7 +385,7 @@ export class Page {
       html('#weights'),
       hasBoth
         ? [
-            ['raw', 'β raw'],
+            ['raw', 'fusion β'],
             ['effective', 'effective'],
           ]
         : [],

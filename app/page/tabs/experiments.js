@@ -249,11 +249,12 @@ export class Experiments {
       entries.length < count
         ? ` ${entries.length} of ${count} entries of the provenance are columns; Show and pinned columns use all.`
         : '';
+    const checkpoints = this.#sweep?.checkpoints ?? 0;
     const about = html('.about', this.#host);
     about.classList.toggle('wrong', matched.problem !== '');
     about.textContent =
       matched.problem ||
-      `${matched.rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.${areGroups ? '' : cut}`;
+      `${matched.rows.length} of ${this.#rows.length} results of ${checkpoints} ${checkpoints === 1 ? 'checkpoint' : 'checkpoints'} match${more}.${areGroups ? '' : cut}`;
     this.#report([...this.#problems, ...this.#unknownChoices(columns)].join(' '));
     this.#groupMenu.show(this.#rows, state.groups, areGroups);
     this.#matching = rows;
