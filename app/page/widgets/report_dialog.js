@@ -16,7 +16,7 @@ const BODY = `
       <label><input type="radio" name="which" value="these"> these steps <input type="text" name="steps" aria-label="Steps" placeholder="12, 40" autocomplete="off"></label>
       <p class="offered"></p>
     </fieldset>
-    <label><input type="checkbox" name="every"> <span>Include slow diagnostics: likelihood maps, saliency, Shapley values</span></label>
+    <label><input type="checkbox" name="every"> <span>Include slow diagnostics, such as likelihood maps, saliency and Shapley values</span></label>
     <label><input type="checkbox" name="pdf"> <span>Also write a PDF</span></label>
     <label class="title">Title <input type="text" name="title" maxlength="200" autocomplete="off"></label>
     <p class="error" role="alert"></p>
