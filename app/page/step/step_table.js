@@ -136,7 +136,7 @@ function weightColumns(trace, component) {
   if (trace.has('weights'))
     columns.push({
       title: 'β',
-      unit: trace.weightWidth > 1 ? name : 'fusion',
+      unit: trace.weightWidth > 1 ? name : '',
       help: `Fusion weight, the output of the network${trace.weightWidth > 1 ? `, for ${name}` : ''}`,
       text: (source, t) => fixed(trace.weight('raw', source, component)?.[t], 2),
     });
