@@ -107,8 +107,9 @@ def maps_figure(
 ) -> Figure:
     """Maps of each modality relative to their maxima, centred on the true position; of one component, curves.
 
-    Haptics maps in contact show the direction of the ridge that the task expects, and the end effector. Raises BadInput
-    if the filter has no maps, or not those of the quantity.
+    Haptics maps in contact show the direction of the ridge that the task expects, and the end effector. A filter that
+    reports only its fused belief has one map of it. Raises BadInput if the filter has no maps, or not those of the
+    quantity.
 
     Args:
         size: cells per side.
@@ -118,9 +119,8 @@ def maps_figure(
     quantity = quantity or engine.quantities[0]
     maps = {state: engine.map(step, size=size, quantity=quantity) for state, step in steps.items()}
     titles = [title for title, _ in axis_titles(checkpoint.task, checkpoint.task.map_indices)]
-    layout = panels(checkpoint.task, trace.modalities, steps)
-    if not layout:
-        raise BadInput(f"filter {checkpoint.name!r} has no map of a modality: it has no separate modalities")
+    *modalities, fused = next(iter(maps.values())).layers
+    layout = panels(checkpoint.task, modalities or (fused,), steps)
     columns = min(PER_ROW, len(layout))
     rows = -(-len(layout) // columns)
     with rc_context(STYLE):

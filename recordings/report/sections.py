@@ -155,7 +155,7 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
 
 
 def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
-    """Error, weights and map statistics of each layer at one step."""
+    """Error, weights and map statistics at one step of each layer that has any."""
     task = trace.task
     units, factors = measures.display_units(task)
     error, nees = measures.errors(trace)[step] * factors, measures.nees(trace)[step]
@@ -184,11 +184,14 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
         for weights in (trace.weights, trace.effective_weights):
             if weights is not None:
                 row.append(float(weights[step, i].mean()) if i < weights.shape[1] else None)
-        if statistics is not None:
-            row += [main.factor * float(np.hypot(*statistics.peak[0, i]))] if same_unit else []
-            row += [factor * float(statistics.area95[0, i])]
-            row += [SHAPES[statistics.shape[0, i]]] if same_unit and len(where) == 2 else []
-        rows.append(tuple(row))
+        if statistics is not None and layer in statistics.layers:
+            at = statistics.layers.index(layer)
+            row += [main.factor * float(np.hypot(*statistics.peak[0, at]))] if same_unit else []
+            row += [factor * float(statistics.area95[0, at])]
+            row += [SHAPES[statistics.shape[0, at]]] if same_unit and len(where) == 2 else []
+        row += [None] * (len(columns) - len(row))
+        if any(value is not None for value in row[1:]):
+            rows.append(tuple(row))
     title = f"{step_text(step, trace.episode.time_of(step)).capitalize()} of episode {trace.episode_index}"
     title += "" if map_ is None else f". Maps: {map_.title}"
     return Table(title, tuple(columns), tuple(rows))
