@@ -8,22 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 FLOOR = 1e-8
-"""Part of a component's usual variance that is added to its variances."""
+"""Part of a component's usual variance, or of its own if that is larger, that is added to its variances."""
 
 SMALLEST = 1e-30
 """Variance of a component that has none in any covariance."""
 
 
 def with_floor(covariance: NDArray[Any], usual: NDArray[Any] | None = None) -> NDArray[np.float64]:
-    """Covariances (..., n, n) in float64 plus ``FLOOR`` times the usual variance of each component on the diagonal.
+    """Covariances (..., n, n) in float64, plus ``FLOOR`` times the larger of own and usual variance on the diagonal.
 
     A change of a component's unit changes the result by the same factors.
 
     Args:
         usual: (n,) variances. Default: ``usual_variances`` of these covariances.
     """
+    covariance = np.asarray(covariance, np.float64)
     usual = usual_variances(covariance) if usual is None else usual
-    return np.asarray(covariance, np.float64) + np.diag(np.maximum(FLOOR * usual, SMALLEST))
+    larger = np.maximum(usual, np.diagonal(covariance, axis1=-2, axis2=-1))
+    return covariance + np.maximum(FLOOR * larger, SMALLEST)[..., None] * np.eye(covariance.shape[-1])
 
 
 def usual_variances(covariance: NDArray[Any]) -> NDArray[np.float64]:
