@@ -14,6 +14,9 @@ from beliefscope.datasets.task import Task
 
 FloatArray = NDArray[np.float32]
 
+MISSED = 2
+"""Typical intervals between readings without one that are an outage: more than one missed reading."""
+
 _MISSING: Any = np.zeros(0)
 
 
@@ -79,6 +82,11 @@ class Episode:
         if name == "contact":
             return self.contact.astype(np.float32)
         return self.covariates.get(name, np.full(len(self), np.nan, np.float32))
+
+    def group_values(self, name: str) -> FloatArray:
+        """(T,) values that define the groups of a covariate: those of a sensor's mask are 0 only in its outages."""
+        values = self.covariate(name)
+        return values if name not in self.task.masks.values() else 1 - outages(values == 0).astype(np.float32)
 
     def present(self, key: str) -> NDArray[np.bool_]:
         """(T,): whether a step has a reading of a sensor (``Task.masks``); other steps repeat the last one."""
@@ -177,6 +185,21 @@ def time_error(time: NDArray[Any]) -> str:
         at = int(wrong[0]) + 1
         return f"is {time[at]:.9g} s at step {at}, after {time[at - 1]:.9g} s; expected ascending times"
     return ""
+
+
+def outages(lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(T,): steps in outages, intervals of steps without a reading that are long for this sensor.
+
+    Args:
+        lost: (T,) steps without a reading. A sensor that is slower than the steps has such steps between its readings.
+    """
+    spacing = np.diff(np.flatnonzero(~lost))
+    shortest = MISSED * float(np.median(spacing)) if len(spacing) else MISSED
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(np.int8))).reshape(-1, 2)
+    result = np.zeros(len(lost), np.bool_)
+    for first, end in edges:
+        result[first:end] = end - first >= shortest
+    return result
 
 
 def is_image(readings: NDArray[Any]) -> bool:

@@ -265,7 +265,7 @@ def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
     }
     for name, covariate in task.covariates.items():
         if name != "contact":
-            masks = covariate.masks(name, episode.covariate(name))
+            masks = covariate.masks(name, episode.group_values(name))
             columns |= {f"{GROUP}{group}": mask for group, mask in masks}
     if trace.effective_sample_size is not None:
         columns["ess"] = trace.effective_sample_size

@@ -115,7 +115,7 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
         yield "contact", "", contact
         yield "contact duration", "s", _duration(contact, durations)
     for name, covariate in task.covariates.items():
-        values = episode.covariate(name)
+        values = episode.group_values(name)
         if name != "contact" and covariate.kind == "continuous":
             yield display_name(name), covariate.unit, values
         elif name != "contact":

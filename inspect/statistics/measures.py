@@ -155,7 +155,7 @@ def phases(trace: Trace) -> dict[str, Mask]:
     groups = {
         group: keep & mask
         for name, covariate in trace.task.covariates.items()
-        for group, mask in covariate.masks(name, trace.episode.covariate(name))
+        for group, mask in covariate.masks(name, trace.episode.group_values(name))
     }
     return {"all": keep, **groups, "blackout": keep & blackout(trace)}
 
@@ -163,11 +163,11 @@ def phases(trace: Trace) -> dict[str, Mask]:
 def shaded_groups(trace: Trace) -> dict[str, Mask]:
     """Group -> mask (T,) of each group of the task's covariates, without those of false values.
 
-    Of the mask of a sensor (``Task.masks``), the steps without a reading.
+    Of the mask of a sensor (``Task.masks``), its outages.
     """
     groups: dict[str, Mask] = {}
     for name, covariate in trace.task.covariates.items():
-        masks = list(covariate.masks(name, trace.episode.covariate(name)))
+        masks = list(covariate.masks(name, trace.episode.group_values(name)))
         groups |= dict(masks[1:] if name in trace.task.masks.values() else masks[: covariate.shaded])
     return groups
 
@@ -186,14 +186,25 @@ def group_masks(trace: Trace) -> Mask:
     return (group_index(trace) == np.arange(4)[:, None]) & counted(trace)
 
 
+def _informative_phases(traces: Sequence[Trace]) -> list[dict[str, Mask]]:
+    """``phases`` of each trace, without the groups of sensors that have no outage in any of them."""
+    result, task = [phases(trace) for trace in traces], traces[0].task
+    for name in task.masks.values():
+        outage, reading = task.covariates[name].group_names(name)
+        if not any(masks[outage].any() for masks in result):
+            for masks in result:
+                del masks[outage], masks[reading]
+    return result
+
+
 def long_phases(trace: Trace) -> dict[str, Mask]:
     """``phases`` of at least ``MIN_STEPS`` steps."""
-    return {phase: mask for phase, mask in phases(trace).items() if mask.sum() >= MIN_STEPS}
+    return {phase: mask for phase, mask in _informative_phases([trace])[0].items() if mask.sum() >= MIN_STEPS}
 
 
 def pooled_phases(traces: Sequence[Trace]) -> dict[str, Mask]:
     """``phases`` of concatenated traces: phase -> mask (sum of T,)."""
-    masks = [phases(trace) for trace in traces]
+    masks = _informative_phases(traces)
     return {phase: np.concatenate([mask[phase] for mask in masks]) for phase in masks[0]}
 
 
@@ -203,7 +214,7 @@ def phase_sums(traces: Sequence[Trace], values: Sequence[Array]) -> dict[str, tu
     Returns: phase -> numbers of steps (M,) and sums (M, ...) of the M trajectories that have steps in it. Phases in no
     trajectory are absent.
     """
-    masks = [phases(trace) for trace in traces]
+    masks = _informative_phases(traces)
     result = {}
     for phase in masks[0]:
         steps = np.array([mask[phase].sum() for mask in masks], dtype=np.float64)

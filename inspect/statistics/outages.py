@@ -9,13 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, outages
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
-
-MISSED = 2
-"""Typical intervals between readings without one that are an outage: more than one missed reading."""
 
 RECOVERED = 1.5
 """Ratio of the error to its median outside of outages at which an estimate has recovered."""
@@ -92,11 +89,7 @@ def missing_steps(trace: Trace) -> dict[str, Mask]:
             lost &= without_reading(trace.episode, key)
         if trace.innovation is not None and name in trace.modalities:
             lost |= np.isnan(trace.innovation[:, trace.modalities.index(name)]).all(1)
-        intervals = np.diff(np.flatnonzero(~lost))
-        typical = float(np.median(intervals)) if len(intervals) else 1.0
-        result[name] = np.zeros(len(trace), dtype=bool)
-        for a, b in measures.intervals(lost):
-            result[name][a:b] = b - a >= MISSED * typical
+        result[name] = outages(lost)
     return result
 
 

@@ -202,7 +202,7 @@ def event_summary(trace: Trace, step: int) -> str:
     groups = [
         "in contact" if group == "contact" else group
         for name, covariate in trace.task.covariates.items()
-        for group, mask in covariate.masks(name, trace.episode.covariate(name))
+        for group, mask in covariate.masks(name, trace.episode.group_values(name))
         if mask[step]
     ]
     parts = [", ".join([f"{trace.episode.times[step]:.1f} s after the start", *groups])]

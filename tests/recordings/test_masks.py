@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.covariate import Covariate
-from beliefscope.datasets.episode import Episode, hold
+from beliefscope.datasets.episode import Episode, hold, outages
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, write_dataset
@@ -91,7 +91,7 @@ def test_a_filter_receives_the_mask(run: Trace, episode: Episode) -> None:
     growth = np.diff(run.estimate_covariance[:, 0, 0])
     np.testing.assert_array_equal(np.isclose(growth, 1e-4, atol=1e-7), ~episode.present("gps")[1:])
     assert set(measures.shaded_groups(run)) == {"no fix", "no image"}
-    np.testing.assert_array_equal(measures.shaded_groups(run)["no fix"], ~episode.present("gps"))
+    np.testing.assert_array_equal(measures.shaded_groups(run)["no fix"], outages(~episode.present("gps")))
 
 
 def test_every_file_keeps_the_mask(

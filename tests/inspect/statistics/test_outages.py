@@ -15,6 +15,7 @@ from beliefscope.datasets.episode import hold
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.outages import missing_steps, without_reading
 from beliefscope.inspect.trace import Trace, trace
 
@@ -119,3 +120,15 @@ def test_readings_are_compared_at_steps_with_a_reading_only() -> None:
     better = errors(point_estimate(gaps, every=5, bias=0.2))
     assert better.readings["gps"] == pytest.approx((0.5, 0.2), rel=1e-3)
     assert better.alarms == ()
+
+
+def test_groups_of_a_slow_sensor_are_its_outages() -> None:
+    """Steps between two readings at the usual interval have no group of their own."""
+    run = point_estimate({(400, 500): 2.0}, every=5)
+    groups = measures.shaded_groups(run)
+    assert np.flatnonzero(groups["no fix"])[[0, -1]].tolist() == [396, 499]
+    assert {"fix", "no fix"} <= set(measures.pooled_phases([run, run]))
+    steady = point_estimate({}, every=5)
+    assert not measures.shaded_groups(steady)["no fix"].any()
+    assert not {"fix", "no fix"} & set(measures.pooled_phases([steady, steady]))
+    assert {"fix", "no fix"} <= set(measures.pooled_phases([steady, run]))
