@@ -213,6 +213,22 @@ test('the summary of a step names error, deviation and dominant modality', () =>
   assert.match(small.text, /^Fused estimate: error 0\.01 cm/, 'not 0.0 cm');
 });
 
+test('the largest deviation of several components may be larger than that of one', () => {
+  const run = (/** @type {number} */ count, /** @type {number} */ sigmas) => {
+    const components = Array(count).fill(trace.components[0]);
+    const largestDeviation = () => ({ sigmas, component: 'hinge_x' });
+    return Object.assign(makeTrace(FUSION), { components, largestDeviation });
+  };
+  const tones = [
+    [1, 1.9],
+    [1, 2.1],
+    [8, 2.1],
+    [8, 2.9],
+    [8, 6],
+  ].map(([count, sigmas]) => stepSummary(run(count, sigmas), 0, 0).tone);
+  assert.deepEqual(tones, ['good', 'warn', 'good', 'warn', 'bad']);
+});
+
 test('the summary explains an uninformative dominant modality', () => {
   const dark = makeTrace({ ...FUSION, blackout: { shape: [2], values: [1, 1] } });
   assert.match(stepSummary(dark, 1, 0).text, /although the image is blacked out\.$/);

@@ -5,7 +5,7 @@
 import { displayName, fixed, percent, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 
-const MAX_SIGMAS = 2; // an error up to this many standard deviations is consistent
+const MAX_SIGMAS = 2; // an error of one component up to this many standard deviations is consistent
 const DOMINANT_SHARE = 0.6; // effective weight from which a modality is dominant
 const FEW_PARTICLES = 0.05; // share of the particles
 /** Another estimate counts as more accurate if its error is lower by this many units for display, and by this factor. */
@@ -65,11 +65,13 @@ function accuracy(trace, step) {
   const deviation = trace.largestDeviation(step);
   if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
   const { sigmas, component } = deviation;
+  // The largest of several deviations is larger than one of them.
+  const consistent = Math.sqrt(MAX_SIGMAS ** 2 + 2 * Math.log(trace.components.length));
   /** @type {[Tone, string]} */
   const [tone, verdict] =
-    sigmas <= MAX_SIGMAS
+    sigmas <= consistent
       ? ['good', 'consistent']
-      : sigmas <= 2 * MAX_SIGMAS
+      : sigmas <= 2 * consistent
         ? ['warn', 'larger than predicted']
         : ['bad', 'overconfident'];
   const text = `${error}; largest deviation ${fixed(sigmas, 1)}σ in ${displayName(component)}: ${verdict}.`;
