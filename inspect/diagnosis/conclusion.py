@@ -176,8 +176,8 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
     if isinstance(checkpoint, ExternalFilter) and cause.name == "particles.few":
         return "Use more particles in the filter's own code."
     text = cause.next.format(task=checkpoint.task.name, filter=_argument(checkpoint))
-    if checkpoint.task.name not in TASKS and "--data" not in text:  # without a sample set
-        text = text.replace(" -o tuned", " --data DATA -o tuned")
+    if "--data" not in text:
+        text = text.replace(" -o tuned", f"{_data(checkpoint)} -o tuned")
     # The loss of an external filter selects what is trained.
     return re.sub(r" --train [\w-]+", "", text) if isinstance(checkpoint, ExternalFilter) else text
 
@@ -188,6 +188,11 @@ def _argument(checkpoint: Checkpoint) -> str:
         return checkpoint.source
     path = checkpoint.path
     return checkpoint.name if path is None or path.parent.resolve() == PRETRAINED.resolve() else path.name
+
+
+def _data(checkpoint: Checkpoint) -> str:
+    """The option for the data in a command; empty for a task with a sample set, which is the default."""
+    return "" if checkpoint.task.name in TASKS else " --data DATA"
 
 
 def is_unused(cause: Cause, checkpoint: Checkpoint) -> bool:
@@ -217,7 +222,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
         sure = bool(candidates) and candidates[0].probability >= SURE
         of_sensors = [alarm for alarm in case.alarms if alarm.statistic in _of_sensors(case)]
         symptom = (of_sensors or case.alarms)[0].text  # a faulty sensor changes the belief as well
-        return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {_search(case, count)}"
+        action = search_action(case.inputs.checkpoint, count)
+        return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {action}"
     first = candidates[0]
     similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:
@@ -233,16 +239,15 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     return text if first.probability >= SURE else f"{text}; try: {first.next}"
 
 
-def _search(case: Case, count: int) -> str:
+def search_action(checkpoint: Checkpoint, count: int) -> str:
     """The next action without a probable cause. count: number of all episodes."""
-    checkpoint = case.inputs.checkpoint
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
     external = isinstance(checkpoint, ExternalFilter)
     return (
         f"{f'{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search' if external else 'Search'} for data slices with "
         "large errors, in the tab Failures or with "
-        f"`beliefscope slices {checkpoint.task.name} --filter {_argument(checkpoint)}`."
+        f"`beliefscope slices {checkpoint.task.name} --filter {_argument(checkpoint)}{_data(checkpoint)}`."
     )
 
 

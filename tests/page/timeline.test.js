@@ -14,7 +14,7 @@ import {
   zoomWindow,
 } from '../../app/page/timeline/step_window.js';
 import { TRACKS, selectedError, trackOptions, tracks } from '../../app/page/timeline/tracks.js';
-import { FUSION, makeTrace } from './fixtures.js';
+import { FUSION, TASK, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
 const state = { component: 'hinge_x', weights: 'effective', track: 'error', charts: '' };
@@ -213,20 +213,20 @@ test('the summary of a step names error, deviation and dominant modality', () =>
   assert.match(small.text, /^Fused estimate: error 0\.01 cm/, 'not 0.0 cm');
 });
 
-test('the largest deviation of several components may be larger than that of one', () => {
-  const run = (/** @type {number} */ count, /** @type {number} */ sigmas) => {
-    const components = Array(count).fill(trace.components[0]);
-    const largestDeviation = () => ({ sigmas, component: 'hinge_x' });
-    return Object.assign(makeTrace(FUSION), { components, largestDeviation });
-  };
-  const tones = [
-    [1, 1.9],
-    [1, 2.1],
-    [8, 2.1],
-    [8, 2.9],
-    [8, 6],
-  ].map(([count, sigmas]) => stepSummary(run(count, sigmas), 0, 0).tone);
-  assert.deepEqual(tones, ['good', 'warn', 'good', 'warn', 'bad']);
+test('the largest deviation of many components may be larger than that of few', () => {
+  const tones = [2.4, 2.6, 5.5, 6].map((sigmas) =>
+    [0, 5].map((more) => {
+      const components = [...TASK.components, ...Array(more).fill(TASK.components[0])];
+      const run = makeTrace(FUSION, { components });
+      const largestDeviation = () => ({ sigmas, component: 'hinge_x' });
+      return stepSummary(Object.assign(run, { largestDeviation }), 0, 0).tone;
+    }),
+  );
+  const expected = ['good good', 'warn good', 'bad warn', 'bad bad'];
+  assert.deepEqual(
+    tones,
+    expected.map((pair) => pair.split(' ')),
+  );
 });
 
 test('the summary explains an uninformative dominant modality', () => {

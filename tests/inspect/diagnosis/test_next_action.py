@@ -11,7 +11,7 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.external.load import ExternalFilter, as_external
 from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.conclusion import next_action
+from beliefscope.inspect.diagnosis.conclusion import next_action, search_action
 
 TASK = Task("peg", (Component("x", "m"),), {"wrench": (2,)}, {"touch": ("wrench",)}, 0, 0.1)
 
@@ -34,3 +34,4 @@ def test_of_an_external_filter_whose_loss_selects_what_is_trained() -> None:
     (cause,) = (cause for cause in causes_of(TASK) if cause.name == "model.touch.bias")
     command = "`beliefscope finetune peg --filter own.py:still --data DATA -o tuned.safetensors`"
     assert command in next_action(cause, external)
+    assert "`beliefscope slices peg --filter own.py:still --data DATA`" in search_action(external, 6)
