@@ -198,19 +198,20 @@ class Failures(Diagnostic):
         return Table(f"Events by phase: {self._label}", columns, tuple(rows))
 
     def event_table(self, events: Sequence[Event]) -> Table:
-        """One row per event with the values at its peak."""
+        """One row per event with the values at its peak; updates that the filter does not report have no column."""
+        known = [i for i, n in enumerate(self.layers) if n == "fused" or any(np.isfinite(e.error[i]) for e in events)]
         columns: tuple[str, ...] = ("episode", "step", "from", "to")
         columns += ("time s", "from s", "to s") if self.timed else ()
         columns += (self._label, "phase")
-        columns += tuple(f"{layer_label(layer)} {self.error_conversion[0]}".rstrip() for layer in self.layers)
+        columns += tuple(f"{layer_label(self.layers[i])} {self.error_conversion[0]}".rstrip() for i in known)
         columns += tuple(f"{display_name(name)} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         if any(event.effective_weights is not None for event in events):
             columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1])
-        return Table("Worst events", columns, tuple(map(self._row, events)))
+        return Table("Worst events", columns, tuple(self._row(event, known) for event in events))
 
-    def _row(self, event: Event) -> tuple[Value, ...]:
-        numbers = [*(self.error_conversion[1] * event.error), *np.degrees(event.angle_error[-1]), event.nees[-1]]
+    def _row(self, event: Event, known: list[int]) -> tuple[Value, ...]:
+        numbers = [*(self.error_conversion[1] * event.error[known]), *np.degrees(event.angle_error[-1]), event.nees[-1]]
         numbers += [event.ess] if self.particles else []
         numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
         values = (float(value) if np.isfinite(value) else None for value in numbers)

@@ -151,7 +151,7 @@ function linkButton({ episode, step, time, link }) {
  * @param {FailureEvent[]} events all events of the score
  * @returns {EventColumn[]}
  */
-function eventColumns({ layers, scores }, score, events) {
+export function eventColumns({ layers, scores }, score, events) {
   const main = scoreUnit(scores.find(({ name }) => name === 'error') ?? score);
   const { unit, scale } = scoreUnit(score);
   const number = true;
@@ -187,6 +187,7 @@ function eventColumns({ layers, scores }, score, events) {
   const label = (/** @type {string} */ layer) => (layer === 'fused' ? layer : updateLabel(layer));
   layers.forEach((layer, i) => {
     if (layer === 'fused' ? score.name === 'error' : !fuses) return;
+    if (events.every(({ error }) => error[i] === null)) return; // the filter does not report this update
     columns.push({
       title: withUnit(fuses ? label(layer) : 'error', main.unit),
       content: ({ error }) => {

@@ -355,6 +355,14 @@ def test_the_table_of_a_filter_without_weights_has_none(traces: list[Trace]) -> 
     assert {len(row) for row in table.rows} == {len(table.columns)}
 
 
+def test_the_table_of_a_filter_without_updates_has_the_fused_error_only(survey: Survey) -> None:
+    failures = failures_of(survey, "error")
+    events = [replace(event, error=np.where(np.arange(3) < 2, np.nan, event.error)) for event in failures.events]
+    table = replace(failures, events=tuple(events)).tables()[-1]
+    assert [name for name in table.columns if name.endswith(" cm")] == ["fused cm"]
+    assert {len(row) for row in table.rows} == {len(table.columns)}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
