@@ -79,7 +79,7 @@ class Survey:
         ess: (S,) effective sample size, or None.
         beta, effective_weights: (S, K) weights, averaged over map components, or None.
         phases: name (``phases_of``) -> (S,) mask, by priority: a step belongs to the first that applies. The groups of
-            covariates are in the order of their size, the smallest first.
+            covariates are in the order of their size, the smallest first, without those of all steps.
     """
 
     task: Task
@@ -306,5 +306,6 @@ def _phases(columns: dict[str, NDArray[Any]], task: Task) -> dict[str, Mask]:
     masks |= {"fast motion": fast, "steady contact": contact, "free motion": ~contact, OTHER: np.ones_like(contact)}
     groups = {name.removeprefix(GROUP): mask.astype(bool) for name, mask in columns.items() if name.startswith(GROUP)}
     smallest = iter(sorted(groups, key=lambda name: int(groups[name].sum())))
+    # A group of all steps, such as of a sensor without outages, would be the phase of all other steps.
     order = [next(smallest) if name in groups else name for name in phases_of(task)]
-    return {name: {**masks, **groups}[name] for name in order}
+    return {name: {**masks, **groups}[name] for name in order if name not in groups or not groups[name].all()}

@@ -15,6 +15,7 @@ from beliefscope.datasets.episode import hold
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.outages import missing_steps, without_reading
 from beliefscope.inspect.trace import Trace, trace
@@ -132,3 +133,6 @@ def test_groups_of_a_slow_sensor_are_its_outages() -> None:
     assert not measures.shaded_groups(steady)["no fix"].any()
     assert not {"fix", "no fix"} & set(measures.pooled_phases([steady, steady]))
     assert {"fix", "no fix"} <= set(measures.pooled_phases([steady, run]))
+    phases = [Survey.from_episodes([EpisodeScores.from_trace(trace_)]).phases for trace_ in (run, steady)]
+    assert {"fix", "no fix"} <= set(phases[0])
+    assert "fix" not in phases[1], "it would be the phase of all other steps"
