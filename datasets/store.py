@@ -137,7 +137,7 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
         with DeferredErrorFile(partial, "w+b") as output:
             with h5py.File(output, "w", libver=("v110", "v110")) as file:
                 file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
-                file.attrs["definition"] = json.dumps(task_to_json(task), sort_keys=True)
+                file.attrs["definition"] = json.dumps(task_to_json(task))
                 for index, episode in enumerate(episodes):
                     group = file.create_group(f"trajectory{index}")
                     _write_episode(group, episode)

@@ -98,7 +98,7 @@ def save_checkpoint(
     if healthy_profile is not None:
         header["healthy_profile"] = dict(healthy_profile)
     tensors = {key: value.detach().cpu().contiguous() for key, value in filter_.state_dict().items()}
-    data = save(tensors, metadata={"beliefscope": json.dumps(header, sort_keys=True)})
+    data = save(tensors, metadata={"beliefscope": json.dumps(header)})
     write_atomically(path, data)
     return hashlib.sha256(data).hexdigest()
 

@@ -55,7 +55,7 @@ def metadata(trace: Trace) -> dict[str, Any]:
 def as_npz(trace: Trace) -> bytes:
     """Every array by name, and the metadata as JSON in the array ``beliefscope``; readable without pickle."""
     data = io.BytesIO()
-    arrays: dict[str, Any] = {NAME: np.array(json.dumps(header_of(trace), sort_keys=True)), **arrays_of(trace)}
+    arrays: dict[str, Any] = {NAME: np.array(json.dumps(header_of(trace))), **arrays_of(trace)}
     np.savez_compressed(data, **arrays)
     return data.getvalue()
 
@@ -72,7 +72,7 @@ def as_parquet(trace: Trace) -> bytes:
         arrays.append(values)
         shape = {"shape": ",".join(map(str, column.shape))} if len(column.shape) > 1 else {}
         fields.append(pa.field(column.name, values.type, metadata={"unit": column.unit} | shape))
-    schema = pa.schema(fields, metadata={NAME: json.dumps(metadata(trace), sort_keys=True)})
+    schema = pa.schema(fields, metadata={NAME: json.dumps(metadata(trace))})
     data = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(arrays, schema=schema), data, compression="zstd")
     return data.getvalue()
@@ -85,7 +85,7 @@ def as_mcap(trace: Trace) -> bytes:
     file = io.BytesIO()
     writer = Writer(file)
     writer.start(library=NAME)
-    writer.add_metadata(NAME, {"trace": json.dumps(metadata(trace), sort_keys=True)})
+    writer.add_metadata(NAME, {"trace": json.dumps(metadata(trace))})
     topics = dict(_topics(trace))
     channels = {}
     for topic, (schema, _) in topics.items():

@@ -339,7 +339,7 @@ class TraceStore:
             original = str(self._trace_file(replace(selection, intervention=None, only="")))
             return RunRequest(
                 **vars(selection),
-                definition=json.dumps(task_to_json(checkpoint.task), sort_keys=True),
+                definition=json.dumps(task_to_json(checkpoint.task)),
                 checkpoint=source,
                 external=checkpoint.path is None,
                 path=str(data),

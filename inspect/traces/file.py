@@ -91,7 +91,7 @@ def _layout(
 
     Arrays are sorted as by the package safetensors, which cannot write in parts.
     """
-    entries: dict[str, Any] = {"__metadata__": {"beliefscope-trace": json.dumps(header, sort_keys=True)}}
+    entries: dict[str, Any] = {"__metadata__": {"beliefscope-trace": json.dumps(header)}}
     end, offsets = 0, {}
     for name in sorted(arrays, key=lambda name: (-list(_TYPES).index(arrays[name][0].str), name)):
         dtype, shape = arrays[name]
