@@ -24,6 +24,7 @@ from beliefscope.datasets.task import Task
 Array = NDArray[np.float64]
 Value = str | int | float | None
 NOTE_WIDTH = 110  # characters
+TABLE_WIDTH = 240  # characters: of a table without continuation
 VIEWS = ("tables", "curves", "bands", "plots", "images")
 
 
@@ -167,7 +168,10 @@ def html_result(headline: str, tables: Sequence[Table]) -> str:
 
 
 def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Value]], note: str = "") -> str:
-    """A table with a title and a note as text; numbers are right-aligned with three digits, None and NaN are ``-``."""
+    """A table with a title and a note as text; numbers are right-aligned with three digits, None and NaN are ``-``.
+
+    A table that is wider than ``TABLE_WIDTH`` continues below, where each part repeats the columns that name the rows.
+    """
 
     def text(value: Value) -> str:
         return "-" if value is None or value != value else f"{value:.3g}" if isinstance(value, float) else str(value)
@@ -177,11 +181,15 @@ def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Val
     alignments = [
         ">" if rows and not any(isinstance(row[i], str) for row in rows) else "<" for i in range(len(columns))
     ]
-    lines = [
-        "  ".join(f"{cell:{align}{width}}" for cell, width, align in zip(row, widths, alignments, strict=True))
-        for row in cells
-    ]
-    return "\n".join([title, *(f"  {line.rstrip()}" for line in (*lines, *textwrap.wrap(note, NOTE_WIDTH)))])
+    names = next((i for i, align in enumerate(alignments) if align == ">"), len(columns)) or min(2, len(columns))
+    parts = [list(range(names))]
+    for i in range(names, len(columns)):
+        if len(parts[-1]) > names and sum(widths[k] + 2 for k in (*parts[-1], i)) > TABLE_WIDTH:
+            parts.append(list(range(names)))
+        parts[-1].append(i)
+    blocks = [["  ".join(f"{row[i]:{alignments[i]}{widths[i]}}" for i in part) for row in cells] for part in parts]
+    lines = [line for block in blocks for line in ("", *block)][1:]
+    return "\n".join([title, *(f"  {line}".rstrip() for line in (*lines, *textwrap.wrap(note, NOTE_WIDTH)))])
 
 
 def as_json(value: Any) -> Any:

@@ -16,7 +16,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.plotting import write_figure
-from beliefscope.inspect.diagnostics.views import as_json, format_table
+from beliefscope.inspect.diagnostics.views import TABLE_WIDTH, as_json, format_table
 from beliefscope.inspect.statistics.measures import blackout
 from beliefscope.inspect.trace import Trace
 
@@ -150,3 +150,12 @@ def test_missing_checkpoint_is_refused() -> None:
 def test_unknown_numbers_of_a_table_are_dashes() -> None:
     rows = [(1.0, 2), (None, None), (float("nan"), 12)]
     assert format_table("Title", ("a", "b"), rows).splitlines() == ["Title", "  a   b", "  1   2", "  -   -", "  -  12"]
+
+
+def test_wide_tables_continue_below_with_the_names_of_the_rows() -> None:
+    columns = ("group", *(f"column {i:02} of this table" for i in range(14)))
+    values = [float(i) for i in range(14)]
+    lines = format_table("Title", columns, [("all", *values), ("fix", *values)]).splitlines()
+    assert max(map(len, lines)) <= TABLE_WIDTH
+    assert [line.split()[0] if line else "" for line in lines] == ["Title", *2 * ["group", "all", "fix", ""]][:-1]
+    assert " ".join(lines).count("column 13 of this table") == 1
