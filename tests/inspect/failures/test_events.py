@@ -348,18 +348,12 @@ def test_figures_and_tables(survey: Survey) -> None:
     assert len(axes.lines) == len(failures.plots()[0].lines) >= 2
 
 
-def test_the_table_of_a_filter_without_weights_has_none(traces: list[Trace]) -> None:
+def test_the_table_of_a_filter_without_weights_and_updates_has_none(traces: list[Trace]) -> None:
     runs = [replace(run, weights=None, effective_weights=None) for run in traces]
-    table = failures_of(survey_over(runs), "error").tables()[-1]
-    assert not [name for name in table.columns if "weight" in name]
-    assert {len(row) for row in table.rows} == {len(table.columns)}
-
-
-def test_the_table_of_a_filter_without_updates_has_the_fused_error_only(survey: Survey) -> None:
-    failures = failures_of(survey, "error")
+    failures = failures_of(survey_over(runs), "error")
     events = [replace(event, error=np.where(np.arange(3) < 2, np.nan, event.error)) for event in failures.events]
     table = replace(failures, events=tuple(events)).tables()[-1]
-    assert [name for name in table.columns if name.endswith(" cm")] == ["fused cm"]
+    assert [name for name in table.columns if name.endswith((" cm", "weight %"))] == ["fused cm"]
     assert {len(row) for row in table.rows} == {len(table.columns)}
 
 
