@@ -20,10 +20,11 @@ TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optit
 """Part of a column's name that marks a true value."""
 
 UNITS_BY_NAME = {
+    **{unit: rf"_{unit}$" for unit in ("deg", "cm", "mm")},
     "rad/s": r"^w[xyz]?$|omega|yaw_?rate|gyro|angular",
     "m/s^2": r"^a[xyz]$|acc",
     "m/s": r"^v[xyz]?$|(^|_)v(el|x|y|z)?(_|$)|velocity|speed",
-    "rad": r"yaw|heading|theta|roll|pitch|angle",
+    "rad": r"_rad$|yaw|heading|theta|roll|pitch|angle",
 }
 """Unit of a component -> pattern of its name; the first that matches."""
 

@@ -140,6 +140,12 @@ def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
     assert len(episodes) == 1
 
 
+@pytest.mark.parametrize(("name", "unit"), [("yaw_deg", "deg"), ("yaw_rad", "rad"), ("lift_mm", "mm"), ("vx", "m/s")])
+def test_a_guessed_map_has_the_units_of_the_names(name: str, unit: str) -> None:
+    columns = {key: np.arange(5.0) for key in ("t", f"true_{name}", "gps_x")}
+    assert f'{{column = "true_{name}", unit = "{unit}"}}' in guess_map(Preview(columns), "drive")
+
+
 def test_a_guessed_map_has_names_units_and_sensors(tmp_path: Path) -> None:
     t = 0.1 * np.arange(80.0)
     names = ("true_x", "true_y", "true_vx", "true_yaw", "gps_x", "gps_y", "wheel")
