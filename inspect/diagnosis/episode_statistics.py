@@ -14,7 +14,11 @@ from beliefscope.inspect.diagnosis.model_checks import model_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
 
-SCATTER = {"module bias": "module scatter", "contact distance": "contact distance scatter"}
+SCATTER = {
+    "module bias": "module scatter",
+    "contact distance": "contact distance scatter",
+    "reading bias": "reading scatter",
+}
 """Kind of statistic -> kind of its distance from the other episodes: whether a bias is the same in all of them."""
 
 

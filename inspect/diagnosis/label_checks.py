@@ -7,7 +7,7 @@ import numpy as np
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.reference_images import HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, lag, largest_lag
 from beliefscope.inspect.trace import Trace
 
 SMALLEST_MOTION = 1e-2
@@ -55,7 +55,7 @@ def _lag(task: Task, labels: Array, measured: Array, keep: Mask) -> float:
     if HAND not in task.observations:
         unwrapped, angles = labels.copy(), list(task.angles)
         unwrapped[:, angles] = np.unwrap(labels[:, angles], axis=0)
-        return fitted_lag(unwrapped, unwrapped + measured - labels, keep)
+        return fitted_lag(unwrapped, unwrapped + measured - labels, keep, keep, largest_lag(task.dt))
     on_map = [component.name in task.map_components for component in task.components]
     smallest = np.where(on_map, min(SMALLEST_MOTION, SMALLEST_SHARE * task.map_half_width), SMALLEST_MOTION)
     moving = np.ptp(labels[keep], axis=0) > smallest

@@ -9,9 +9,9 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, axis_name
-from beliefscope.inspect.statistics.reading_model import ReadingModel
+from beliefscope.inspect.statistics.reading_model import FIRST_CHANGES, ReadingModel
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, fitted_lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, largest_lag
 
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
@@ -36,7 +36,8 @@ def modelled_sensors(task: Task) -> list[str]:
 def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict[str, float]:
     """Of each channel that the labels explain, against its expected readings.
 
-    ``reading lag``: steps by which the readings of a sensor follow the expected ones. At this lag, ``inverted``: half
+    ``reading lag``: steps by which the readings of a sensor follow the expected ones, if these hardly differ with
+    fractions of steps. At this lag, ``inverted``: half
     the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then fit (``FITS``).
     ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged, whatever their signs,
     for the best other channel. ``reading bias``: mean error relative to the noise. ``reading gain``: slope of the
@@ -47,8 +48,9 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         if model.key not in episode.observations or not np.isfinite(episode.states).all():
             continue
         delay, errors = delayed_errors(episode, model)
-        values[f"reading lag/{model.key}/all"] = delay
         readings, expected, present = model.compare(episode)
+        short = _short_delay(readings, expected, present, model) if delay == 0.0 else delay
+        values[f"reading lag/{model.key}/all"] = short
         line = _line(readings[present], expected[present])
         least = errors.min(0)
         own = np.diagonal(least)
@@ -66,6 +68,14 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     return values
 
 
+def _short_delay(readings: Array, expected: Array, present: Mask, model: ReadingModel) -> float:
+    """Steps, with fractions: regression of the errors (T, A) on the changes of the expected readings by step."""
+    change = np.gradient(expected, axis=0)[present] / model.noise
+    error = (readings - expected)[present] / model.noise
+    change, error = (x - x.mean(0) for x in (change, error))
+    return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
+
+
 def _line(readings: Array, expected: Array) -> dict[str, Array]:
     """``bias``, ``gain`` and ``noise`` (A,) of readings (S, A): a line through the expected ones, and what it leaves.
 
@@ -78,8 +88,9 @@ def _line(readings: Array, expected: Array) -> dict[str, Array]:
     power = np.maximum(np.square(x).sum(0), 1e-24)
     slope = (x * y).sum(0) / power
     rest = np.sqrt(np.square(y - slope * x).mean(0))
-    gain = np.where(np.abs(slope - 1.0) > SURELY * rest / np.sqrt(power), slope, 1.0)
-    return {"bias": (readings - expected).mean(0), "gain": gain, "noise": rest / np.maximum(np.abs(gain), 1e-3)}
+    sure = np.abs(slope - 1.0) > SURELY * rest / np.sqrt(power)
+    before = np.where(sure, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
+    return {"bias": (readings - expected).mean(0), "gain": np.where(sure, slope, 1.0), "noise": rest / before}
 
 
 def _evidence(error: Array, other: Array, limit: float) -> Array:
@@ -90,5 +101,7 @@ def _evidence(error: Array, other: Array, limit: float) -> Array:
 
 def delayed_errors(episode: Episode, model: ReadingModel) -> tuple[float, Array]:
     """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay."""
-    delay = fitted_lag(*model.compare(episode))
+    readings, expected, present = model.compare(episode)
+    known = np.arange(len(episode)) >= FIRST_CHANGES
+    delay = fitted_lag(readings, expected, present, known & present.any(), largest_lag(episode.dt))
     return delay, model.errors(episode, 0 if np.isnan(delay) else int(delay))

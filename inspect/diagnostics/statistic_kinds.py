@@ -50,6 +50,7 @@ KINDS = {
     "contact lag": ("delay{of} in steps behind the labelled contact", False, 0.5),
     "reading lag": ("delay{of} in steps behind the labels", False, 0.5),
     "reading bias": ("error{of} against the reading expected from the labels, relative to its noise,", False, 0.3),
+    "reading scatter": ("variation{of} of its error between episodes, relative to its noise,", False, 0.3),
     "reading gain": ("slope{of} on the reading expected from the labels", False, 0.05),
     "reading noise": ("noise{of} beside the reading expected from the labels, relative to healthy noise,", True, 0.05),
     "inverted": ("evidence for the opposite sign of the channel{of}", False, 0.1),
@@ -112,7 +113,16 @@ PHASES = {
 
 RISING = frozenset(
     {"error", "angle error", "regret", "outside", "black", "losses", "frozen", "stuck", "saturation", "occlusion"}
-    | {"change", "opposition", "opposed", "inverted", "exchanged", "contact distance error", "contact distance scatter"}
+    | {
+        "change",
+        "opposition",
+        "opposed",
+        "inverted",
+        "exchanged",
+        "reading scatter",
+        "contact distance error",
+        "contact distance scatter",
+    }
     | {"module error", "module scatter", "dynamics error"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""

@@ -17,6 +17,9 @@ from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.reference_images import CONTACT
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask
 
+FIRST_CHANGES = 2
+"""First step with all features, which need two earlier ones."""
+
 EXPLAINED = 0.5
 """Smallest share of the variance of a channel within episodes that its model explains in other episodes."""
 
@@ -28,6 +31,9 @@ RIDGE = 1e-3
 
 MIN_EPISODES = 4
 """Smallest number of episodes of a model."""
+
+SLIGHTLY = 0.01
+"""rad: by how much readings of angles may exceed half a turn."""
 
 DIGITS = 4
 """Significant digits of stored coefficients."""
@@ -43,6 +49,8 @@ class ReadingModel:
         coefficients: (F, A) in units of the readings by those of the ``features``.
         constants: (A,) in units of the readings.
         noise: (A,) standard deviations of the readings from the expected ones, in episodes to which it is not fitted.
+        angles: A indices of the state components that the channels measure modulo a turn, such as a heading; -1 for
+            channels that do not wrap around.
     """
 
     key: str
@@ -50,6 +58,7 @@ class ReadingModel:
     coefficients: Array
     constants: Array
     noise: Array
+    angles: tuple[int, ...]
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -63,6 +72,7 @@ class ReadingModel:
             "coefficients": [rounded(row) for row in self.coefficients],
             "constants": rounded(self.constants),
             "noise": rounded(self.noise),
+            "angles": list(self.angles),
         }
 
     @classmethod
@@ -71,17 +81,18 @@ class ReadingModel:
         channels = tuple(int(channel) for channel in value["channels"])
         names = ("coefficients", "constants", "noise")
         coefficients, constants, noise = (np.array(value[name], dtype=np.float64) for name in names)
-        if coefficients.ndim != 2 or not coefficients.shape[1:] == constants.shape == noise.shape == (len(channels),):
+        shapes = (*coefficients.shape[1:], *constants.shape, *noise.shape, len(value["angles"]))
+        if coefficients.ndim != 2 or shapes != (len(channels),) * 4:
             raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}")
-        return cls(str(value["key"]), channels, coefficients, constants, noise)
+        return cls(str(value["key"]), channels, coefficients, constants, noise, tuple(map(int, value["angles"])))
 
     def compare(self, episode: Episode) -> tuple[Array, Array, Mask]:
         """Readings and expected readings (T, A), and the steps (T,) that have both.
 
-        None has if the model has the features of another version.
+        Angles are not wrapped. No step has both if the model has the features of another version.
         """
         inputs, present = features(episode), _steps(episode, self.key)
-        readings = episode.observations[self.key][:, self.channels].astype(np.float64)
+        readings = _unwrapped(episode, episode.observations[self.key][:, self.channels].astype(np.float64), self.angles)
         if inputs.shape[1] != len(self.coefficients):
             return readings, readings, np.zeros_like(present)
         return readings, inputs @ self.coefficients + self.constants, present
@@ -93,7 +104,7 @@ class ReadingModel:
         """
         readings, expected, present = self.compare(episode)
         steps = np.flatnonzero(present)
-        steps = steps[(steps - delay > 1) & (steps - delay < len(present))]  # expected readings begin at step 2
+        steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(present))]
         if len(steps) < MIN_STEPS:
             return np.full((2, len(self.channels), len(self.channels)), np.nan)
         difference = (
@@ -112,24 +123,27 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
     inputs = [features(episode) for episode in episodes]
     result = []
     for key in keys:
+        angles = [_angle_of(episodes, key, channel) for channel in range(episodes[0].observations[key].shape[1])]
         rows = [
-            (x[at], episode.observations[key][at].astype(np.float64))
+            (x[at], _unwrapped(episode, episode.observations[key].astype(np.float64), angles)[at])
             for x, episode in zip(inputs, episodes, strict=True)
             if (at := _steps(episode, key)).sum() >= MIN_STEPS
         ]
         if len(rows) < MIN_EPISODES:
             continue
-        means = [np.mean([row[i].mean(0) for row in rows], axis=0) for i in (0, 1)]
-        rows = [(x - x.mean(0), y - y.mean(0)) for x, y in rows]
+        mean_x, mean_y = (np.mean([row[i].mean(0) for row in rows], axis=0) for i in (0, 1))
+        rows = [(x - mean_x, y - mean_y) for x, y in rows]
         halves = (_left(rows[1::2], _ridge(rows[::2])), _left(rows[::2], _ridge(rows[1::2])))
-        total = np.square(np.concatenate([y for _, y in rows])).sum(0)
+        total = np.asarray(sum(len(y) * y.var(0) for _, y in rows))
         channels = np.flatnonzero(halves[0] + halves[1] < (1.0 - EXPLAINED) * total)
         if len(channels):
             coefficients = _ridge(rows)[:, channels]
-            constants = means[1][channels] - means[0] @ coefficients
+            constants = mean_y[channels] - mean_x @ coefficients
             noise = np.sqrt((halves[0] + halves[1])[channels] / sum(len(y) for _, y in rows))
             noise = np.maximum(noise, SMALLEST_NOISE * np.sqrt(total[channels] / sum(len(y) for _, y in rows)))
-            result.append(ReadingModel(key, tuple(channels.tolist()), coefficients, constants, noise))
+            explained = tuple(channels.tolist())
+            turning = tuple(angles[channel] for channel in explained)
+            result.append(ReadingModel(key, explained, coefficients, constants, noise, turning))
     return tuple(result)
 
 
@@ -143,19 +157,42 @@ def _ridge(rows: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def _left(rows: Sequence[tuple[Array, Array]], coefficients: Array) -> Array:
-    """(d,) sum of squares that the coefficients leave unexplained."""
-    return np.asarray(sum(np.square(y - x @ coefficients).sum(0) for x, y in rows))
+    """(d,) sum of squares within episodes that the coefficients leave unexplained."""
+    return np.asarray(sum(len(y) * (y - x @ coefficients).var(0) for x, y in rows))
+
+
+def _angle_of(episodes: Sequence[Episode], key: str, channel: int) -> int:
+    """Index of the component that wraps around as a channel does, and is closest to it; -1 for other channels."""
+    task = episodes[0].task
+    wrapping = [i for i, component in enumerate(task.components) if component.wraps]
+    readings = [episode.observations[key][:, channel].astype(np.float64) for episode in episodes]
+    jumps = any((np.abs(np.diff(values)) > np.pi).any() for values in readings)
+    if not wrapping or not jumps or max(np.abs(values).max() for values in readings) > np.pi + SLIGHTLY:
+        return -1
+    states = np.concatenate([episode.states[:, wrapping] for episode in episodes]).astype(np.float64)
+    alike = np.abs(np.exp(1j * (np.concatenate(readings)[:, None] - states)).mean(0))
+    return wrapping[int(alike.argmax())]
+
+
+def _unwrapped(episode: Episode, readings: Array, angles: Sequence[int]) -> Array:
+    """Readings (T, d), of which those of angles are within half a turn of the components (``angles``), unwrapped."""
+    result = readings.copy()
+    for channel, component in enumerate(angles):
+        if component >= 0:
+            angle = np.unwrap(episode.states[:, component].astype(np.float64))
+            result[:, channel] = angle + (readings[:, channel] - angle + np.pi) % (2.0 * np.pi) - np.pi
+    return result
 
 
 def _steps(episode: Episode, key: str) -> Mask:
-    """(T,): steps with a reading that have two earlier ones, from which their changes are computed."""
-    return np.asarray(episode.present(key) & (np.arange(len(episode)) > 1))
+    """(T,): steps with a reading and all features."""
+    return np.asarray(episode.present(key) & (np.arange(len(episode)) >= FIRST_CHANGES))
 
 
 def features(episode: Episode) -> Array:
     """(T, F): the state, its first and second changes by step, changes in the body frame, and all of them in contact.
 
-    Angles that wrap are their cosine and sine, rotations their matrices. Changes are zero where they are unknown, at
+    Angles that wrap are also their cosine and sine, rotations their matrices. Changes are zero where they are unknown, at
     the first two steps.
     """
     task, states = episode.task, episode.states.astype(np.float64)
@@ -172,7 +209,10 @@ def features(episode: Episode) -> Array:
 
 
 def _values(task: Task, states: Array) -> tuple[Array, Array]:
-    """State components (T, V) without jumps, and those (T, R) that turn vectors of the world into the body frame."""
+    """State components (T, V) without jumps, and those (T, R) that turn vectors of the world into the body frame.
+
+    Of angles that wrap around, also the angles, unwrapped.
+    """
     frames = [f(states[:, [i]]) for i, c in enumerate(task.components) if c.wraps for f in (np.cos, np.sin)]
     if task.rotations:
         from scipy.spatial.transform import Rotation  # takes most of a second
@@ -181,5 +221,6 @@ def _values(task: Task, states: Array) -> tuple[Array, Array]:
     turning = {i for i, c in enumerate(task.components) if c.wraps}
     turning |= {i for at in task.rotations for i in range(at.start, at.stop)}
     others = [states[:, [i]] for i in range(states.shape[1]) if i not in turning]
+    others += [np.unwrap(states[:, [i]], axis=0) for i, c in enumerate(task.components) if c.wraps]
     empty = np.zeros((len(states), 0))
     return np.concatenate([*others, *frames, empty], axis=1), np.concatenate([*frames, empty], axis=1)

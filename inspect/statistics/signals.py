@@ -11,6 +11,9 @@ Mask = NDArray[np.bool_]
 MAX_LAG = 12
 """Largest lag that is searched, steps."""
 
+LONGEST_DELAY = 0.5
+"""s: largest delay that is searched where steps are short."""
+
 MIN_SCORE = 3.5
 """Smallest correlation of two signals with a lag, in standard errors of white noise, 1 / sqrt(number of steps)."""
 
@@ -23,6 +26,9 @@ SMALL_REST = 0.3
 
 BETTER = 0.9
 """Largest unpredicted variance at a lag, relative to that without one."""
+
+MIN_RATIO = 15.0
+"""Smallest log-likelihood ratio of a lag to none, times two: that of a lag by chance is rarely larger."""
 
 MIN_STEPS = 10
 """Minimum number of steps of an estimate."""
@@ -141,24 +147,26 @@ def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, fl
     return float(lags[best]), float(correlation[best])
 
 
-def fitted_lag(late: Array, early: Array, valid: Mask) -> float:
+def fitted_lag(late: Array, early: Array, late_known: Mask, early_known: Mask, largest: int = MAX_LAG) -> float:
     """Steps by which ``late`` (T, d) follows ``early`` (T, d): those at which a line by column leaves the least of it.
 
     More exact than ``lag`` for smooth signals that predict each other well. Columns do not count if a line of positive
     slope leaves more than ``SMALL_REST`` of their variance at all lags; NaN without any. 0 if no lag is clearly better
-    (``BETTER``).
+    (``BETTER``, ``MIN_RATIO``).
 
     Args:
-        valid: (T,) steps at which both are known.
+        late_known, early_known: (T,) steps at which they are known.
+        largest: largest lag in size, steps; at most a quarter of T.
     """
-    if valid.sum() < MIN_STEPS:
+    if min(late_known.sum(), early_known.sum()) < MIN_STEPS:
         return np.nan
-    lags = np.arange(-MAX_LAG, MAX_LAG + 1)
-    target = np.arange(len(late))[:, None] + lags  # (T, L): step of ``late`` that belongs to a step of ``early``
-    inside = target.clip(0, len(late) - 1)
-    paired = ((target == inside) & valid[:, None] & valid[inside])[..., None]
+    largest = min(largest, len(late) // 4)
+    steps, lags = np.flatnonzero(late_known), np.arange(-largest, largest + 1)
+    source = steps[:, None] - lags  # (S, L): step of ``early`` that belongs to a step of ``late``
+    inside = source.clip(0, len(late) - 1)
+    paired = ((source == inside) & early_known[inside])[..., None]
     count = np.maximum(paired.sum(0), 1)
-    a, b = (np.where(paired, x, 0.0) for x in (late[inside], early[:, None]))  # (T, L, d)
+    a, b = (np.where(paired, x, 0.0) for x in (late[steps][:, None], early[inside]))  # (S, L, d)
     a, b = (np.where(paired, x - x.sum(0) / count, 0.0) for x in (a, b))
     correlation = (a * b).sum(0) / np.sqrt(np.maximum((a * a).sum(0) * (b * b).sum(0), 1e-24))
     rest = 1.0 - np.square(np.maximum(correlation, 0.0))  # (L, d)
@@ -168,7 +176,14 @@ def fitted_lag(late: Array, early: Array, valid: Mask) -> float:
         return np.nan
     total = rest[:, chosen].sum(1)
     best = int(total.argmin())
-    return float(lags[best]) if total[best] < BETTER * total[MAX_LAG] else 0.0
+    smaller = np.log(np.maximum(rest[[largest, best]][:, chosen], 1e-9))
+    ratio = float(count[best, 0] * (smaller[0] - smaller[1]).sum())  # of log-likelihoods, with independent noise
+    return float(lags[best]) if total[best] < BETTER * total[largest] and ratio > MIN_RATIO else 0.0
+
+
+def largest_lag(dt: float) -> int:
+    """Largest lag that is searched for ``fitted_lag``, steps: ``LONGEST_DELAY``, and at least ``MAX_LAG``."""
+    return max(MAX_LAG, round(LONGEST_DELAY / dt))
 
 
 def deviating_interval(series: Array) -> tuple[int, int]:

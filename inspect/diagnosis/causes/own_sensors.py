@@ -23,7 +23,17 @@ SYNCHRONISE = "Synchronise the clocks of the sensors."
 BIASED = ("level", "drift", "saturation", "contact lag", "reading bias")
 """Kinds of statistics of vector sensors that a bias changes."""
 
-DELAYED = (*BIASED, "change", "size", "roughness", "reading gain", "reading noise", "inverted", "exchanged")
+DELAYED = (
+    *BIASED,
+    "change",
+    "size",
+    "roughness",
+    "reading gain",
+    "reading noise",
+    "reading scatter",
+    "inverted",
+    "exchanged",
+)
 """As ``BIASED``, of a delay."""
 
 VECTOR = (
@@ -73,11 +83,11 @@ def _patterns(key: str, *kinds: str) -> str:
 def _changed_readings(key: str, modality: str) -> list[Cause]:
     """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio."""
     of = partial(_patterns, key)
-    scaled = of(*BIASED, "change", "size", "noise", "reading lag", "reading gain")
+    scaled = of(*BIASED, "change", "size", "noise", "reading lag", "reading noise", "reading scatter")
     noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
     gain = (Symptom(of("size"), 0, otherwise=(Symptom(of("reading gain"), 0),)), Symptom(of("noise"), 0))
-    rough = f"{scaled}|{of('roughness', 'reading noise', 'stuck')}"
+    rough = f"{scaled}|{of('roughness', 'stuck')}"
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor."),
         ("bias", "biased", bias, of(*BIASED), "Tare the sensor."),
