@@ -14,7 +14,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
-from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
+from beliefscope.inspect.diagnosis.reading_checks import modelled_keys
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
@@ -50,7 +50,7 @@ def sensor_record(episodes: Sequence[Episode], reference: Reference | None = Non
 
     reference: images of other clean episodes of the same camera; default: measured, which takes most of the time.
     """
-    keys = modelled_sensors(episodes[0].task) if episodes else []
+    keys = modelled_keys(episodes[0].task) if episodes else []
     groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
     models = [fit_reading_models(group, keys) for group in groups]
     references = [reference or measure_reference(group) for group in groups]

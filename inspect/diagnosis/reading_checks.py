@@ -1,4 +1,4 @@
-"""Order, signs and delay of the channels of a user's sensors, against the readings that the labels lead to expect."""
+"""Channels of a user's sensors and controls against the values that the labels lead to expect."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, axis_name
-from beliefscope.inspect.statistics.reading_model import FIRST_CHANGES, ReadingModel
+from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, axis_name, commands_hand
+from beliefscope.inspect.statistics.reading_model import CONTROL, FIRST_CHANGES, ReadingModel, readings_of
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, largest_lag
 
@@ -33,30 +33,37 @@ def modelled_sensors(task: Task) -> list[str]:
     return [key for key, size in sizes.items() if size <= MAX_CHANNELS]
 
 
+def modelled_keys(task: Task) -> list[str]:
+    """Keys of the reading models of a task: sensors, and controls that do not command a measured hand."""
+    has_controls = 0 < task.control_size <= MAX_CHANNELS and not commands_hand(task)
+    return [*modelled_sensors(task), *([CONTROL] if has_controls else [])]
+
+
 def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict[str, float]:
     """Of each channel that the labels explain, against its expected readings.
 
-    ``reading lag``: steps by which the readings of a sensor follow the expected ones, if these hardly differ with
-    fractions of steps. At this lag, ``inverted``: half
-    the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then fit (``FITS``).
-    ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged, whatever their signs,
-    for the best other channel. ``reading bias``: mean error relative to the noise. ``reading gain``: slope of the
+    ``reading lag``: steps by which the readings of a sensor follow the expected ones; of a short delay, also fractions.
+    The others are those at this lag. ``reading bias``: mean error relative to the noise. ``reading gain``: slope of the
     readings on the expected ones. ``reading noise``: standard deviation from this line, relative to the noise.
+    ``inverted``: half the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then
+    fit (``FITS``). ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged,
+    whatever their signs, for the best other channel.
     """
     values: dict[str, float] = {}
     for model in models:
-        if model.key not in episode.observations or not np.isfinite(episode.states).all():
+        if model.key not in (*episode.observations, CONTROL) or not np.isfinite(episode.states).all():
             continue
         delay, errors = delayed_errors(episode, model)
         readings, expected, present = model.compare(episode)
-        short = _short_delay(readings, expected, present, model) if delay == 0.0 else delay
+        is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())  # sign and order
+        short = _short_delay(readings, expected, present, model) if delay == 0.0 and is_own else delay
         values[f"reading lag/{model.key}/all"] = short
-        line = _line(readings[present], expected[present])
+        line = _line(*model.pairs(episode, 0 if np.isnan(delay) else int(delay)))
         least = errors.min(0)
         own = np.diagonal(least)
         exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
         inverted = _evidence(np.diagonal(errors[0]), np.diagonal(errors[1]), FITS)
-        count = episode.task.observations[model.key][0]
+        count = readings_of(episode, model.key).shape[1]
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
             values[f"reading bias/{axis}/all"] = float(line["bias"][i] / model.noise[i])
@@ -100,8 +107,16 @@ def _evidence(error: Array, other: Array, limit: float) -> Array:
 
 
 def delayed_errors(episode: Episode, model: ReadingModel) -> tuple[float, Array]:
-    """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay."""
+    """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay.
+
+    Periodic readings with the opposite sign look delayed: without a delay, channels may have another sign and order.
+    """
     readings, expected, present = model.compare(episode)
     known = np.arange(len(episode)) >= FIRST_CHANGES
     delay = fitted_lag(readings, expected, present, known & present.any(), largest_lag(episode.dt))
-    return delay, model.errors(episode, 0 if np.isnan(delay) else int(delay))
+    errors = model.errors(episode)
+    if np.isnan(delay) or delay == 0.0:
+        return delay, errors
+    delayed = model.errors(episode, int(delay))
+    is_arranged = errors.min((0, 2)).sum() < np.diagonal(delayed[0]).sum()
+    return (0.0, errors) if is_arranged else (delay, delayed)

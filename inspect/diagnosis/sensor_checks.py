@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
-from beliefscope.inspect.diagnosis.control_checks import control_label_statistics
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
 from beliefscope.inspect.diagnosis.reading_checks import reading_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
@@ -48,7 +47,7 @@ def sensor_statistics(
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
     values |= vector_statistics(episode) | law_statistics(episode)
-    values |= contact_distance_statistics(episode, reference) | control_label_statistics(episode)
+    values |= contact_distance_statistics(episode, reference)
     values |= window_statistics(episode, reference) | reading_statistics(episode, readings)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from fnmatch import fnmatch
 from functools import partial
 from itertools import permutations
 from typing import Any
@@ -28,6 +27,7 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     lever,
 )
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
+from beliefscope.inspect.statistics.reading_model import CONTROL
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
 from beliefscope.inspect.statistics.signals import MIN_STEPS
 
@@ -82,7 +82,7 @@ def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
     kinds = ("contact lag", "reading lag")
     lags = {
         name: [deviations[statistic] for kind in kinds if (statistic := f"{kind}/{name}/all") in deviations]
-        for name in inputs.checkpoint.task.observations
+        for name in (*inputs.checkpoint.task.observations, CONTROL)
     }
     largest = {name: max(behind_by, key=lambda d: d.t) for name, behind_by in lags.items() if behind_by}
     behind = {name: round(d.value - d.healthy) for name, d in largest.items()}
@@ -90,7 +90,7 @@ def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
         steps_of = {name: steps for name, steps in behind.items() if steps > 0}
     else:
         names = [f"lag/{key if key in ('control', 'labels') else 'image'}/all", f"lag/labels {key}/all"]
-        names += ["control lag/control/all", "lag/dynamics/all"] if key == "control" else []
+        names += ["lag/dynamics/all"] if key == CONTROL else []
         lag = next((deviations[name] for name in names if name in deviations), None)
         steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
         if not steps:
@@ -294,13 +294,12 @@ def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
 
 
 def _scale(deviations: Deviations, channel: int, size: int) -> float:
-    """Healthy over actual gain on the component that a channel changes most, or actual over healthy size."""
-    gains = [d for name, d in deviations.items() if fnmatch(name, f"control gain/control * {channel}/all")]
-    gain = max(gains, key=lambda d: abs(d.healthy) / max(d.high - d.low, 1e-12), default=None)
-    if gain is not None and gain.alarm and gain.value:
-        return gain.healthy / gain.value
-    name = f"size/{axis_name('control', channel, size)}/all"
-    return (_ratio(deviations, name) or 1.0) if name in deviations and deviations[name].alarm else 1.0
+    """Actual over healthy gain of a channel of the controls, or over its healthy size."""
+    axis = axis_name("control", channel, size)
+    for name in (f"reading gain/{axis}/all", f"size/{axis}/all"):
+        if name in deviations and deviations[name].alarm:
+            return _ratio(deviations, name) or 1.0
+    return 1.0
 
 
 def negate_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:

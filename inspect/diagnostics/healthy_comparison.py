@@ -43,8 +43,7 @@ OF_AXES = frozenset({"level", "drift", "change", "noise"})
 """Kinds of statistics of an axis of a sensor, in the unit of its readings (per s for drifts)."""
 
 SMALLEST_SHARE = 0.02
-"""Smallest standard deviation of these statistics relative to the size of the readings, where that is known; of the
-effect of a control on a component, relative to the largest effect of any control on it."""
+"""Smallest standard deviation of these statistics relative to the size of the readings, where that is known."""
 
 SMALLEST_REST = 0.005
 """Smallest share of remaining readings that is distinguished from none."""
@@ -244,30 +243,9 @@ def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np
     for i, (kind, subject, _) in enumerate(name.split("/") for name in names):
         if kind in OF_AXES and (size := f"size/{subject}/contact") in names:
             floor[i] = min(floor[i], SMALLEST_SHARE * np.nanmedian(values[:, names.index(size)]))
-    for i, smallest in _smallest_gains(names, values).items():
-        floor[i] = max(floor[i], smallest)
     rising = np.array([k in RISING or n.endswith("/range") for n, k in zip(names, kinds, strict=True)])
     scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
     return np.where(lost, -np.log(np.maximum(1.0 - values, SMALLEST_REST)), scaled), floor, rising
-
-
-def _smallest_gains(names: Sequence[str], values: Array) -> dict[int, float]:
-    """Index of each gain ``control gain/control COMPONENT CHANNEL/all`` -> its smallest standard deviation.
-
-    The gains of a component have the units of their controls. Their effects, gain times ``size/control``, compare.
-    """
-    sizes = [float(np.nanmedian(values[:, i])) for i, name in enumerate(names) if name.startswith("size/control")]
-    effects: dict[str, dict[int, float]] = {}  # component -> index -> effect of one unit of the gain
-    for i, name in enumerate(names):
-        if name.startswith("control gain/"):
-            component, channel = name.split("/")[1].rsplit(" ", 1)
-            if int(channel) < len(sizes) and sizes[int(channel)] > 0.0:
-                effects.setdefault(component, {})[i] = sizes[int(channel)]
-    return {
-        i: SMALLEST_SHARE * max(abs(float(np.nanmedian(values[:, k]))) * unit for k, unit in units.items()) / size
-        for units in effects.values()
-        for i, size in units.items()
-    }
 
 
 @lru_cache(maxsize=16)

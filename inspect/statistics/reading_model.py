@@ -1,7 +1,7 @@
-"""Linear model of a vector sensor: the readings that the labels lead to expect, fitted to the healthy episodes.
+"""Linear model of a vector sensor or of the controls: values that the labels lead to expect, from healthy episodes.
 
 It shows what the readings of a sensor of unknown physics cannot show by themselves: channels that are inverted or
-exchanged, and a delay behind the labels.
+exchanged, a gain, a bias, and a delay behind the labels.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.reference_images import CONTACT
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask
+
+CONTROL = "control"
+"""Key of the model of the controls."""
 
 FIRST_CHANGES = 2
 """First step with all features, which need two earlier ones."""
@@ -41,10 +44,10 @@ DIGITS = 4
 
 @dataclass(frozen=True)
 class ReadingModel:
-    """Expected readings of one sensor.
+    """Expected readings of one sensor, or expected controls.
 
     Attributes:
-        key: observation key of the sensor.
+        key: observation key of the sensor, or ``CONTROL``.
         channels: indices of the A channels that the labels explain (``EXPLAINED``).
         coefficients: (F, A) in units of the readings by those of the ``features``.
         constants: (A,) in units of the readings.
@@ -92,24 +95,28 @@ class ReadingModel:
         Angles are not wrapped. No step has both if the model has the features of another version.
         """
         inputs, present = features(episode), _steps(episode, self.key)
-        readings = _unwrapped(episode, episode.observations[self.key][:, self.channels].astype(np.float64), self.angles)
+        readings = _unwrapped(episode, readings_of(episode, self.key)[:, self.channels], self.angles)
         if inputs.shape[1] != len(self.coefficients):
             return readings, readings, np.zeros_like(present)
         return readings, inputs @ self.coefficients + self.constants, present
 
-    def errors(self, episode: Episode, delay: int = 0) -> Array:
-        """(2, A, A): mean square of reading i minus plus or minus expected reading j, ``delay`` steps earlier.
-
-        Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
-        """
+    def pairs(self, episode: Episode, delay: int = 0) -> tuple[Array, Array]:
+        """Readings (S, A) and the readings expected ``delay`` steps earlier, of the S steps that have both."""
         readings, expected, present = self.compare(episode)
         steps = np.flatnonzero(present)
         steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(present))]
-        if len(steps) < MIN_STEPS:
+        return readings[steps], expected[steps - delay]
+
+    def errors(self, episode: Episode, delay: int = 0) -> Array:
+        """(2, A, A): mean square of reading i minus plus or minus expected reading j, of ``pairs``.
+
+        Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
+        """
+        readings, expected = self.pairs(episode, delay)
+        if len(readings) < MIN_STEPS:
             return np.full((2, len(self.channels), len(self.channels)), np.nan)
-        difference = (
-            readings[steps][:, :, None] - np.array([1.0, -1.0])[:, None, None, None] * expected[steps - delay][:, None]
-        )
+        signs = np.array([1.0, -1.0])[:, None, None, None]
+        difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
         return np.asarray(np.square(difference / self.noise).mean(1))
 
 
@@ -123,9 +130,9 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
     inputs = [features(episode) for episode in episodes]
     result = []
     for key in keys:
-        angles = [_angle_of(episodes, key, channel) for channel in range(episodes[0].observations[key].shape[1])]
+        angles = [_angle_of(episodes, key, channel) for channel in range(readings_of(episodes[0], key).shape[1])]
         rows = [
-            (x[at], _unwrapped(episode, episode.observations[key].astype(np.float64), angles)[at])
+            (x[at], _unwrapped(episode, readings_of(episode, key), angles)[at])
             for x, episode in zip(inputs, episodes, strict=True)
             if (at := _steps(episode, key)).sum() >= MIN_STEPS
         ]
@@ -147,6 +154,11 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
     return tuple(result)
 
 
+def readings_of(episode: Episode, key: str) -> Array:
+    """(T, d) readings of a vector sensor, or the controls."""
+    return (episode.controls if key == CONTROL else episode.observations[key]).astype(np.float64)
+
+
 def _ridge(rows: Sequence[tuple[Array, Array]]) -> Array:
     """(F, d) coefficients of ridge regression, of pairs of features (S, F) and readings (S, d)."""
     x, y = (np.concatenate(parts) for parts in zip(*rows, strict=True))
@@ -165,7 +177,7 @@ def _angle_of(episodes: Sequence[Episode], key: str, channel: int) -> int:
     """Index of the component that wraps around as a channel does, and is closest to it; -1 for other channels."""
     task = episodes[0].task
     wrapping = [i for i, component in enumerate(task.components) if component.wraps]
-    readings = [episode.observations[key][:, channel].astype(np.float64) for episode in episodes]
+    readings = [readings_of(episode, key)[:, channel] for episode in episodes]
     jumps = any((np.abs(np.diff(values)) > np.pi).any() for values in readings)
     if not wrapping or not jumps or max(np.abs(values).max() for values in readings) > np.pi + SLIGHTLY:
         return -1
@@ -186,22 +198,24 @@ def _unwrapped(episode: Episode, readings: Array, angles: Sequence[int]) -> Arra
 
 def _steps(episode: Episode, key: str) -> Mask:
     """(T,): steps with a reading and all features."""
-    return np.asarray(episode.present(key) & (np.arange(len(episode)) >= FIRST_CHANGES))
+    present = np.ones(len(episode), dtype=bool) if key == CONTROL else episode.present(key)
+    return np.asarray(present & (np.arange(len(episode)) >= FIRST_CHANGES))
 
 
 def features(episode: Episode) -> Array:
     """(T, F): the state, its first and second changes by step, changes in the body frame, and all of them in contact.
 
-    Angles that wrap are also their cosine and sine, rotations their matrices. Changes are zero where they are unknown, at
-    the first two steps.
+    Angles that wrap have their cosine and sine as well, rotations are their matrices. Changes are zero where they are
+    unknown, at the first two steps.
     """
     task, states = episode.task, episode.states.astype(np.float64)
     change, second = np.zeros((2, *states.shape))
     change[1:] = task.difference(states[1:], states[:-1])
     second[2:] = change[2:] - change[1:-1]
     values, frames = _values(task, states)
-    in_frames = (frames[:, :, None] * change[:, None]).reshape(len(states), -1)
-    all_ = np.concatenate([values, change, second, in_frames], axis=1)
+    moved = np.concatenate([change, second], axis=1)
+    in_frames = (frames[:, :, None] * moved[:, None]).reshape(len(states), -1)
+    all_ = np.concatenate([values, moved, in_frames], axis=1)
     if CONTACT not in task.covariates:
         return all_
     contact = np.asarray(episode.contact, dtype=np.float64)[:, None]

@@ -43,49 +43,60 @@ def _labels(task: Task) -> tuple[Cause, ...]:
     (delay,) = (cause for cause in data.CAUSES if cause.name == "labels.delay")
     (_, dynamics) = delay.symptoms
     lag = Symptom("lag/labels/*|lag/dynamics/*", 1, 2.0, otherwise=(Symptom("reading lag/*", -1),))
-    controls = Symptom("control lag/*", -1, optional=True)
+    controls = Symptom("reading lag/control/*", -1, optional=True)
     return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls)),)
 
 
 def _controls(task: Task) -> tuple[Cause, ...]:
     """Causes in controls that do not command a measured hand, and in their use.
 
-    Two things show such controls: the changes of the labels, where a regression on the controls explains them, and the
-    dynamics model of a filter. An opposite sign is also a wrong scale, and inverted dynamics, by their slope, are also
-    frozen ones: the prior prefers them.
+    Two things show such controls: the labels, where these explain them, and the dynamics model of a filter. Inverted
+    dynamics, by their slope, are also frozen ones: the prior prefers them.
     """
     if not task.control_size or commands_hand(task):
         return ()
     # Updates of single modalities, which stand in for measurements, depend on the prediction.
-    changed = f"control gain/*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
-    used = Symptom("dynamics slope/*|dynamics spread/*|control gain/*", 0, optional=True)
+    changed = f"reading */control*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
+    used = Symptom("dynamics slope/*|dynamics spread/*|reading gain/control*", 0, optional=True)
     return (
         Cause(
             "control.delay",
             "Controls delayed",
-            (Symptom("control lag/*", otherwise=(Symptom("lag/dynamics/*", -1),)),),
-            changed,
+            (Symptom("reading lag/control/*", otherwise=(Symptom("lag/dynamics/*", -1),)),),
+            f"inverted/control*|exchanged/control*|{changed}",
             "Synchronise the controls with the sensors.",
             "advance control",
         ),
         Cause(
             "control.scale",
-            "Controls with a wrong scale, sign or order",
-            (Symptom("control gain/*", 0, otherwise=(Symptom("size/control*", 0),)), used),
-            f"control lag/*|size/control*|{changed}",
-            "Check the units, signs and order of the controls.",
+            "Controls with a wrong scale",
+            (Symptom("reading gain/control*", 0, otherwise=(Symptom("size/control*", 0),)), used),
+            f"size/control*|{changed}",
+            "Check the units of the controls.",
             "scale control",
+        ),
+        Cause(
+            "control.bias",
+            "Controls biased",
+            (Symptom("reading bias/control*", 0),),
+            f"lag/dynamics/*|{LABELS}|{DYNAMICS}",
+            "Calibrate the zero of the controls.",
+        ),
+        Cause(
+            "control.axes",
+            "Channels of the controls exchanged",
+            (Symptom("exchanged/control*"),),
+            f"inverted/control*|opposed/control*|size/control*|{changed}",
+            "Check the order of the controls.",
+            "rearrange control",
         ),
         Cause(
             "control.sign",
             "Controls with the opposite sign",
-            (
-                Symptom("opposed/control*", otherwise=(Symptom("control gain/*", target="mirrored"),)),
-                Symptom("control gain/*", 0, optional=True),
-            ),
-            f"control lag/*|{changed}",
+            (Symptom("inverted/control*", otherwise=(Symptom("opposed/control*"),)),),
+            f"opposed/control*|{changed}",
             "Check the sign convention of the controls.",
-            "negate control|scale control",
+            "rearrange control|negate control",
             prior=0.2,
         ),
         Cause(

@@ -137,5 +137,7 @@ def test_built_in_tasks_have_the_causes_of_the_catalog() -> None:
         "weights.ignores_near",
         "weights.ignores_far",
         "control.sign",
+        "control.axes",
+        "control.bias",
         "dynamics.inverted",
     }

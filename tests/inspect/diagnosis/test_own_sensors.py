@@ -130,7 +130,7 @@ STILL = as_external(still, "still", WRENCH)
         ("sensor_gain=wrench:factor=-1", "wrench.sign"),
         ("sensor_swapped=wrench", "wrench.axes"),
         ("delay=haptics:steps=3", "wrench.delay"),
-        ("control_scale=-1", "control.scale"),
+        ("control_scale=-1", "control.sign"),
         ("control_scale=0.1", "control.scale"),
         ("control_delay=4", "control.delay"),
     ],
@@ -148,7 +148,7 @@ def test_faults_of_readings_and_controls_of_a_task_without_a_measured_hand(fault
     causes = applicable(causes_of(WRENCH), [d.statistic for d in deviations])
     result = probabilities({c.name: explain(c, deviations) for c in causes})
     assert max(result, key=lambda name: result[name]) == cause
-    assert result[cause] > (0.6 if faults == "control_scale=-1" else 0.8), "control.sign is probable as well"
+    assert result[cause] > 0.8
 
 
 def test_wrong_channels_are_put_back() -> None:
@@ -169,10 +169,7 @@ def test_scaled_controls_are_divided_by_their_factor() -> None:
     wrong = Faults.parse("control_scale=-2").apply(slide(0), 0)
     inputs = RunInputs(STILL, {0: wrong}, 1, frozenset({0}))
     gains = [
-        Deviation(
-            f"control gain/control {name} {i}/all", value / -2, value, value - 0.01, value + 0.01, 0.0, value < 0, 9
-        )
-        for name, i, value in [("x", 0, -1.0), ("x", 1, 0.01), ("y", 0, 0.01), ("y", 1, -1.0)]
+        Deviation(f"reading gain/control {axis}/all", -2.0, 1.0, 0.99, 1.01, 0.0, True, -9.0) for axis in ("x", "y")
     ]
     result = scale_control(inputs, {gain.statistic: gain for gain in gains})
     assert result is not None
@@ -202,7 +199,7 @@ def test_models_of_sensors_with_own_names_may_have_faulty_sensors() -> None:
 
 
 def test_single_modality_updates_behind_the_labels_are_a_consequence_of_wrong_controls() -> None:
-    gain = Deviation("control gain/control x 0/all", 1.0, -1.0, -1.1, -0.9, 0.0, True, 20.0)
+    gain = Deviation("inverted/control x/all", 2.0, 0.0, 0.0, 0.1, 0.0, True, 20.0)
     late = Deviation("lag/labels camera/all", -9.0, 0.0, -0.5, 0.5, 0.0, True, -10.0)
     result = ranked(WRENCH, gain, late)
     assert result["control.sign"] > 0.7 > 0.3 > result["camera.delay"]
@@ -215,7 +212,7 @@ def test_inverted_dynamics_are_not_frozen() -> None:
 
     inverted, frozen = ranked(WRENCH, *slope(-1.0)), ranked(WRENCH, *slope(0.1))
     assert inverted["dynamics.inverted"] > 0.7
-    gain = Deviation("control gain/control x 0/all", 1.0, -1.0, -1.1, -0.9, 0.0, True, 20.0)
+    gain = Deviation("inverted/control x/all", 2.0, 0.0, 0.0, 0.1, 0.0, True, 20.0)
     wrong = ranked(WRENCH, *slope(-1.0), gain)
     assert wrong["control.sign"] > 0.7 > 0.3 > wrong["dynamics.inverted"], "the controls themselves are inverted"
     assert frozen["dynamics.frozen"] > 0.7 > 0.1 > frozen["dynamics.inverted"]

@@ -250,22 +250,3 @@ def test_only_names_of_pretrained_filters_have_a_file(name: str) -> None:
     hash_ = load_checkpoint(pretrained_path("door", "crossmodal-ekf")).hash
     assert profile_document("door", "crossmodal-ekf", hash_, None) is not None
     assert profile_document("door", name, hash_, None) is None
-
-
-def test_gains_of_controls_without_effect_hide_no_deviation() -> None:
-    """An irrelevant gain that is far from its usual values in one healthy episode."""
-    rng = np.random.default_rng(0)
-    count = 40
-    statistics = {
-        "size/control x/all": np.full(count, 2.0),
-        "size/control y/all": rng.normal(0.5, 0.05, count),
-        "control gain/control yaw 0/all": rng.normal(0.0, 1e-6, count),
-        "control gain/control yaw 1/all": rng.normal(0.01, 1e-5, count),
-        "nis/gps/all": np.exp(rng.normal(0.0, 0.2, count)),
-    }
-    statistics["control gain/control yaw 0/all"][20] = 5e-4
-    usual = {name: float(np.median(values)) for name, values in statistics.items()}
-    profile = HealthyProfile("clean.h5", count, None, statistics)
-    gain = "control gain/control yaw"
-    for fault in ({"nis/gps/all": 20.0}, {f"{gain} 1/all": 0.02}, {f"{gain} 0/all": 2e-3}):
-        assert compare(profile, [usual | fault]).p_value == pytest.approx(1 / (count + 1))

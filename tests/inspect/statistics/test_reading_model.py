@@ -105,8 +105,9 @@ def test_errors_are_those_of_the_noise_where_channels_match() -> None:
 def test_delays_are_exact(model: ReadingModel, delay: int) -> None:
     late = NEW.observations[model.key][np.maximum(np.arange(STEPS) - delay, 0)]
     values = reading_statistics(with_readings(NEW, model.key, late), MODELS)
-    assert values[f"reading lag/{model.key}/all"] == delay
-    assert values[f"inverted/{model.key} x/all"] == 0.0, "errors are those at the delay"
+    assert values[f"reading lag/{model.key}/all"] == pytest.approx(delay, abs=0.02 if delay == 0 else 0.0)
+    assert values[f"inverted/{model.key} x/all"] == 0.0, "errors, gain and noise are those at the delay"
+    assert (values[f"reading gain/{model.key} x/all"], round(values[f"reading noise/{model.key} x/all"])) == (1.0, 1)
 
 
 def test_wrong_channels_show_in_their_own_statistics_only() -> None:
