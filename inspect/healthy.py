@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,10 +52,15 @@ def sensor_record(episodes: Sequence[Episode], reference: Reference | None = Non
     """
     keys = modelled_keys(episodes[0].task) if episodes else []
     groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
-    models = [fit_reading_models(group, keys) for group in groups]
+    models = fit_reading_models(episodes, keys)
+    noise = {(model.key, model.channels): model.noise for model in models}
+    fold_models = [
+        [replace(m, noise=noise.get((m.key, m.channels), m.noise)) for m in fit_reading_models(group, keys)]
+        for group in groups
+    ]
     references = [reference or measure_reference(group) for group in groups]
-    rows = [sensor_statistics(e, references[i % FOLDS], models[i % FOLDS]) for i, e in enumerate(episodes)]
-    return SensorRecord(rows, reference or measure_reference(episodes), fit_reading_models(episodes, keys))
+    rows = [sensor_statistics(e, references[i % FOLDS], fold_models[i % FOLDS]) for i, e in enumerate(episodes)]
+    return SensorRecord(rows, reference or measure_reference(episodes), models)
 
 
 def profile_of(

@@ -117,6 +117,7 @@ RISING = frozenset(
         "opposed",
         "inverted",
         "exchanged",
+        "reading noise",
         "reading scatter",
         "contact distance error",
         "contact distance scatter",

@@ -32,6 +32,9 @@ SMALLEST_NOISE = 0.01
 RIDGE = 1e-3
 """Penalty of squared coefficients of standardised features, relative to the number of steps."""
 
+MAX_STEPS = 20_000
+"""Number of steps to which a model is fitted; of more, every second one and so on."""
+
 MIN_EPISODES = 4
 """Smallest number of episodes of a model."""
 
@@ -131,10 +134,12 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
     result = []
     for key in keys:
         angles = [_angle_of(episodes, key, channel) for channel in range(readings_of(episodes[0], key).shape[1])]
+        present = [np.flatnonzero(_steps(episode, key)) for episode in episodes]
+        stride = 1 + sum(map(len, present)) // MAX_STEPS
         rows = [
-            (x[at], _unwrapped(episode, readings_of(episode, key), angles)[at])
-            for x, episode in zip(inputs, episodes, strict=True)
-            if (at := _steps(episode, key)).sum() >= MIN_STEPS
+            (x[steps[::stride]], _unwrapped(episode, readings_of(episode, key), angles)[steps[::stride]])
+            for x, episode, steps in zip(inputs, episodes, present, strict=True)
+            if len(steps) // stride >= MIN_STEPS
         ]
         if len(rows) < MIN_EPISODES:
             continue
@@ -187,7 +192,7 @@ def _angle_of(episodes: Sequence[Episode], key: str, channel: int) -> int:
 
 
 def _unwrapped(episode: Episode, readings: Array, angles: Sequence[int]) -> Array:
-    """Readings (T, d), of which those of angles are within half a turn of the components (``angles``), unwrapped."""
+    """Readings (T, d): those of angles are unwrapped, within half a turn of the components (``angles``)."""
     result = readings.copy()
     for channel, component in enumerate(angles):
         if component >= 0:
@@ -203,7 +208,7 @@ def _steps(episode: Episode, key: str) -> Mask:
 
 
 def features(episode: Episode) -> Array:
-    """(T, F): the state, its first and second changes by step, changes in the body frame, and all of them in contact.
+    """(T, F): the state, its first and second changes by step, these in the body frame, and all of them in contact.
 
     Angles that wrap have their cosine and sine as well, rotations are their matrices. Changes are zero where they are
     unknown, at the first two steps.
@@ -212,10 +217,10 @@ def features(episode: Episode) -> Array:
     change, second = np.zeros((2, *states.shape))
     change[1:] = task.difference(states[1:], states[:-1])
     second[2:] = change[2:] - change[1:-1]
-    values, frames = _values(task, states)
-    moved = np.concatenate([change, second], axis=1)
-    in_frames = (frames[:, :, None] * moved[:, None]).reshape(len(states), -1)
-    all_ = np.concatenate([values, moved, in_frames], axis=1)
+    others, frames = _values(task, states)
+    vectors = np.concatenate([others, change, second], axis=1)
+    in_frames = (frames[:, :, None] * vectors[:, None]).reshape(len(states), -1)
+    all_ = np.concatenate([vectors, frames, in_frames], axis=1)
     if CONTACT not in task.covariates:
         return all_
     contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
@@ -223,18 +228,16 @@ def features(episode: Episode) -> Array:
 
 
 def _values(task: Task, states: Array) -> tuple[Array, Array]:
-    """State components (T, V) without jumps, and those (T, R) that turn vectors of the world into the body frame.
+    """State components (T, V) that do not jump, and those (T, R) that turn vectors of the world into the body frame.
 
-    Of angles that wrap around, also the angles, unwrapped.
+    Angles that wrap around are among both, unwrapped.
     """
-    frames = [f(states[:, [i]]) for i, c in enumerate(task.components) if c.wraps for f in (np.cos, np.sin)]
+    turning = {i for i, c in enumerate(task.components) if c.wraps}
+    rotated = {i for at in task.rotations for i in range(at.start, at.stop)}
+    others = [np.unwrap(x, axis=0) if i in turning else x for i, x in enumerate(states.T) if i not in rotated]
+    frames = [f(states[:, i]) for i in turning for f in (np.cos, np.sin)]
     if task.rotations:
         from scipy.spatial.transform import Rotation  # takes most of a second
 
-        frames += [Rotation.from_rotvec(states[:, at]).as_matrix().reshape(len(states), 9) for at in task.rotations]
-    turning = {i for i, c in enumerate(task.components) if c.wraps}
-    turning |= {i for at in task.rotations for i in range(at.start, at.stop)}
-    others = [states[:, [i]] for i in range(states.shape[1]) if i not in turning]
-    others += [np.unwrap(states[:, [i]], axis=0) for i, c in enumerate(task.components) if c.wraps]
-    empty = np.zeros((len(states), 0))
-    return np.concatenate([*others, *frames, empty], axis=1), np.concatenate([*frames, empty], axis=1)
+        frames += [x for at in task.rotations for x in Rotation.from_rotvec(states[:, at]).as_matrix().reshape(-1, 9).T]
+    return np.array(others).T.reshape(len(states), -1), np.array(frames).T.reshape(len(states), -1)
