@@ -16,6 +16,9 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitte
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
 
+SIMPLER = 2.0
+"""Largest error with another sign and order, relative to that with a delay, at which the former is preferred."""
+
 SURELY = 4.0
 """Smallest number of standard errors of a slope."""
 
@@ -118,5 +121,5 @@ def delayed_errors(episode: Episode, model: ReadingModel) -> tuple[float, Array]
     if np.isnan(delay) or delay == 0.0:
         return delay, errors
     delayed = model.errors(episode, int(delay))
-    is_arranged = errors.min((0, 2)).sum() < np.diagonal(delayed[0]).sum()
+    is_arranged = errors.min((0, 2)).sum() < SIMPLER * np.diagonal(delayed[0]).sum()
     return (0.0, errors) if is_arranged else (delay, delayed)

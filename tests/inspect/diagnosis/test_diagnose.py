@@ -152,9 +152,14 @@ def test_sensors_without_statistics_are_named() -> None:
     assert sensors_ == [name.replace("_", " ") for name in checkpoint().task.observations if name != "force"]
     assert statistic == "level of force (x) in free motion"
     assert result.tables()[-1].rows[-1] == (statistic,)
+    assert not result.to_json()["outdated"]
     newer = [{**row, "opposed/control x/all": 1.0} for row in rows]
-    *_, outdated = healthy(compared(inputs, runs(), newer, sensed, record, 0.05)).to_json()["unmeasured"]
-    assert outdated == "statistics that the healthy record of an earlier version lacks (1): measure it again"
+    document = healthy(compared(inputs, runs(), newer, sensed, record, 0.05)).to_json()
+    assert document["outdated"]
+    assert (
+        document["unmeasured"][-1]
+        == "statistics that the healthy record of an earlier version lacks (1): measure it again"
+    )
 
 
 def test_faults_after_all_steps_are_refused() -> None:

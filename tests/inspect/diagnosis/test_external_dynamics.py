@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import beliefscope as bs
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.healthy import profile_of
@@ -86,3 +87,11 @@ def test_defects_of_an_external_filter_are_named(filter_: Cart, cause: str) -> N
 def test_a_healthy_external_filter_is_healthy() -> None:
     profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
     assert diagnose(loaded(Cart()), {seed: drive(seed) for seed in range(20, 30)}, profile=profile).state == "healthy"
+
+
+def test_a_faulty_sensor_is_not_broken_dynamics_although_predictions_start_at_wrong_estimates() -> None:
+    profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
+    faulty = {seed: Faults.parse("sensor_gain=rear:factor=-1").apply(drive(seed), seed) for seed in range(50, 56)}
+    result = diagnose(loaded(Cart(weight=0.5)), faulty, profile=profile)
+    probability = {c.cause.name: c.probability for c in result.causes}
+    assert probability["rear.sign"] > 0.9 > 0.2 > probability.get("dynamics.broken", 0.0)

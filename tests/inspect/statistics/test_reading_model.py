@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task, rotation
-from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors, reading_statistics
+from beliefscope.inspect.diagnosis.reading_checks import modelled_keys, modelled_sensors, reading_statistics
 from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
 
 DT, STEPS, NOISE = 0.05, 120, 0.01
@@ -144,3 +144,66 @@ def test_a_model_of_other_features_has_no_steps() -> None:
     (other,) = fit_reading_models([replace(e, task=replace(PLANE, covariates={})) for e in EPISODES], ["gps"])
     assert not other.compare(NEW)[2].any()
     assert np.isnan(reading_statistics(NEW, [other])["reading bias/gps x/all"])
+
+
+IMU = replace(
+    PLANE,
+    name="imu",
+    observations={"compass": (1,)},
+    modalities={"compass": ("compass",)},
+    control_size=3,
+)
+
+
+def fly(seed: int) -> Episode:
+    """A heading that wraps around, and controls that are acceleration and turn rate in the body frame."""
+    rng = np.random.default_rng(seed)
+    position, yaw = 0.5 * smooth(rng, 2), 3.0 * smooth(rng, 1)[:, 0] + rng.uniform(-np.pi, np.pi)
+    velocity = np.diff(position, axis=0, prepend=position[:1]) / DT
+    x, y = np.diff(velocity, axis=0, prepend=velocity[:1]).T / DT
+    rate = np.diff(yaw, prepend=yaw[:1]) / DT
+    controls = np.column_stack([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, rate])
+    heading = yaw + 1.0 + rng.normal(0.0, 0.05, STEPS)
+    yaw, heading = ((angle + np.pi) % (2.0 * np.pi) - np.pi for angle in (yaw, heading))
+    states = np.column_stack([position, yaw])
+    noisy = controls + rng.normal(0.0, 0.2, controls.shape)
+    return Episode(IMU, states, noisy, {"compass": heading[:, None]}, contact=np.zeros(STEPS))
+
+
+FLIGHTS = [fly(seed) for seed in range(12)]
+OF_FLIGHTS = fit_reading_models(FLIGHTS, modelled_keys(IMU))
+
+
+def test_angles_are_compared_modulo_a_turn() -> None:
+    compass, flight = OF_FLIGHTS[0], fly(100)
+    assert (compass.key, compass.angles) == ("compass", (2,))
+    assert np.abs(np.diff(flight.observations["compass"][:, 0])).max() > np.pi, "it wraps around"
+    turned = (flight.observations["compass"] + 0.4 + np.pi) % (2.0 * np.pi) - np.pi
+    before, after = (
+        reading_statistics(with_readings(flight, "compass", readings), OF_FLIGHTS)["reading bias/compass/all"]
+        for readings in (flight.observations["compass"], turned)
+    )
+    assert (after - before) * compass.noise[0] == pytest.approx(0.4, abs=1e-4)
+
+
+def test_controls_in_the_body_frame_are_sensors() -> None:
+    controls, flight = OF_FLIGHTS[1], fly(100)
+    assert (controls.key, controls.channels) == ("control", (0, 1, 2))
+    clean = reading_statistics(flight, OF_FLIGHTS)
+    exchanged = reading_statistics(replace(flight, controls=flight.controls[:, [1, 0, 2]]), OF_FLIGHTS)
+    inverted = reading_statistics(replace(flight, controls=flight.controls * [1, 1, -1]), OF_FLIGHTS)
+    degrees = reading_statistics(replace(flight, controls=flight.controls * [1, 1, 180 / np.pi]), OF_FLIGHTS)
+    assert clean["exchanged/control x/all"] == clean["inverted/control z/all"] == 0.0
+    assert min(exchanged["exchanged/control x/all"], inverted["inverted/control z/all"]) > 0.5
+    assert degrees["reading gain/control z/all"] == pytest.approx(180 / np.pi, rel=0.05)
+    assert "control" not in modelled_keys(replace(IMU, control_size=0))
+
+
+def test_periodic_readings_with_the_opposite_sign_are_not_delayed() -> None:
+    t = DT * np.arange(STEPS)
+    states = np.column_stack([np.sin(2.0 * np.pi * t), np.cos(2.0 * np.pi * t), np.zeros(STEPS)])
+    episode = replace(NEW, states=states)
+    for sign, name in ((1.0, "clean"), (-1.0, "inverted")):
+        values = reading_statistics(with_readings(episode, "gps", sign * (GPS.constants + states[:, :2])), MODELS)
+        assert abs(values["reading lag/gps/all"]) < 0.1, name
+        assert (values["inverted/gps x/all"] > 1.0) == (sign < 0.0)

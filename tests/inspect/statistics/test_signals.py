@@ -8,6 +8,7 @@ import pytest
 from beliefscope.inspect.statistics.signals import (
     MAX_LAG,
     deviating_interval,
+    fitted_lag,
     lag,
     long_runs,
     noise_level,
@@ -99,3 +100,23 @@ def test_robust_fit_recovers_coefficients_beside_outliers() -> None:
     values = exact + rng.normal(scale=0.01, size=exact.shape)
     values[:, ::10] += 50.0
     np.testing.assert_allclose(robust_fit(columns, values), coefficients, rtol=0.02, atol=2.0)
+
+
+@pytest.mark.parametrize("delay", [-7, 0, 1, 5, MAX_LAG])
+@pytest.mark.parametrize("gain", [0.2, 30.0])
+def test_a_fitted_lag_is_that_of_a_smooth_signal_with_noise_whatever_its_gain(delay: int, gain: float) -> None:
+    """Of columns that another signal does not predict, the lag does not depend."""
+    steps = np.arange(MAX_LAG, 200 - MAX_LAG)
+    signal, other = smooth(200, 2), np.random.default_rng(5).normal(size=(len(steps), 1))
+    late = gain * signal[steps - delay] + 7.0 + 0.02 * gain * np.random.default_rng(3).normal(size=(len(steps), 2))
+    known = np.ones(len(steps), dtype=bool)
+    pair = np.hstack([late, other]), np.hstack([signal[steps], smooth(len(steps), 1, seed=9)])
+    assert fitted_lag(*pair, known, known) == delay
+    assert fitted_lag(*pair, np.arange(len(steps)) % 4 == 0, known) == delay, "readings at every fourth step"
+
+
+def test_a_fitted_lag_needs_a_signal_of_the_same_sign_and_enough_steps() -> None:
+    signal, known = smooth(100, 1), np.ones(100, dtype=bool)
+    assert np.isnan(fitted_lag(smooth(100, 1, seed=4), signal, known, known))
+    assert np.isnan(fitted_lag(signal, signal, np.arange(100) < 5, known))
+    assert fitted_lag(signal, signal, known, known, largest=0) == 0.0
