@@ -178,8 +178,12 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
     text = cause.next.format(task=checkpoint.task.name, filter=_argument(checkpoint))
     if "--data" not in text:
         text = text.replace(" -o tuned", f"{_data(checkpoint)} -o tuned")
-    # The loss of an external filter selects what is trained.
-    return re.sub(r" --train [\w-]+", "", text) if isinstance(checkpoint, ExternalFilter) else text
+    if not isinstance(checkpoint, ExternalFilter):
+        return text
+    if not any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)()):
+        text = re.sub(r"(, or train with noisy images| and fine-tune): `.*`", "", text)
+        return re.sub(r"(Fine-tune|Calibrate) (it|them): `.*`", r"Correct \2 in the filter's own code", text)
+    return re.sub(r" --train [\w-]+", "", text)  # its loss selects what is trained
 
 
 def _argument(checkpoint: Checkpoint) -> str:

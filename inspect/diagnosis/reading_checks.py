@@ -9,9 +9,15 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, axis_name, commands_hand
-from beliefscope.inspect.statistics.reading_model import CONTROL, FIRST_CHANGES, ReadingModel, readings_of
+from beliefscope.inspect.statistics.reading_model import (
+    CONTROL,
+    FIRST_CHANGES,
+    ComparedReadings,
+    ReadingModel,
+    readings_of,
+)
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, largest_lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, fitted_lag, largest_lag
 
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
@@ -56,12 +62,11 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     for model in models:
         if model.key not in (*episode.observations, CONTROL) or not np.isfinite(episode.states).all():
             continue
-        delay, errors = delayed_errors(episode, model)
-        readings, expected, present = model.compare(episode)
+        compared = model.compare(episode)
+        delay, errors = delayed_errors(compared, episode.dt)
         is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())  # sign and order
-        short = _short_delay(readings, expected, present, model) if delay == 0.0 and is_own else delay
-        values[f"reading lag/{model.key}/all"] = short
-        line = _line(*model.pairs(episode, 0 if np.isnan(delay) else int(delay)))
+        values[f"reading lag/{model.key}/all"] = _short_delay(compared) if delay == 0.0 and is_own else delay
+        line = _line(*compared.pairs(0 if np.isnan(delay) else int(delay)))
         least = errors.min(0)
         own = np.diagonal(least)
         exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
@@ -78,11 +83,11 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     return values
 
 
-def _short_delay(readings: Array, expected: Array, present: Mask, model: ReadingModel) -> float:
-    """Steps, with fractions: regression of the errors (T, A) on the changes of the expected readings by step."""
-    change = np.gradient(expected, axis=0)[present] / model.noise
-    error = (readings - expected)[present] / model.noise
-    change, error = (x - x.mean(0) for x in (change, error))
+def _short_delay(compared: ComparedReadings) -> float:
+    """Steps, with fractions: regression of the errors on the changes of the expected readings by step."""
+    error, change = compared.readings - compared.expected, np.gradient(compared.expected, axis=0)
+    error, change = (x[compared.present] / compared.noise for x in (error, change))
+    error, change = (x - x.mean(0) for x in (error, change))
     return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
 
 
@@ -109,17 +114,19 @@ def _evidence(error: Array, other: Array, limit: float) -> Array:
     return np.asarray(0.5 * np.log(np.where(other < limit, np.maximum(ratio, 1.0), 1.0)))
 
 
-def delayed_errors(episode: Episode, model: ReadingModel) -> tuple[float, Array]:
+def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]:
     """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay.
 
     Periodic readings with the opposite sign look delayed: without a delay, channels may have another sign and order.
+
+    Args:
+        dt: s per step.
     """
-    readings, expected, present = model.compare(episode)
-    known = np.arange(len(episode)) >= FIRST_CHANGES
-    delay = fitted_lag(readings, expected, present, known & present.any(), largest_lag(episode.dt))
-    errors = model.errors(episode)
+    known = (np.arange(len(compared.present)) >= FIRST_CHANGES) & compared.present.any()
+    delay = fitted_lag(compared.readings, compared.expected, compared.present, known, largest_lag(dt))
+    errors = compared.errors()
     if np.isnan(delay) or delay == 0.0:
         return delay, errors
-    delayed = model.errors(episode, int(delay))
+    delayed = compared.errors(int(delay))
     is_arranged = errors.min((0, 2)).sum() < SIMPLER * np.diagonal(delayed[0]).sum()
     return (0.0, errors) if is_arranged else (delay, delayed)

@@ -208,7 +208,8 @@ def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs 
 
     if model is None:
         return None
-    total = np.sum([delayed_errors(inputs.episodes[index], model)[1] for index in inputs.affected], axis=0)
+    affected = (inputs.episodes[index] for index in inputs.affected)
+    total = np.sum([delayed_errors(model.compare(episode), episode.dt)[1] for episode in affected], axis=0)
     if not np.isfinite(total).all():
         return None
     sources, channels = linear_sum_assignment(total.min(0))  # reading i is of channel j

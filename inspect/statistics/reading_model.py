@@ -15,7 +15,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.reference_images import CONTACT
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask
+from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask
 
 CONTROL = "control"
 """Key of the model of the controls."""
@@ -43,6 +43,35 @@ SLIGHTLY = 0.01
 
 DIGITS = 4
 """Significant digits of stored coefficients."""
+
+
+@dataclass(frozen=True)
+class ComparedReadings:
+    """Readings and expected readings (T, A) of an episode, the steps (T,) that have both, and the noise (A,)."""
+
+    readings: Array
+    expected: Array
+    present: Mask
+    noise: Array
+
+    def pairs(self, delay: int = 0) -> tuple[Array, Array]:
+        """Readings (S, A) and the readings expected ``delay`` steps earlier, of at most ``MAX_PAIRS`` steps."""
+        steps = np.flatnonzero(self.present)
+        steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(self.present))]
+        steps = steps[:: 1 + len(steps) // MAX_PAIRS]
+        return self.readings[steps], self.expected[steps - delay]
+
+    def errors(self, delay: int = 0) -> Array:
+        """(2, A, A): mean square of reading i minus plus or minus expected reading j, of ``pairs``.
+
+        Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
+        """
+        readings, expected = self.pairs(delay)
+        if len(readings) < MIN_STEPS:
+            return np.full((2, len(self.noise), len(self.noise)), np.nan)
+        signs = np.array([1.0, -1.0])[:, None, None, None]
+        difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
+        return np.asarray(np.square(difference / self.noise).mean(1))
 
 
 @dataclass(frozen=True)
@@ -92,35 +121,16 @@ class ReadingModel:
             raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}")
         return cls(str(value["key"]), channels, coefficients, constants, noise, tuple(map(int, value["angles"])))
 
-    def compare(self, episode: Episode) -> tuple[Array, Array, Mask]:
-        """Readings and expected readings (T, A), and the steps (T,) that have both.
+    def compare(self, episode: Episode) -> ComparedReadings:
+        """The readings of an episode beside the expected ones; angles are not wrapped.
 
-        Angles are not wrapped. No step has both if the model has the features of another version.
+        No step has both if the model has the features of another version.
         """
         inputs, present = features(episode), _steps(episode, self.key)
         readings = _unwrapped(episode, readings_of(episode, self.key)[:, self.channels], self.angles)
         if inputs.shape[1] != len(self.coefficients):
-            return readings, readings, np.zeros_like(present)
-        return readings, inputs @ self.coefficients + self.constants, present
-
-    def pairs(self, episode: Episode, delay: int = 0) -> tuple[Array, Array]:
-        """Readings (S, A) and the readings expected ``delay`` steps earlier, of the S steps that have both."""
-        readings, expected, present = self.compare(episode)
-        steps = np.flatnonzero(present)
-        steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(present))]
-        return readings[steps], expected[steps - delay]
-
-    def errors(self, episode: Episode, delay: int = 0) -> Array:
-        """(2, A, A): mean square of reading i minus plus or minus expected reading j, of ``pairs``.
-
-        Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
-        """
-        readings, expected = self.pairs(episode, delay)
-        if len(readings) < MIN_STEPS:
-            return np.full((2, len(self.channels), len(self.channels)), np.nan)
-        signs = np.array([1.0, -1.0])[:, None, None, None]
-        difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
-        return np.asarray(np.square(difference / self.noise).mean(1))
+            return ComparedReadings(readings, readings, np.zeros_like(present), self.noise)
+        return ComparedReadings(readings, inputs @ self.coefficients + self.constants, present, self.noise)
 
 
 def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:

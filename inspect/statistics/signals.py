@@ -27,6 +27,9 @@ SMALL_REST = 0.3
 BETTER = 0.9
 """Largest unpredicted variance at a lag, relative to that without one."""
 
+MAX_PAIRS = 4_000
+"""Number of steps of a signal that are compared at each lag, evenly spaced."""
+
 MIN_RATIO = 15.0
 """Smallest log-likelihood ratio of a lag to none, times two: that of a lag by chance is rarely larger."""
 
@@ -162,6 +165,7 @@ def fitted_lag(late: Array, early: Array, late_known: Mask, early_known: Mask, l
         return np.nan
     largest = min(largest, len(late) // 4)
     steps, lags = np.flatnonzero(late_known), np.arange(-largest, largest + 1)
+    steps = steps[:: 1 + len(steps) // MAX_PAIRS]
     source = steps[:, None] - lags  # (S, L): step of ``early`` that belongs to a step of ``late``
     inside = source.clip(0, len(late) - 1)
     paired = ((source == inside) & early_known[inside])[..., None]

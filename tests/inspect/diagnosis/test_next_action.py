@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor, nn
 
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
@@ -26,12 +27,25 @@ def test_of_checkpoints() -> None:
 
 
 def test_of_an_external_filter_whose_loss_selects_what_is_trained() -> None:
-    def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
-        return np.zeros((*controls.shape[:-1], 1))
+    class Still(nn.Linear):
+        def forward(self, *, observations: object, controls: Tensor) -> Tensor:
+            return self.weight.expand(*controls.shape[:-1], 1)
 
-    adapter = as_external(still, "still", TASK).adapter
+    adapter = as_external(Still(1, 1), "still", TASK).adapter
     external = ExternalFilter(adapter, TASK, "own-still", "own.py:still")
     (cause,) = (cause for cause in causes_of(TASK) if cause.name == "model.touch.bias")
     command = "`beliefscope finetune peg --filter own.py:still --data DATA -o tuned.safetensors`"
     assert command in next_action(cause, external)
     assert "`beliefscope slices peg --filter own.py:still --data DATA`" in search_action(external, 6)
+
+
+def test_of_a_filter_without_parameters() -> None:
+    def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
+        return np.zeros((*controls.shape[:-1], 1))
+
+    external = as_external(still, "still", TASK)
+    actions = {cause.name: next_action(cause, external) for cause in causes_of(TASK)}
+    assert actions["dynamics.broken"] == "Correct it in the filter's own code."
+    assert actions["model.touch.bias"].endswith("same symptoms. Correct it in the filter's own code.")
+    assert actions["data.shift"] == "Collect data of these conditions."
+    assert not [action for action in actions.values() if "finetune" in action or "`" in action]

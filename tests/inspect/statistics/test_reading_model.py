@@ -68,9 +68,10 @@ def test_only_sensors_that_the_labels_explain_have_a_model() -> None:
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.key)
 def test_expected_readings_of_new_episodes_are_the_noise_free_ones(model: ReadingModel) -> None:
-    readings, expected, present = model.compare(NEW)
+    compared = model.compare(NEW)
+    error = (compared.readings - compared.expected)[compared.present]
     scale = np.mean([episode.observations[model.key].std(0) for episode in EPISODES], axis=0)
-    assert (readings - expected)[present].std(0).max() < 1.2 * NOISE + 0.02 * scale.max()
+    assert error.std(0).max() < 1.2 * NOISE + 0.02 * scale.max()
     np.testing.assert_allclose(model.noise, np.maximum(NOISE, 0.01 * scale), rtol=0.3)
 
 
@@ -86,16 +87,16 @@ def test_readings_in_the_body_of_a_rotation_in_space_are_expected() -> None:
         return Episode(task, turned.as_rotvec(), np.zeros((STEPS, 0)), {"imu": gravity}, contact=np.zeros(STEPS))
 
     (model,) = fit_reading_models([turn(seed) for seed in range(8)], ["imu"])
-    readings, expected, present = model.compare(turn(50))
-    assert np.abs(readings - expected)[present].std(0).max() < 0.1
+    compared = model.compare(turn(50))
+    assert (compared.readings - compared.expected)[compared.present].std(0).max() < 0.1
     assert model.channels == (0, 1, 2)
 
 
 def test_errors_are_those_of_the_noise_where_channels_match() -> None:
     """A signed permutation of the channels has them at the places of this permutation."""
-    clean = GPS.errors(NEW)
+    clean = GPS.compare(NEW).errors()
     readings = NEW.observations["gps"][:, ::-1] * [1.0, -1.0]
-    turned = GPS.errors(with_readings(NEW, "gps", readings))
+    turned = GPS.compare(with_readings(NEW, "gps", readings)).errors()
     assert np.diagonal(clean[0]).max() < 2.0 < 100.0 < min(clean[0, 0, 1], clean[1, 0, 0])
     np.testing.assert_allclose([turned[0, 0, 1], turned[1, 1, 0]], [clean[0, 1, 1], clean[0, 0, 0]], rtol=1e-3)
 
@@ -130,19 +131,19 @@ def test_absent_readings_do_not_count() -> None:
     fix = (np.arange(STEPS) % 3 == 0).astype(np.float32)
     readings = np.where(fix[:, None] > 0.0, NEW.observations["gps"], 0.0)
     episode = replace(with_readings(NEW, "gps", readings), task=task, covariates={"fix": fix})
-    assert np.diagonal(GPS.errors(episode)[0]).max() < 2.0
+    assert np.diagonal(GPS.compare(episode).errors()[0]).max() < 2.0
 
 
 def test_models_are_stored_as_json() -> None:
     stored = ReadingModel.from_json(json.loads(json.dumps(GPS.to_json())))
-    np.testing.assert_allclose(stored.compare(NEW)[1], GPS.compare(NEW)[1], rtol=0.0, atol=2e-3)
+    np.testing.assert_allclose(stored.compare(NEW).expected, GPS.compare(NEW).expected, rtol=0.0, atol=2e-3)
     with pytest.raises(ValueError, match="2 channels"):
         ReadingModel.from_json({**GPS.to_json(), "noise": [1.0]})
 
 
 def test_a_model_of_other_features_has_no_steps() -> None:
     (other,) = fit_reading_models([replace(e, task=replace(PLANE, covariates={})) for e in EPISODES], ["gps"])
-    assert not other.compare(NEW)[2].any()
+    assert not other.compare(NEW).present.any()
     assert np.isnan(reading_statistics(NEW, [other])["reading bias/gps x/all"])
 
 
