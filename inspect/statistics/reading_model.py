@@ -134,11 +134,12 @@ class ReadingModel:
 
 
 def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
-    """Models of the vector sensors whose readings depend on the labels; none for unlabelled or too few episodes.
+    """Models of the vector sensors whose readings depend on the labels; none for too few labelled episodes.
 
     Each half of the episodes decides which channels the model of the other half explains.
     """
-    if len(episodes) < MIN_EPISODES or not keys or not all(np.isfinite(e.states).all() for e in episodes):
+    episodes = [episode for episode in episodes if np.isfinite(episode.states).all()]
+    if len(episodes) < MIN_EPISODES or not keys:
         return ()
     inputs = [features(episode) for episode in episodes]
     result = []

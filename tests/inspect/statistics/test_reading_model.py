@@ -64,6 +64,7 @@ def test_only_sensors_that_the_labels_explain_have_a_model() -> None:
     assert fit_reading_models(EPISODES[:3], ["gps"]) == (), "too few episodes"
     unlabelled = [replace(e, states=np.full_like(e.states, np.nan)) for e in EPISODES]
     assert fit_reading_models(unlabelled, ["gps"]) == ()
+    assert len(fit_reading_models([*EPISODES, *unlabelled], ["gps"])) == 1
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.key)
