@@ -18,7 +18,15 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile, profile_document
-from beliefscope.inspect.diagnostics.statistic_kinds import KINDS, LEVER, LOST, RISING, label_of, unit_of
+from beliefscope.inspect.diagnostics.statistic_kinds import (
+    KINDS,
+    LEVER,
+    LOST,
+    RISING,
+    is_contact_known,
+    label_of,
+    unit_of,
+)
 from beliefscope.inspect.diagnostics.views import Table
 
 SIGNIFICANCE = 0.01
@@ -67,6 +75,7 @@ class Deviation:
         alarm: whether it is significant and at least ``MIN_EFFECT``.
         t: difference of the means over its standard error; of ``with_critical_values``, relative to its critical value.
         unit, factor: for display, and the factor from the unit of the values.
+        has_contact: whether contact is measured or labelled in the task.
     """
 
     statistic: str
@@ -79,11 +88,12 @@ class Deviation:
     t: float
     unit: str = ""
     factor: float = 1.0
+    has_contact: bool = True
 
     @property
     def label(self) -> str:
         """Display name of the statistic."""
-        return label_of(self.statistic)
+        return label_of(self.statistic, self.has_contact)
 
     @property
     def text(self) -> str:
@@ -186,7 +196,8 @@ def compare(
     mean, healthy = np.nanmean(values[:count], axis=0), np.nanmean(values[count:], axis=0)
     columns = [column.tolist() for column in (mean, healthy, low, high, p_value, alarm, t[0])]
     rows: Iterable[tuple[Any, ...]] = zip(names, *columns, strict=True)
-    deviations = [Deviation(*row, *(unit_of(row[0], task) if task else ())) for row in rows]
+    of_task = [(*unit_of(name, task), is_contact_known(task)) if task else () for name in names]
+    deviations = [Deviation(*row, *more) for row, more in zip(rows, of_task, strict=True)]
     order = np.argsort(-np.abs(t[0]), kind="stable")
     relative = (np.abs(t) / _own_scale(t[1:], t, count == 1)).max(1)
     extreme = int((relative[1:] * (1.0 + 1e-9) >= relative[0]).sum())

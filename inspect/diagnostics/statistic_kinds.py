@@ -150,9 +150,18 @@ OF_COMPONENTS = frozenset(
 """Kinds of statistics in the unit of the state component that their subject ends with; else m, of the controls."""
 
 
-def label_of(statistic: str) -> str:
-    """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``."""
+def is_contact_known(task: Task) -> bool:
+    """Whether contact is measured or labelled. Otherwise, statistics of these phases are those of whole episodes."""
+    return "contact" in task.observations or "contact" in task.covariates
+
+
+def label_of(statistic: str, has_contact: bool = True) -> str:
+    """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``.
+
+    has_contact: of the task.
+    """
     kind, subject, phase = statistic.split("/")
+    phase = phase if has_contact or phase not in ("contact", "free motion") else "all"
     title = KINDS[kind][0] if kind in KINDS else kind
     name, _, axis = subject.partition(" ")
     if (kind, name) == ("lag", "labels"):

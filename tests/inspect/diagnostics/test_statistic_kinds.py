@@ -32,6 +32,12 @@ def test_label(statistic: str, label: str) -> None:
     assert label_of(statistic) == label
 
 
+def test_without_contact_statistics_are_those_of_whole_episodes() -> None:
+    assert label_of("size/gps x/contact", has_contact=False) == "standard deviation of gps (x)"
+    assert label_of("level/gps x/free motion", has_contact=False) == "level of gps (x)"
+    assert label_of("noise/gps x/extreme", has_contact=False) == label_of("noise/gps x/extreme")
+
+
 @pytest.mark.parametrize(
     ("statistic", "unit", "factor"),
     [
