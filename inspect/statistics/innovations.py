@@ -104,49 +104,54 @@ def nis_of(trace: Trace) -> Array | None:
 
 def autocorrelations(trace: Trace) -> dict[tuple[str, str], float]:
     """(modality, component) -> autocorrelation at lag 1 over the counted steps; empty for too few steps."""
-    tests = _ljung_box(trace)
-    return {} if tests is None else dict(zip(_names(trace), map(float, tests[1]), strict=True))
+    return {name: r for name, (_, r, _) in _ljung_box(trace).items()}
 
 
 def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
-    """Test innovations in predicted standard deviations; statistics of independent trajectories add up."""
-    results = [tests for trace in traces if (tests := _ljung_box(trace)) is not None]
-    if not results:
+    """Test innovations in predicted standard deviations; statistics of independent trajectories add up.
+
+    Of the series that all trajectories with enough steps have.
+    """
+    results = [tests for trace in traces if (tests := _ljung_box(trace))]
+    names = [name for name in results[0] if all(name in tests for tests in results)] if results else []
+    if not names:
         return []
-    statistic = np.sum([q for q, _, _ in results], axis=0)
-    correlation = np.mean([r for _, r, _ in results], axis=0)
-    unbiased = np.stack([np.stack([r + 1.0 / steps, np.ones_like(r)], axis=-1) for _, r, steps in results])
-    _, low, high = jackknife(unbiased, lambda sums: sums[..., 0] / sums[..., 1], 1.0 - 0.05 / len(correlation))
+    values = np.array([[tests[name] for name in names] for tests in results])  # (E, S, 3)
+    statistic, correlation = values[..., 0].sum(0), values[..., 1].mean(0)
+    unbiased = np.stack([values[..., 1] + 1.0 / values[..., 2].min(1, keepdims=True), np.ones_like(values[..., 1])], -1)
+    _, low, high = jackknife(unbiased, lambda sums: sums[..., 0] / sums[..., 1], 1.0 - 0.05 / len(names))
     degrees = LAGS * len(results)
     return [
-        Whiteness(modality, component, float(r), float(a), float(b), float(q), degrees, float(chdtrc(degrees, q)))
-        for (modality, component), q, r, a, b in zip(_names(traces[0]), statistic, correlation, low, high, strict=True)
+        Whiteness(*name, float(r), float(a), float(b), float(q), degrees, float(chdtrc(degrees, q)))
+        for name, q, r, a, b in zip(names, statistic, correlation, low, high, strict=True)
     ]
 
 
-def _names(trace: Trace) -> list[tuple[str, str]]:
-    """(modality, channel) of each series of ``_ljung_box``: components of the state, or channels of the measurement."""
+def _names(trace: Trace, channels: int) -> list[tuple[str, str]]:
+    """(modality, channel) of the K m series of innovations: components of the state, or channels of the measurement."""
     if trace.innovation is None:
         return [(modality, c.name) for modality in trace.modalities for c in trace.task.components]
-    keep = np.isfinite(trace.innovation).any(0)  # (K, m)
-    return [(trace.modalities[k], f"channel {i + 1}") for k, i in np.argwhere(keep)]
+    return [(modality, f"channel {i + 1}") for modality in trace.modalities for i in range(channels)]
 
 
-def _ljung_box(trace: Trace) -> tuple[Array, Array, int] | None:
-    """Ljung-Box statistic and autocorrelation at lag 1 of each series, and the number of steps; None for too few.
+def _ljung_box(trace: Trace) -> dict[tuple[str, str], tuple[float, float, int]]:
+    """(modality, channel) -> Ljung-Box statistic, autocorrelation at lag 1 and number of steps; empty for too few.
 
-    Steps without a measurement do not count.
+    Steps without a measurement, or with an invalid variance, do not count.
     """
     pair, keep = innovations(trace), counted(trace)
     if pair is None:
-        return None
+        return {}
     nu, s = pair
-    normalised = (nu / np.sqrt(np.diagonal(s, axis1=-2, axis2=-1)))[keep].reshape(keep.sum(), -1)
-    series = [column[np.isfinite(column)] for column in normalised.T if np.isfinite(column).any()]
-    if not series or min(map(len, series)) <= 2 * LAGS:
-        return None
-    if len({len(column) for column in series}) == 1:
-        return *ljung_box(np.stack(series, axis=1)), len(series[0])
-    tests = [ljung_box(column[:, None]) for column in series]
-    q, r = (np.concatenate(parts) for parts in zip(*tests, strict=True))
-    return q, r, min(map(len, series))
+    variance = np.diagonal(s, axis1=-2, axis2=-1)
+    normalised = (nu / np.sqrt(np.where(variance > 0.0, variance, np.nan)))[keep].reshape(keep.sum(), -1)
+    columns = dict(zip(_names(trace, nu.shape[-1]), normalised.T, strict=True))
+    series = {name: column[np.isfinite(column)] for name, column in columns.items() if np.isfinite(column).any()}
+    if not series or min(map(len, series.values())) <= 2 * LAGS:
+        return {}
+    by_length = {len(column): [n for n in series if len(series[n]) == len(column)] for column in series.values()}
+    result: dict[tuple[str, str], tuple[float, float, int]] = {}
+    for steps, names in by_length.items():
+        q, r = ljung_box(np.stack([series[name] for name in names], axis=1))
+        result |= {name: (float(a), float(b), steps) for name, a, b in zip(names, q, r, strict=True)}
+    return {name: result[name] for name in series}

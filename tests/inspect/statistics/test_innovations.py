@@ -1,0 +1,52 @@
+"""Tests of innovations in measurement space, whose channels may be absent at any step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.store import open_dataset
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.inspect.statistics.innovations import autocorrelations, whiteness_of
+from beliefscope.inspect.statistics.measures import counted
+from beliefscope.inspect.trace import Trace, trace
+
+
+@pytest.fixture(scope="module")
+def run() -> Trace:
+    """White innovations of two channels of each modality; the second of haptics does not exist."""
+    with open_dataset("datasets/samples/door.h5") as data:
+        result = trace(load_checkpoint(PRETRAINED / "door-crossmodal-ekf.safetensors"), data[140])
+    innovation = np.random.default_rng(0).normal(size=(len(result), 2, 2)).astype(np.float32)
+    innovation[:, 1, 1] = np.nan
+    covariance = np.broadcast_to(np.eye(2, dtype=np.float32), (len(result), 2, 2, 2)).copy()
+    return replace(result, innovation=innovation, innovation_covariance=covariance)
+
+
+def with_variance(trace_: Trace, variance: float) -> Trace:
+    assert trace_.innovation_covariance is not None
+    covariance = trace_.innovation_covariance.copy()
+    covariance[:, 0, 1, 1] = variance
+    return replace(trace_, innovation_covariance=covariance)
+
+
+def test_channels_have_the_names_of_their_modality(run: Trace) -> None:
+    image, haptics = run.modalities
+    expected = [(image, "channel 1"), (image, "channel 2"), (haptics, "channel 1")]
+    assert [*autocorrelations(run)] == expected
+    assert [(w.modality, w.component) for w in whiteness_of([run, run])] == expected
+    assert max(map(abs, autocorrelations(run).values())) < 4.0 / np.sqrt(counted(run).sum())
+
+
+def test_channels_without_a_valid_variance_or_a_counted_step_have_no_test(run: Trace) -> None:
+    """A filter that diverges can report negative variances; the others' results are unchanged."""
+    invalid, others = with_variance(run, -1.0), autocorrelations(run)
+    image, haptics = run.modalities
+    assert autocorrelations(invalid) == {name: r for name, r in others.items() if name != (image, "channel 2")}
+    assert run.innovation is not None
+    early = run.innovation.copy()
+    early[counted(run), 1] = np.nan
+    assert (haptics, "channel 1") not in autocorrelations(replace(run, innovation=early))
+    assert [w.component for w in whiteness_of([run, invalid])] == ["channel 1", "channel 1"]
