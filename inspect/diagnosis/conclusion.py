@@ -99,13 +99,14 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
     return {name: numbers[name] for name in dict.fromkeys([*order, *numbers]) if numbers[name]}
 
 
-def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
+def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
     """What the diagnosis cannot judge: sensors without statistics, and statistics that the episodes or the record lack.
 
     Episodes of contact only lack those of free motion, for example, and records of earlier versions those of new kinds.
 
     Args:
         numbers: of ``statistics_by_subject``.
+        new: of ``missing_statistics``.
     """
     sensors = [display_name(key) for key in case.inputs.checkpoint.task.observations if key not in numbers]
     of_sensors, compared = _of_sensors(case), case.by_statistic
@@ -114,7 +115,6 @@ def unmeasured(case: Case, numbers: Mapping[str, int]) -> list[str]:
         for name, values in case.profile.statistics.items()
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
-    new = missing_statistics(case)
     outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
     return sensors + absent + (outdated if new else [])
 
@@ -279,7 +279,7 @@ def _when(case: Case, candidate: Candidate) -> str:
 
 
 def _provenance(case: Case) -> dict[str, Any]:
-    checkpoint, numbers = case.inputs.checkpoint, statistics_by_subject(case)
+    checkpoint, numbers, new = case.inputs.checkpoint, statistics_by_subject(case), missing_statistics(case)
     return {
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
@@ -289,7 +289,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "healthy_data": case.profile.data,
         "miscalibrated": _is_miscalibrated(_nees(case.profile)),
         "statistics": numbers,
-        "unmeasured": unmeasured(case, numbers),
-        "outdated": missing_statistics(case) > 0,
+        "unmeasured": unmeasured(case, numbers, new),
+        "outdated": new > 0,
         "alarm_rate": case.alarm_rate,
     }

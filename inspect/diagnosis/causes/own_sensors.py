@@ -62,7 +62,7 @@ def sensor_causes(task: Task) -> tuple[Cause, ...]:
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in KNOWN}
     result = []
     for key, modality in keys.items():
-        changed = f"*/{key}/*|*/{key} */*|lag/*|{_downstream(modality)}"
+        changed = f"{_patterns(key, '*')}|lag/*|{_downstream(modality)}"
         for kinds, mechanism, word, action in IMAGE if key in task.images else VECTOR:
             symptom = Symptom(_patterns(key, *kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
@@ -109,7 +109,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
 def _wrong_channels(task: Task, key: str) -> list[Cause]:
     """Inverted and exchanged channels of a vector sensor."""
     modality = next(name for name, keys in task.modalities.items() if key in keys)
-    changed = f"*/{key}/*|*/{key} */*|lever/*|axes/*|direction/*|{_downstream(modality)}"
+    changed = f"{_patterns(key, '*')}|lever/*|axes/*|direction/*|{_downstream(modality)}"
     name, action = display_name(key), "Check the axes and signs of the sensor."
     entries = [("sign", f"Sensor {name} has inverted channels", "inverted")]
     entries += [("axes", f"Channels of sensor {name} exchanged", "exchanged")] if task.observations[key][0] > 1 else []
@@ -204,7 +204,7 @@ def _delays(task: Task) -> tuple[Cause, ...]:
         if key in (FORCE, TORQUE):
             changed += f"|lever/{FORCE}*|axes/{FORCE}/*|size/*/contact"
         if key == FORCE and TORQUE in task.observations:
-            changed += f"|*/{TORQUE}/*|*/{TORQUE} */*"
+            changed += f"|{_patterns(TORQUE, '*')}"
         alone = HAND not in task.observations and len(task.modalities[modality]) == 1
         otherwise = (Symptom(f"lag/labels {modality}/*", -1),) if alone else ()
         symptoms = (Symptom(f"contact lag/{key}/*|reading lag/{key}/*", otherwise=otherwise),)
