@@ -135,6 +135,7 @@ def test_model_causes_change_their_module_only(
         assert isinstance(checkpoint.filter, type(originals[name].filter))
 
 
+@pytest.mark.slow
 def test_kalman_filter_causes(originals: dict[str, Checkpoint], episodes: list[Episode]) -> None:
     original = originals["crossmodal-ekf"]
     std = original.filter.statistics.mean_std("state")[1].numpy()
@@ -167,6 +168,7 @@ def test_kalman_filter_causes(originals: dict[str, Checkpoint], episodes: list[E
     np.testing.assert_allclose(np.linalg.inv(precision), product.estimate_covariance, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_particle_filter_causes(originals: dict[str, Checkpoint], episodes: list[Episode]) -> None:
     original = originals["crossmodal-pf"]
 

@@ -84,6 +84,7 @@ def test_invalid_definitions_are_rejected(change: dict[str, Any], message: str) 
         task_from_json(stored(DOOR) | change)
 
 
+@pytest.mark.slow
 def test_mutated_definitions_give_a_task_or_one_line() -> None:
     """500 definitions with a value replaced, at any depth."""
     rng = np.random.default_rng(0)

@@ -154,6 +154,7 @@ def test_lstm_has_no_dynamics_baseline() -> None:
     assert document["baselines"]["stay"]["rmse"].keys() == document["rmse"].keys()
 
 
+@pytest.mark.slow
 def test_start_offset_has_its_length_and_covariance() -> None:
     """Distances are exact, directions uniform, and the variance of each component is that of the offsets."""
     offset = StartOffset.parse("3cm,20deg", DOOR)

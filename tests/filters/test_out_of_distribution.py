@@ -96,6 +96,7 @@ def test_injected_faults_are_no_difference_of_the_data(checkpoint: Checkpoint, f
     assert data_warning(checkpoint, faulty, faults) is None
 
 
+@pytest.mark.slow
 def test_moved_frame(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
     """A single episode suffices for the warning; the alignment finds the offset without knowing it."""
     planted = np.array([0.52, -0.3])
@@ -117,12 +118,14 @@ def test_moved_frame(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
     assert same == fresh[:5]
 
 
+@pytest.mark.slow
 def test_offset_that_is_not_constant(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
     moved = [move(checkpoint.task, episode, np.array([0.4 + 0.3 * i, 0.0]), []) for i, episode in enumerate(fresh[:5])]
     with pytest.raises(BadInput, match="no constant offset"):
         align(checkpoint, moved)
 
 
+@pytest.mark.slow
 def test_pretrained_summaries_are_of_the_sample_sets() -> None:
     """As printed by the function that writes the record of new checkpoints, and available to every simulated filter."""
     for task in TASKS:

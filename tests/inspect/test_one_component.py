@@ -185,6 +185,7 @@ def test_numbers_do_not_depend_on_the_unit_of_the_state(unit: str, display: tupl
             assert row[1:] == pytest.approx(same[1:], rel=1e-3, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_every_diagnostic_is_computed_or_refused_with_a_reason(runs: list[Trace]) -> None:
     results, reasons = run_diagnostics(runs, checkpoint(task()), {name: {} for name in DIAGNOSTICS}, True)
     assert {"consistency", "errors", "maps"} <= set(results)
@@ -260,6 +261,7 @@ def test_phases_of_failures_are_groups_of_declared_covariates(runs: list[Trace])
     assert not evaluate(checkpoint(declared), [traces[0].episode]).rmse_before_contact
 
 
+@pytest.mark.slow
 def test_recording_report_export_and_page(runs: list[Trace], tmp_path: Path) -> None:
     run, filter_ = runs[0], checkpoint(task())
     maps = MapEngine(filter_, run).maps(range(0, 200, 50), size=41)

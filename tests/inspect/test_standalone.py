@@ -118,6 +118,7 @@ def test_other_observations_and_weights_have_no_effect(name: str, episode: Episo
         np.testing.assert_allclose(result.modality_mean[:, 0], result.estimate_mean, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_haptics_update_of_the_door_is_not_the_haptics_filter(name: str) -> None:
     """The shared prior carries the image: labelled as haptics, the update hides what haptics is worth."""

@@ -197,6 +197,7 @@ def test_names_of_an_earlier_version(traced: Trace) -> None:
     np.testing.assert_array_equal(loaded.effective_weights, traced.effective_weights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door-field/information-ekf", "push-field/information-ekf"])
 def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     task, filter_name = name.split("/")
@@ -211,6 +212,7 @@ def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.
         np.testing.assert_allclose(arrays_of(in_blocks)[key], values, rtol=2e-3, atol=2e-5, err_msg=key)
 
 
+@pytest.mark.slow
 def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     whole = trace(checkpoint, episode, particles=2000)
@@ -241,6 +243,7 @@ def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, mo
         trace(checkpoint, episode, particles_kept=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door/crossmodal-pf", "push-field/information-ekf"])
 def test_trace_in_parts_has_the_same_bytes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The evidence of the last filter depends on several steps."""

@@ -90,6 +90,7 @@ def test_sensor_ingredients_change_their_sensor_and_nothing_else(task: Task, epi
     np.testing.assert_array_equal(other.controls, episode.controls)
 
 
+@pytest.mark.slow
 def test_ingredients_of_the_physics_change_the_motion(task: Task) -> None:
     sensors = tuple(SENSORS)
     base = simulated(task, *sensors, steps=100)
@@ -170,6 +171,7 @@ def test_replay_has_the_object_of_the_episode(task: Task, episode: Episode) -> N
         replay(task, broken)
 
 
+@pytest.mark.slow
 def test_pushes_reach_the_puck_and_nudges_move_it() -> None:
     episodes = [simulate_push_field(11, index, 200) for index in range(4)]
     contact = np.concatenate([episode.contact for episode in episodes])

@@ -193,6 +193,7 @@ def test_pucks_are_pushed_and_the_hand_never_idles(samples: list[Episode]) -> No
         assert np.diff(moving).max() <= 10, "at most one second"
 
 
+@pytest.mark.slow
 def test_camera_sees_the_puck(samples: list[Episode]) -> None:
     """The robot occludes few rays to the puck, and kernel regression from single images locates it."""
     model = push_model()

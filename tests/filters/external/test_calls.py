@@ -58,6 +58,7 @@ def test_measurements_and_scalars_are_stored(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.extra["trace"], result.extra["trace"])
 
 
+@pytest.mark.slow
 def test_nis_of_a_matched_filter_is_one_and_of_a_wrong_noise_its_ratio() -> None:
     episodes = [vehicle.drive(seed, 400) for seed in range(5)]
 

@@ -86,6 +86,7 @@ def tune(base, episodes, settings=SETTINGS, stop=lambda: False, partial=None, lo
     )
 
 
+@pytest.mark.slow
 def test_a_selected_module_learns_and_the_others_stay(
     base: ExternalFilter, episodes: list[Episode], tmp_path: Path
 ) -> None:

@@ -230,6 +230,7 @@ def test_haptics_are_relative_to_the_hand() -> None:
     torch.testing.assert_close(after.observation[:, :, 0], before.observation[:, :, 0])
 
 
+@pytest.mark.slow
 def test_history_has_the_past_steps_and_nothing_else(filter_: InformationFilter) -> None:
     values = torch.arange(8.0).reshape(8, 1, 1)
     window = recent_steps(values, (1, 2), [])

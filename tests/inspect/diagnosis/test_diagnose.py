@@ -36,7 +36,7 @@ from beliefscope.inspect.diagnosis.deviations import (
 from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
-from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, profile_document
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -68,6 +68,7 @@ def faulty(faults: str) -> Mapping[int, Episode]:
     return {index: Faults.parse(faults).apply(episode) for index, episode in simulated(100, 6).items()}
 
 
+@pytest.mark.slow
 def test_clean_episodes_are_healthy() -> None:
     result = diagnose(checkpoint(), simulated(100, 6), profile=profile())
     assert (result.state, result.masked, result.causes) == ("healthy", False, ())
@@ -99,16 +100,17 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     assert small in healthy(replace(case, traces=case.traces[:1])).headline
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "cause", "steps"),
     [
         ("image_frozen:from=30", "image.frozen", " from step 31 (3.1 s)"),
-        pytest.param("image_frozen", "image.frozen", " at all steps", marks=pytest.mark.slow),
+        ("image_frozen", "image.frozen", " at all steps"),
         ("blackout:from=20:to=40", "image.blackout", " from step 20 to 39 (2.0 to 3.9 s)"),
-        pytest.param("force_stuck", "force.stuck", " at all steps", marks=pytest.mark.slow),
-        pytest.param("force_bias=3", "force.bias", "", marks=pytest.mark.slow),
+        ("force_stuck", "force.stuck", " at all steps"),
+        ("force_bias=3", "force.bias", ""),
         ("force_bias=8:from=30", "force.bias", " from step 30 (3.0 s)"),
-        pytest.param("force_drift=2", "force.drift", "", marks=pytest.mark.slow),
+        ("force_drift=2", "force.drift", ""),
     ],
 )
 def test_a_planted_sensor_fault_is_named_with_its_steps(faults: str, cause: str, steps: str) -> None:
@@ -124,6 +126,7 @@ def test_a_planted_sensor_fault_is_named_with_its_steps(faults: str, cause: str,
         assert first.steps == (31, 60)
 
 
+@pytest.mark.slow
 def test_a_healthy_diagnosis_states_what_was_compared() -> None:
     """Statistics by sensor, of controls, labels, models and filter; and those that these episodes cannot have."""
     result = diagnose(checkpoint(), simulated(100, 6), profile=profile())
@@ -168,6 +171,7 @@ def test_faults_after_all_steps_are_refused() -> None:
         bs.diagnose("push/crossmodal-ekf", "push", [0, 1], faults="blackout:from=100")
 
 
+@pytest.mark.slow
 def test_focused_episodes_are_compared_with_each_other() -> None:
     """Statistics that depend on the other episodes are those of the chosen ones, not of all from before."""
     episodes = dict(simulated(100, 6)) | {i: faulty("effector_offset=0.03")[i] for i in (1, 4)}
@@ -183,6 +187,7 @@ def test_focused_episodes_are_compared_with_each_other() -> None:
     assert part.grouped != [case.grouped[i] for i in chosen]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "action"), [(1, "held-out"), (3, "`beliefscope slices push --filter crossmodal-ekf`")]
 )
@@ -231,6 +236,7 @@ def test_the_number_of_processes_does_not_matter() -> None:
     assert serial.causes[0].recovered is not None
 
 
+@pytest.mark.slow
 def test_a_fault_in_some_episodes_is_examined_in_these() -> None:
     episodes = dict(simulated(100, 6)) | {i: faulty("image_frozen=5")[i] for i in (1, 4)}
     first = diagnose(checkpoint(), episodes, profile=profile()).causes[0]
@@ -238,6 +244,7 @@ def test_a_fault_in_some_episodes_is_examined_in_these() -> None:
     assert first.evidence[0].value > 0.8  # share of repeated images in these episodes, not in all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "masked"), [(0.7, True), (0.3, False)])
 def test_a_fault_is_masked_if_undoing_it_changes_little(scale: float, masked: bool) -> None:
     """The NEES is inversely proportional to the scale of the reported covariance; its limit is 2."""
@@ -254,6 +261,7 @@ def test_a_fault_is_masked_if_undoing_it_changes_little(scale: float, masked: bo
     assert (result.causes[0].cause.name, result.masked) == ("covariance.small", masked)
 
 
+@pytest.mark.slow
 def test_a_biased_module_is_named_and_its_error_recovered() -> None:
     filter_ = copy.deepcopy(checkpoint().filter)
     filter_.get_submodule("virtual_sensors.image.state").bias += 0.7
@@ -275,11 +283,12 @@ def test_a_biased_module_is_named_and_its_error_recovered() -> None:
 
 def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
     with pytest.raises(BadInput, match="no episodes"):
-        diagnose(checkpoint(), {}, profile=profile())
+        diagnose(checkpoint(), {})
     with pytest.raises(BadInput, match="no healthy record"):
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
 
 
+@pytest.mark.slow
 def test_the_alarm_rate_of_one_episode_depends_on_the_size_of_the_record() -> None:
     """One of n + 1 episodes is the most unusual one with probability 1 / (n + 1)."""
     assert [checked_alarm_rate(*sizes) for sizes in ((12, 1), (12, 2), (49, 1), (120, 1))] == [1 / 13, 0.02, 0.02, 0.02]
@@ -294,7 +303,9 @@ def test_the_alarm_rate_of_one_episode_depends_on_the_size_of_the_record() -> No
 
 def test_a_record_of_too_few_episodes_is_no_diagnosis() -> None:
     """The comparison needs ten values of a statistic, so the page must not offer a diagnosis with fewer."""
-    few, enough = ({**profile().to_json(), "episodes": count} for count in (7, 20))
+    few, enough = (
+        {**profile_document("push", "crossmodal-ekf", checkpoint().hash, None), "episodes": n} for n in (7, 20)
+    )
     filter_ = replace(checkpoint(), hash="other", name="mine", healthy_profile=few)
     assert "a healthy record of 7 episodes, fewer than the 10 needed" in (no_diagnosis(filter_) or "")
     assert no_diagnosis(replace(filter_, healthy_profile=enough)) is None

@@ -67,6 +67,7 @@ def loaded(filter_: Cart) -> Checkpoint:
     return bs.load_filter(adapter, TASK, name="cart")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("filter_", "cause"),
     [
@@ -84,11 +85,13 @@ def test_defects_of_an_external_filter_are_named(filter_: Cart, cause: str) -> N
     assert (result.causes[0].cause.name, result.causes[0].probability > 0.5) == (cause, True)
 
 
+@pytest.mark.slow
 def test_a_healthy_external_filter_is_healthy() -> None:
     profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
     assert diagnose(loaded(Cart()), {seed: drive(seed) for seed in range(20, 30)}, profile=profile).state == "healthy"
 
 
+@pytest.mark.slow
 def test_a_faulty_sensor_is_not_broken_dynamics_although_predictions_start_at_wrong_estimates() -> None:
     profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
     faulty = {seed: Faults.parse("sensor_gain=rear:factor=-1").apply(drive(seed), seed) for seed in range(50, 56)}

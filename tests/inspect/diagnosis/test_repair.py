@@ -37,6 +37,7 @@ def case(name: str, index: int, faults: str) -> tuple[Episode, Trace, float]:
     return clean, trace(checkpoint, Faults.parse(faults).apply(clean), particles=PARTICLES), bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "index", "faults"),
     [

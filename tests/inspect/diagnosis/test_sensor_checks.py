@@ -52,6 +52,7 @@ def change(task: str, faults: str, statistic: str) -> float:
     return medians(task, faults)[statistic] - medians(task)[statistic]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
     ("faults", "statistic", "amount", "tolerance"),
@@ -191,6 +192,7 @@ def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[
     return {name: float(np.mean(column)) for name, column in columns.items() if column}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_laws_of_contact_separate_gain_sign_and_axes(task: str) -> None:
     identity = (0, 1, 2)
@@ -268,6 +270,7 @@ def test_image_shift_is_registered() -> None:
     assert y == pytest.approx(-2.0, abs=0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "statistic", "steps"),
     [

@@ -88,6 +88,7 @@ def inverted(filter_: Any) -> None:
     output.bias *= -1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change", "action"),
     [
@@ -283,6 +284,7 @@ def test_the_last_modality_is_not_dropped() -> None:
     assert undo("drop image", inputs(checkpoint("unimodal-ekf")), {}) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-pf", "image-ekf"])
 def test_lost_images_are_skipped_step_by_step(name: str) -> None:
     """The pixels of a lost image do not matter, and images of other steps are used."""

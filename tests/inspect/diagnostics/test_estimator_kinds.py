@@ -45,6 +45,7 @@ def test_innovations_of_a_matched_filter_are_consistent_and_the_gate_acts() -> N
     assert gps.missed < 5
 
 
+@pytest.mark.slow
 def test_gates_that_never_act_or_always_reject_are_reported() -> None:
     never: Any = DIAGNOSTICS["innovations"](traces(outliers=True))
     assert never.modalities[0].gate == "never acts"

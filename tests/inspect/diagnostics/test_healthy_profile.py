@@ -67,6 +67,7 @@ def test_overconfidence_raises_an_alarm() -> None:
     assert first.alarms[0].value > first.alarms[0].high
 
 
+@pytest.mark.slow
 def test_one_verdict_over_20_seeds() -> None:
     rng = np.random.default_rng(1)
     reference = profile(trajectories(100, rng))
@@ -172,6 +173,7 @@ def test_malformed_profiles_are_refused(change: dict[str, Any]) -> None:
         HealthyProfile.from_json(document | change)
 
 
+@pytest.mark.slow
 def test_pretrained_profiles_belong_to_their_checkpoints() -> None:
     paths = sorted(PRETRAINED.glob(f"*{SUFFIX}"))
     assert paths

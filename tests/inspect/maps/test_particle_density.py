@@ -82,6 +82,7 @@ def divergence(particles: int, seed: int) -> float:
     return float((np.exp(exact) * (exact - posterior)).sum())
 
 
+@pytest.mark.slow
 def test_posterior_approaches_that_of_the_kalman_filter() -> None:
     few, many = (np.mean([divergence(particles, seed) for seed in range(4)]) for particles in (100, 20_000))
     assert many < 0.01
