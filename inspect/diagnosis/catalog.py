@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from beliefscope.datasets.task import Task
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.causes import (
     data,
@@ -19,6 +21,7 @@ from beliefscope.inspect.diagnosis.causes import (
     own_sensors,
     particles,
 )
+from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
 from beliefscope.inspect.statistics.reference_images import HAND
 
 CAUSES: tuple[Cause, ...] = (
@@ -47,6 +50,14 @@ def causes_of(task: Task) -> tuple[Cause, ...]:
     own = own_sensors.sensor_causes(task) + own_models.model_causes(task)
     names = {cause.name for cause in own}
     return (*(_of_modality(cause, modalities) for cause in CAUSES if cause.name not in names), *own)
+
+
+def causes_in(checkpoint: Checkpoint) -> tuple[Cause, ...]:
+    """All causes of a filter: those of its task, and those of external filters only."""
+    causes = causes_of(checkpoint.task)
+    if isinstance(checkpoint, ExternalFilter):
+        return tuple(map(in_predictions, (*causes, *external_causes(checkpoint.task))))
+    return causes
 
 
 def _of_modality(cause: Cause, modalities: Mapping[str, str]) -> Cause:

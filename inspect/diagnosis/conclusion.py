@@ -15,8 +15,17 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.filters.subsets import modalities_of
-from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.cause import SHOWN, Candidate, Cause, Diagnosis, Evidence, matches, probability_text
+from beliefscope.inspect.diagnosis.catalog import causes_in
+from beliefscope.inspect.diagnosis.cause import (
+    SHOWN,
+    Candidate,
+    Cause,
+    Diagnosis,
+    Evidence,
+    index_ranges,
+    matches,
+    probability_text,
+)
 from beliefscope.inspect.diagnosis.deviations import (
     ALARM_RATE,
     Case,
@@ -70,6 +79,8 @@ def healthy(case: Case) -> Diagnosis:
         headline = f"Healthy, though {overconfident}: {text}"
         if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
             headline = f"Always {overconfident}, also in its record; {text[:-1]}; try: {CONVENTIONS}."
+    if turned := _turned(case):
+        headline = f"{turned}; otherwise {text}"
     return Diagnosis("healthy", False, headline, (), largest, _provenance(case))
 
 
@@ -78,6 +89,22 @@ def _nees(profile: HealthyProfile) -> float:
     values = profile.statistics.get("nees/fused/all", np.empty(0))
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else 1.0
+
+
+def _turned(case: Case) -> str:
+    """The modalities with innovations of about a full turn, and the episodes; empty if there is none.
+
+    They are wrong in any filter, but a few such episodes are no significant deviation, and the record may have them.
+    """
+    found: dict[str, list[int]] = {}
+    for trace, row in zip(case.traces, case.rows, strict=True):
+        for name in (name for name, value in row.items() if name.startswith("innovation turns/") and value > 0.0):
+            found.setdefault(name.split("/")[1], []).append(trace.episode_index)
+    if not found:
+        return ""
+    names = ", ".join(map(display_name, found))
+    episodes = sorted({episode for group in found.values() for episode in group})
+    return f"Innovations of {names} not wrapped in episode{'s' * (len(episodes) > 1)} {index_ranges(episodes)}"
 
 
 def _is_miscalibrated(nees: float) -> bool:
@@ -141,7 +168,7 @@ def conclude(
         effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown
             unless it does not use the sensor.
     """
-    by_name = {cause.name: cause for cause in causes_of(case.inputs.checkpoint.task)}
+    by_name = {cause.name: cause for cause in causes_in(case.inputs.checkpoint)}
     ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
@@ -226,7 +253,9 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
         sure = bool(candidates) and candidates[0].probability >= SURE
         of_sensors = [alarm for alarm in case.alarms if alarm.statistic in _of_sensors(case)]
         symptom = (of_sensors or case.alarms)[0].text  # a faulty sensor changes the belief as well
-        action = search_action(case.inputs.checkpoint, count)
+        action = search_action(
+            case.inputs.checkpoint, count, any(s.startswith(("nis/", "particles/")) for s in case.by_statistic)
+        )
         return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {action}"
     first = candidates[0]
     similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
@@ -243,13 +272,19 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     return text if first.probability >= SURE else f"{text}; try: {first.next}"
 
 
-def search_action(checkpoint: Checkpoint, count: int) -> str:
-    """The next action without a probable cause. count: number of all episodes."""
+def search_action(checkpoint: Checkpoint, count: int, reports: bool = True) -> str:
+    """The next action without a probable cause.
+
+    count: number of all episodes. reports: whether the filter reports innovations or particles.
+    """
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
     external = isinstance(checkpoint, ExternalFilter)
+    start = f"{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search" if external else "Search"
+    if external and not reports:
+        start = f"Return its predictions and innovations, which show faults of its equations, {CONVENTIONS}, or search"
     return (
-        f"{f'{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search' if external else 'Search'} for data slices with "
+        f"{start} for data slices with "
         "large errors, in the tab Failures or with "
         f"`beliefscope slices {checkpoint.task.name} --filter {_argument(checkpoint)}{_data(checkpoint)}`."
     )
@@ -287,7 +322,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
         "healthy_data": case.profile.data,
-        "miscalibrated": _is_miscalibrated(_nees(case.profile)),
+        "miscalibrated": _is_miscalibrated(_nees(case.profile)) or bool(_turned(case)),
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers, new),
         "outdated": new > 0,

@@ -11,11 +11,9 @@ import numpy as np
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
-from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Cause
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
@@ -26,9 +24,6 @@ from beliefscope.inspect.trace import Trace
 
 ALARM_RATE = 0.02
 """Default probability that a healthy filter raises an alarm."""
-
-PREDICTING = ("dynamics", "process_noise")
-"""Components of causes in the prediction of a filter."""
 
 SHARED = 0.25
 """Mean deviation of episodes, relative to that of others, from which a fault affects them as well."""
@@ -134,15 +129,8 @@ def focus(case: Case) -> Case:
 
 
 def explain_all(case: Case) -> dict[str, Explanation]:
-    """How well each cause that can be observed explains all deviations, by name.
-
-    Predictions of an external filter start at its estimates: whatever changes these changes statistics of its dynamics.
-    """
-    checkpoint = case.inputs.checkpoint
-    causes = applicable(causes_of(checkpoint.task), case.by_statistic)
-    if isinstance(checkpoint, ExternalFilter):
-        changed = f"|{DYNAMICS}|process noise/*"
-        causes = [c if c.component in PREDICTING else replace(c, consequences=c.consequences + changed) for c in causes]
+    """How well each cause that can be observed explains all deviations, by name."""
+    causes = applicable(causes_in(case.inputs.checkpoint), case.by_statistic)
     return {cause.name: explain(cause, case.deviations) for cause in causes}
 
 

@@ -16,7 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.deviations import (
@@ -221,7 +221,7 @@ def confirm(
 
 def _undone(everything: Case, case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect | None:
     """Effect of undoing a cause; None if it cannot be undone."""
-    cause = next(cause for cause in causes_of(case.inputs.checkpoint.task) if cause.name == name)
+    cause = next(cause for cause in causes_in(case.inputs.checkpoint) if cause.name == name)
     alarms = symptoms_of(cause, case.alarms)
     hit = affected_episodes(case, alarms)
     steps = affected_steps(case, alarms[0], hit) if alarms else None

@@ -18,6 +18,7 @@ SCATTER = {
     "module bias": "module scatter",
     "contact distance": "contact distance scatter",
     "reading bias": "reading scatter",
+    "dynamics offset": "dynamics scatter",
 }
 """Kind of statistic -> kind of its distance from the other episodes: whether a bias is the same in all of them."""
 

@@ -23,6 +23,7 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
+from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
@@ -61,7 +62,7 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
     """
     has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
     if external:
-        values = reported_particle_statistics(trace) | weight_statistics(trace)
+        values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if has_truth:
@@ -224,7 +225,8 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
 def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
     """Those of ``dynamics_statistics`` from the predictions of an external filter, which start at its estimates.
 
-    The process noise is what a prediction adds to the variance of the estimate. Only of filters whose models share one
+    The process noise is what a prediction adds to the variance of the estimate. ``dynamics offset``: mean residual,
+    which differs between episodes if the filter does not estimate a bias. Only of filters whose models share one
     prediction.
     """
     mean, covariance = trace.predicted_mean, trace.predicted_covariance
@@ -235,12 +237,12 @@ def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
     predicted = task.difference(mean[1:, 0].astype(np.float64), trace.estimate_mean[:-1].astype(np.float64))[keep]
     change = task.difference(states[1:], states[:-1])[keep]
     residual = measures.wrapped(task, predicted - change)
-    more: dict[str, Array] = {}
+    more: dict[str, Array] = {"dynamics offset": residual.mean(0)}
     if covariance is not None and trace.has_covariance:
         added = covariance[1:, 0].astype(np.float64) - trace.estimate_covariance[:-1].astype(np.float64)
         variance = np.median(np.diagonal(added, axis1=-2, axis2=-1)[keep], axis=0)
         variance = np.where(variance > 0.0, variance, np.nan)
-        more = {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
+        more |= {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
     return _of_changes(task, residual, change, more, states.std(0))
 
 

@@ -23,6 +23,8 @@ KINDS = {
     "module scatter": ("variation of the bias between episodes of the measurement model", True, 0.05),
     "dynamics bias": ("bias of the dynamics model", False, 2e-5),
     "dynamics error": ("error of the dynamics model", True, 0.02),
+    "dynamics offset": ("mean error of the dynamics model", False, 2e-5),
+    "dynamics scatter": ("variation between episodes of the mean error of the dynamics model", False, 2e-5),
     "dynamics nis": ("squared error over process noise of the dynamics model", True, 0.05),
     "dynamics slope": ("slope of the predicted on the true change", False, 0.02),
     "dynamics spread": ("error beyond bias and slope of the dynamics model", True, 0.02),
@@ -30,6 +32,12 @@ KINDS = {
     "beta logit": ("log-odds of beta", False, 0.05),
     "beta spread": ("variation of the log-odds of beta", True, 0.05),
     "beta contact": ("change of the log-odds of beta with contact", False, 0.02),
+    "measurement noise": ("standard deviation of the measurement noise", True, 0.02),
+    "innovation std": ("predicted standard deviation of the innovations", True, 0.02),
+    "innovation share": ("predicted standard deviation of the innovations{of} relative to all others", True, 0.02),
+    "innovation bias": ("mean of the innovations, in standard deviations,", False, 0.05),
+    "innovation turns": ("share of innovations of about a full turn", False, 0.002),
+    "updates": ("share of steps with an accepted measurement", False, 0.02),
     "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
     "fusion variance": ("log-ratio of the used variance to that of the fusion rule", False, 0.02),
     "fusion mean": ("distance of the estimate from the fusion rule", True, 1.0),
@@ -117,12 +125,13 @@ RISING = frozenset(
         "opposed",
         "inverted",
         "exchanged",
+        "innovation turns",
         "reading noise",
         "reading scatter",
         "contact distance error",
         "contact distance scatter",
     }
-    | {"module error", "module scatter", "dynamics error"}
+    | {"module error", "module scatter", "dynamics error", "dynamics scatter"}
 )
 """Kinds of statistics whose decrease is no sign of a fault."""
 
@@ -144,7 +153,7 @@ OF_KINDS = {
 
 OF_COMPONENTS = frozenset(
     {f"module {value}" for value in ("bias", "error", "std", "spread", "scatter")}
-    | {f"dynamics {value}" for value in ("bias", "error", "spread")}
+    | {f"dynamics {value}" for value in ("bias", "error", "spread", "offset", "scatter")}
     | {"process noise", "offset"}
 )
 """Kinds of statistics in the unit of the state component that their subject ends with; else m, of the controls."""

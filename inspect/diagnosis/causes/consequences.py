@@ -4,7 +4,7 @@ from __future__ import annotations
 
 FILTER = (
     "error/*|angle error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*|ancestors/*"
-    "|offspring/*"
+    "|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*"
 )
 """Belief of the filter, and the use of its modules."""
 

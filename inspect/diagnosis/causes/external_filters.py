@@ -1,0 +1,80 @@
+"""Causes in external Kalman filters that report predictions and innovations, by the names of the modalities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from beliefscope.datasets.task import Task, display_name
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER
+
+DRIFT = Cause(
+    "dynamics.drift",
+    "Dynamics biased, differently in each episode",
+    (Symptom("dynamics scatter/*"),),
+    "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "nis", "offset", "spread"))
+    + f"|process noise/*|{FILTER}",
+    "Check the bias of its inputs that the filter should estimate.",
+    prior=0.1,
+)
+"""A bias that the filter does not estimate, such as that of a gyroscope."""
+
+
+def external_causes(task: Task) -> tuple[Cause, ...]:
+    """Causes that show in the predictions and innovations of an external filter only."""
+    return (DRIFT, *(cause for modality in task.modalities for cause in _of_updates(modality)))
+
+
+def in_predictions(cause: Cause) -> Cause:
+    """A cause with its consequences in the predictions of an external filter, which start at its estimates."""
+    changed = {
+        "dynamics": "dynamics offset/*|dynamics scatter/*",
+        "process_noise": "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "offset", "slope", "spread")),
+    }
+    others = f"{DYNAMICS}|process noise/*"
+    return replace(cause, consequences=f"{cause.consequences}|{changed.get(cause.component, others)}")
+
+
+def _of_updates(modality: str) -> tuple[Cause, ...]:
+    """Causes in the updates with a modality.
+
+    Where modalities are always used together, only the mean of their measurement noise is known, and the innovations
+    show whose it is.
+    """
+    name = display_name(modality)
+    sizes: tuple[tuple[str, Literal[-1, 1]], ...] = (("small", -1), ("large", 1))
+    noise = (
+        Cause(
+            f"measurement_noise.{modality}.{size}",
+            f"Measurement noise of {name} too {size}",
+            (
+                Symptom(
+                    f"measurement noise/{modality}/*",
+                    direction,
+                    otherwise=(Symptom(f"innovation share/{modality}/*", direction),),
+                ),
+                Symptom("measurement noise//*", direction, optional=True),
+            ),
+            FILTER,
+            f"Compare R of {name} with the variance of its readings.",
+        )
+        for size, direction in sizes
+    )
+    return (
+        *noise,
+        Cause(
+            f"innovation.{modality}.turns",
+            f"Innovations of {name} not wrapped",
+            (Symptom(f"innovation turns/{modality}/*"),),
+            FILTER,
+            "Wrap differences of angles to half a turn on either side of 0.",
+        ),
+        Cause(
+            f"updates.{modality}.missing",
+            f"Updates with {name} missing",
+            (Symptom(f"updates/{modality}/*", -1),),
+            FILTER,
+            "Check the gate of the filter, and when it updates.",
+        ),
+    )

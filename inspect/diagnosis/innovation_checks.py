@@ -1,0 +1,119 @@
+"""Statistics of the innovations that an external filter reports in the spaces of its measurements."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from beliefscope.inspect.statistics.innovations import innovations
+from beliefscope.inspect.statistics.measures import Array, Mask, counted
+from beliefscope.inspect.trace import Trace
+
+MIN_STEPS = 10
+"""Minimum number of steps of a statistic."""
+
+LARGEST_LOGARITHM = 30.0
+"""Largest absolute logarithm of a standard deviation; larger ones are those of a covariance without full rank."""
+
+TURN_AND_NOISE = 6.6
+"""Range of the readings of an angle, rad: a turn, and some noise."""
+
+TURN = 1.0
+"""Largest distance of an innovation from a full turn, rad, that counts as one."""
+
+
+def innovation_statistics(trace: Trace) -> dict[str, float]:
+    """``KIND/MODALITY/all`` -> value, of innovations nu with covariance S.
+
+    ``innovation bias``, by channel: mean of nu, in standard deviations. ``innovation std``: geometric mean of the
+    standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a
+    channel of angles. ``updates``: share of
+    steps with an accepted innovation. ``measurement noise``: geometric mean of the standard deviations R
+    (``measurement_noise``). ``innovation share``: innovation std relative to that of all modalities, where the
+    measurement noise of some is unknown.
+    """
+    if trace.innovation is None or (pair := innovations(trace)) is None:
+        return {}
+    keep = counted(trace)
+    nu, variance = pair[0][keep], np.diagonal(pair[1][keep], axis1=-2, axis2=-1)
+    used = np.isfinite(nu) & (variance > 0.0)
+    deviation = np.sqrt(np.where(used, variance, np.nan))
+    accepted = _accepted(trace, np.isfinite(nu), keep)
+    values: dict[str, float] = {}
+    for k, modality in enumerate(trace.modalities):
+        values[f"updates/{modality}/all"] = float(np.mean(accepted[:, k].any(-1)))
+        channels = np.flatnonzero(used[:, k].sum(0) >= MIN_STEPS)
+        if not len(channels):
+            continue
+        for i in channels:
+            at = used[:, k, i]
+            values[f"innovation bias/{modality} {i + 1}/all"] = float((nu[at, k, i] / deviation[at, k, i]).mean())
+        values[f"innovation std/{modality}/all"] = float(np.exp(np.nanmean(np.log(deviation[:, k, channels]))))
+        if len(angles := [i for i in _angles(trace, modality, nu.shape[-1]) if i in channels]):
+            turns = np.any(np.abs(np.abs(nu[:, k, angles]) - 2.0 * math.pi) < TURN, axis=-1)
+            values[f"innovation turns/{modality}/all"] = float(turns[used[:, k].any(-1)].mean())
+    noise = measurement_noise(trace)
+    if "measurement noise//all" in noise:
+        sizes = {m: values[name] for m in trace.modalities if (name := f"innovation std/{m}/all") in values}
+        mean = math.exp(np.mean(np.log([*sizes.values()])))
+        values |= {f"innovation share/{m}/all": size / mean for m, size in sizes.items()}
+    return values | noise
+
+
+def _angles(trace: Trace, modality: str, count: int) -> list[int]:
+    """Channels of a modality whose readings may be angles in rad: all within one turn, from -pi or from 0."""
+    keys = trace.task.modalities.get(modality, ())
+    readings = [trace.episode.observations[key] for key in keys]
+    if any(values.ndim != 2 for values in readings) or not readings:
+        return []
+    values = np.concatenate(readings, axis=1)[:, :count]
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    within = (high - low < TURN_AND_NOISE) & (low > -TURN_AND_NOISE / 2.0) & (high < TURN_AND_NOISE)
+    return np.flatnonzero(within).tolist()
+
+
+def measurement_noise(trace: Trace) -> dict[str, float]:
+    """``measurement noise/MODALITY/all``: geometric mean of the standard deviations R of each modality's channels.
+
+    An update has ``det P / det P+ = det S / det R``, whatever the measurement function, and several updates in turn
+    have the product of these ratios: the logarithms of the steps are linear equations for those of the modalities. For
+    modalities that are always used together, they only give the mean of all, ``measurement noise//all``.
+
+    Only of filters whose modalities share one prediction and whose beliefs have a covariance of full rank.
+    """
+    pair, predicted = innovations(trace), trace.predicted_covariance
+    if pair is None or predicted is None or trace.predicted_mean is None or not trace.has_covariance:
+        return {}
+    if not np.allclose(trace.predicted_mean, trace.predicted_mean[:, :1], rtol=1e-3, equal_nan=True):
+        return {}
+    nu, s = pair
+    used = _accepted(trace, np.isfinite(nu))
+    s = np.where(used[..., :, None] & used[..., None, :], s, np.eye(nu.shape[-1]))
+    before, after = predicted[:, 0].astype(np.float64), trace.estimate_covariance.astype(np.float64)
+    (sign_s, of_s), (sign, of_before), (sign_after, of_after) = map(np.linalg.slogdet, (s, before, after))
+    channels = used.sum(-1)  # (T, K)
+    keep = counted(trace) & (sign_s > 0).all(-1) & (sign > 0) & (sign_after > 0) & (channels.sum(-1) > 0)
+    total = 0.5 * (of_s.sum(-1) - of_before + of_after)  # sum of the channels' log standard deviations
+    if keep.sum() < MIN_STEPS:
+        return {}
+    values = _by_modality(trace.modalities, channels[keep].astype(np.float64), total[keep])
+    if len(values) < (channels[keep] > 0).any(0).sum():
+        values[""] = float(np.mean(total[keep] / channels.sum(-1)[keep]))
+    return {f"measurement noise/{m}/all": math.exp(v) for m, v in values.items() if abs(v) < LARGEST_LOGARITHM}
+
+
+def _accepted(trace: Trace, used: Mask, keep: Mask | slice = slice(None)) -> Mask:
+    """The used channels (T, K, m) without rejected measurements."""
+    return used if trace.accepted is None else used & (trace.accepted[keep] != 0.0)[..., None]
+
+
+def _by_modality(modalities: tuple[str, ...], channels: Array, total: Array) -> dict[str, float]:
+    """Modality -> mean logarithm of its standard deviations, if the equations determine it."""
+    gram = channels.T @ channels
+    eigenvalues, vectors = np.linalg.eigh(gram)
+    free = vectors[:, eigenvalues < 1e-6 * max(float(eigenvalues[-1]), 1e-12)]
+    solution = np.linalg.lstsq(channels, total, rcond=1e-6)[0]
+    determined = np.abs(free).max(1, initial=0.0) < 1e-3
+    measured = channels.sum(0) > 0
+    return {m: float(v) for m, v, yes in zip(modalities, solution, determined & measured, strict=True) if yes}

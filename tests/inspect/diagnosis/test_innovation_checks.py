@@ -1,0 +1,206 @@
+"""Measurement noise, unwrapped innovations and missing updates of an external Kalman filter, from what it reports."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import beliefscope as bs
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.trace import Trace
+
+Array = NDArray[np.float64]
+
+STD = {"radar": (0.3, 0.02), "compass": (0.05,)}
+"""Range and bearing of the origin, m and rad; heading, rad."""
+
+BIAS = 0.05
+"""Standard deviation of the bias of the turn rate, rad/s."""
+
+COMPONENTS = (
+    *(bs.Component(name, "m") for name in ("x", "y")),
+    bs.Component("heading", "rad", wraps=True),
+    bs.Component("bias", "rad/s"),
+)
+
+
+def task(every: int) -> bs.Task:
+    """every: steps between two readings of the radar."""
+    return bs.Task(
+        name="boat",
+        components=COMPONENTS,
+        observations={key: (len(std),) for key, std in STD.items()},
+        modalities={key: (key,) for key in STD},
+        masks={"radar": "radar_reading"},
+        covariates={"radar_reading": bs.Covariate("boolean")},
+        control_size=2,
+        dt=0.1,
+    )
+
+
+def wrapped(angle: Any) -> Any:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def sail(seed: int, every: int = 4) -> bs.Episode:
+    """The controls are speed in m/s and turn rate in rad/s, with a bias."""
+    rng, steps = np.random.default_rng(seed), 100
+    turn = np.repeat(rng.normal(0.0, 0.6, steps // 10), 10)
+    heading = rng.uniform(-math.pi, math.pi) + 0.1 * np.cumsum(turn)
+    place = rng.normal(0.0, 4.0, 2) + 0.1 * np.cumsum(2.0 * np.stack([np.cos(heading), np.sin(heading)], 1), 0)
+    bias = np.full(steps, rng.normal(0.0, BIAS))
+    controls = np.stack([2.0 + rng.normal(0.0, 0.1, steps), turn + bias + rng.normal(0.0, 0.02, steps)], 1)
+    clean = {"radar": np.stack([np.hypot(*place.T), np.arctan2(*place.T[::-1])], 1), "compass": heading[:, None]}
+    readings = {key: values + STD[key] * rng.standard_normal(values.shape) for key, values in clean.items()}
+    readings["radar"][:, 1], readings["compass"] = wrapped(readings["radar"][:, 1]), wrapped(readings["compass"])
+    mask = (np.arange(steps) % every == 0).astype(np.float32)
+    states = np.stack([*place.T, wrapped(heading), bias], 1)
+    return bs.Episode(
+        task(every), states, controls, readings, seed=seed, split="test", covariates={"radar_reading": mask}
+    )
+
+
+class Boat:
+    """An extended Kalman filter with one update after another. Its arguments are the defects."""
+
+    H: ClassVar = {"compass": np.eye(4)[2:3]}
+
+    def __init__(
+        self, radar: float = 1.0, compass: float = 1.0, wraps: bool = True, has_bias: bool = True, updates: float = 1.0
+    ) -> None:
+        self.factors, self.wraps, self.has_bias, self.updates = (
+            {"radar": radar, "compass": compass},
+            wraps,
+            has_bias,
+            updates,
+        )
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        self.mean, self.covariance, self.random = mean, covariance, np.random.default_rng(0)
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        x, y, heading, bias = self.mean
+        speed, c, s = 0.1 * controls[0], math.cos(heading), math.sin(heading)
+        turn = 0.1 * (controls[1] - (bias if self.has_bias else 0.0))
+        mean, jacobian = np.array([x + speed * c, y + speed * s, heading + turn, bias]), np.eye(4)
+        jacobian[:2, 2], jacobian[2, 3] = (-speed * s, speed * c), -0.1 if self.has_bias else 0.0
+        noise = np.diag([1e-4, 1e-4, 4e-6, 1e-8])
+        covariance = jacobian @ self.covariance @ jacobian.T + noise
+        predicted, innovations, covariances = (mean, covariance), [], []
+        for key in STD:
+            if not observations.get(f"{key}.present", True) or (
+                key == "compass" and self.random.random() > self.updates
+            ):
+                innovations.append(None)
+                covariances.append(None)
+                continue
+            h, expected = self.measure(key, mean)
+            innovation = observations[key] - expected
+            if self.wraps:
+                innovation[-1] = wrapped(innovation[-1])
+            r = self.factors[key] * np.diag(np.square(STD[key]))
+            size = h @ covariance @ h.T + r
+            gain = covariance @ h.T @ np.linalg.inv(size)
+            mean, covariance = mean + gain @ innovation, covariance - gain @ size @ gain.T
+            innovations.append(innovation)
+            covariances.append(size)
+        mean[2] = wrapped(mean[2])
+        self.mean, self.covariance = mean, covariance
+        return {
+            "estimate_mean": mean,
+            "estimate_covariance": covariance,
+            "predicted_mean": np.stack([predicted[0]] * 2),
+            "predicted_covariance": np.stack([predicted[1]] * 2),
+            "innovation": innovations,
+            "innovation_covariance": covariances,
+        }
+
+    def measure(self, key: str, mean: Array) -> tuple[Array, Array]:
+        """Jacobian and value of a measurement."""
+        if key == "compass":
+            return self.H["compass"], mean[2:3]
+        x, y = mean[:2]
+        r = math.hypot(x, y)
+        return np.array([[x / r, y / r, 0, 0], [-y / r**2, x / r**2, 0, 0]]), np.array([r, math.atan2(y, x)])
+
+
+def loaded(filter_: Boat, every: int = 4) -> Checkpoint:
+    adapter = bs.Adapter(filter_, batched=False, modalities=tuple(STD), initial_std=(0.5, 0.5, 0.1, BIAS))
+    return bs.load_filter(adapter, task(every), name="boat")
+
+
+def run(filter_: Boat, every: int = 4) -> Trace:
+    return bs.trace(loaded(filter_, every), [sail(3, every)])
+
+
+@cache
+def profile() -> HealthyProfile:
+    return profile_of(loaded(Boat()), [sail(seed) for seed in range(30)], "boat")
+
+
+@pytest.mark.parametrize(("radar", "compass"), [(1.0, 1.0), (0.1, 1.0), (5.0, 0.3)])
+def test_measurement_noise_is_that_of_the_filter_whatever_its_measurement_functions(
+    radar: float, compass: float
+) -> None:
+    """``det P / det P+ = det S / det R``: the compass alone at three of four steps, and both at the others."""
+    values = innovation_statistics(run(Boat(radar, compass)))
+    expected = math.sqrt(radar * STD["radar"][0] * STD["radar"][1])
+    assert values["measurement noise/radar/all"] == pytest.approx(expected, rel=1e-3)  # the trace has float32
+    assert values["measurement noise/compass/all"] == pytest.approx(math.sqrt(compass) * STD["compass"][0], rel=1e-3)
+
+
+def test_modalities_that_are_always_used_together_have_a_mean_measurement_noise() -> None:
+    values = innovation_statistics(run(Boat(), every=1))
+    product = STD["radar"][0] * STD["radar"][1] * STD["compass"][0]
+    assert values["measurement noise//all"] == pytest.approx(product ** (1 / 3), rel=1e-3)
+    assert "measurement noise/radar/all" not in values
+    shares = [values[f"innovation share/{key}/all"] for key in STD]
+    assert math.prod(shares) == pytest.approx(1.0)
+
+
+def test_rejected_measurements_change_no_covariance() -> None:
+    whole = run(Boat())
+    gated = replace(whole, accepted=np.where(np.isfinite(whole.innovation).any(-1), 1.0, np.nan))
+    assert innovation_statistics(gated) == innovation_statistics(whole)
+    gated.accepted[:, 1] = 0.0
+    assert innovation_statistics(gated)["updates/compass/all"] == 0.0
+
+
+def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None:
+    assert innovation_statistics(replace(run(Boat()), innovation=None, innovation_covariance=None)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("filter_", "cause"),
+    [
+        (Boat(radar=0.1), "measurement_noise.radar.small"),
+        (Boat(compass=10.0), "measurement_noise.compass.large"),
+        (Boat(wraps=False), "innovation.compass.turns"),
+        (Boat(has_bias=False), "dynamics.drift"),
+        (Boat(updates=0.5), "updates.compass.missing"),
+    ],
+)
+def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:
+    result = diagnose(loaded(filter_), {seed: sail(seed) for seed in range(40, 50)}, profile=profile())
+    assert result.causes, result.headline
+    assert (result.causes[0].cause.name, result.causes[0].probability > 0.5) == (cause, True), result.headline
+
+
+@pytest.mark.slow
+def test_innovations_that_are_not_wrapped_are_mentioned_although_the_record_has_them_too() -> None:
+    unwrapped = loaded(Boat(wraps=False))
+    record = profile_of(unwrapped, [sail(seed) for seed in range(30)], "boat")
+    result = diagnose(unwrapped, {seed: sail(seed) for seed in range(46, 52)}, profile=record)
+    assert (result.state, result.provenance["miscalibrated"]) == ("healthy", True)
+    assert result.headline.startswith("Innovations of compass not wrapped in episodes 47, 49, 50; otherwise no ")
