@@ -12,12 +12,14 @@ from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.label_checks import common_part, label_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.trace import Trace
 
 SCATTER = {
     "module bias": "module scatter",
     "contact distance": "contact distance scatter",
     "reading bias": "reading scatter",
+    "reading lag": "reading lag scatter",
     "dynamics offset": "dynamics scatter",
 }
 """Kind of statistic -> kind of its distance from the other episodes: whether a bias is the same in all of them."""
@@ -43,6 +45,15 @@ def episode_statistics(trace: Trace, checkpoint: Checkpoint, sensors: Mapping[st
     return {**values, **sensors, **label_statistics(trace), **model_statistics(trace, checkpoint)}
 
 
+def _distance(values: Array, kind: str) -> Array:
+    """Distances of values (E,) from their mean; of delays, from the range between none and twice the mean.
+
+    An estimated delay is less exact if it is large. A bias is a delay or its opposite, by the direction of the motion.
+    """
+    mean = float(np.nanmean(values))
+    return np.maximum(np.abs(values - mean) - (abs(mean) if kind == "reading lag" else 0.0), 0.0)
+
+
 def with_scatter(
     profile: HealthyProfile, rows: Sequence[Mapping[str, float]]
 ) -> tuple[HealthyProfile, list[dict[str, float]]]:
@@ -57,8 +68,8 @@ def with_scatter(
         if kind not in SCATTER or np.isfinite(values).sum() < 2:
             continue
         name = f"{SCATTER[kind]}/{rest}"
-        columns[name] = np.abs(healthy - np.nanmean(healthy))
-        for row, value in zip(result, np.abs(values - np.nanmean(values)).tolist(), strict=True):
+        columns[name] = _distance(healthy, kind)
+        for row, value in zip(result, _distance(values, kind).tolist(), strict=True):
             row[name] = value
     for name in (name for name in profile.statistics if name.partition("/")[0] in COMMON):
         finite = np.array([row[name] for row in rows if np.isfinite(row.get(name, np.nan))])

@@ -80,7 +80,10 @@ class HealthyProfile:
             }
             data, images = str(document["data"]), document.get("reference")
             reference = None if images is None else Reference.from_json(images)
-            readings = tuple(ReadingModel.from_json(model) for model in document.get("readings", ()))
+            models = (
+                model for model in document.get("readings", ()) if "biases" in model
+            )  # others have other features
+            readings = tuple(map(ReadingModel.from_json, models))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"the healthy record is malformed: {error!r}") from None
         for name, values in rows.items():

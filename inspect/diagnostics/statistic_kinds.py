@@ -57,6 +57,7 @@ KINDS = {
     "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
     "contact lag": ("delay{of} in steps behind the labelled contact", False, 0.5),
     "reading lag": ("delay{of} in steps behind the labels", False, 0.5),
+    "reading lag scatter": ("variation between episodes of the delay{of} in steps behind the labels", False, 0.5),
     "reading bias": ("error{of} against the value expected from the labels, relative to its noise,", False, 0.3),
     "reading scatter": ("variation{of} of its error between episodes, relative to its noise,", False, 0.3),
     "reading gain": ("slope{of} on the value expected from the labels", False, 0.05),
@@ -128,6 +129,7 @@ RISING = frozenset(
         "innovation turns",
         "reading noise",
         "reading scatter",
+        "reading lag scatter",
         "contact distance error",
         "contact distance scatter",
     }

@@ -47,12 +47,12 @@ DIGITS = 4
 
 @dataclass(frozen=True)
 class ComparedReadings:
-    """Readings and expected readings (T, A) of an episode, the steps (T,) that have both, and the noise (A,)."""
+    """Readings and expected readings (T, A) of an episode, the steps (T,) that have both, and their model."""
 
     readings: Array
     expected: Array
     present: Mask
-    noise: Array
+    model: ReadingModel
 
     def pairs(self, delay: int = 0) -> tuple[Array, Array]:
         """Readings (S, A) and the readings expected ``delay`` steps earlier, of at most ``MAX_PAIRS`` steps."""
@@ -68,10 +68,10 @@ class ComparedReadings:
         """
         readings, expected = self.pairs(delay)
         if len(readings) < MIN_STEPS:
-            return np.full((2, len(self.noise), len(self.noise)), np.nan)
+            return np.full((2, readings.shape[1], readings.shape[1]), np.nan)
         signs = np.array([1.0, -1.0])[:, None, None, None]
         difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
-        return np.asarray(np.square(difference / self.noise).mean(1))
+        return np.asarray(np.square(difference / self.model.noise).mean(1))
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ class ReadingModel:
         coefficients: (F, A) in units of the readings by those of the ``features``.
         constants: (A,) in units of the readings.
         noise: (A,) standard deviations of the readings from the expected ones, in episodes to which it is not fitted.
+        biases: (A,) standard deviations between these episodes of the mean of this noise, beyond those of its average.
         angles: A indices of the state components that the channels measure modulo a turn, such as a heading; -1 for
             channels that do not wrap around.
     """
@@ -93,6 +94,7 @@ class ReadingModel:
     coefficients: Array
     constants: Array
     noise: Array
+    biases: Array
     angles: tuple[int, ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -107,6 +109,7 @@ class ReadingModel:
             "coefficients": [rounded(row) for row in self.coefficients],
             "constants": rounded(self.constants),
             "noise": rounded(self.noise),
+            "biases": rounded(self.biases),
             "angles": list(self.angles),
         }
 
@@ -114,12 +117,14 @@ class ReadingModel:
     def from_json(cls, value: Mapping[str, Any]) -> ReadingModel:
         """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
         channels = tuple(int(channel) for channel in value["channels"])
-        names = ("coefficients", "constants", "noise")
-        coefficients, constants, noise = (np.array(value[name], dtype=np.float64) for name in names)
-        shapes = (*coefficients.shape[1:], *constants.shape, *noise.shape, len(value["angles"]))
-        if coefficients.ndim != 2 or shapes != (len(channels),) * 4:
+        names = ("coefficients", "constants", "noise", "biases")
+        coefficients, constants, noise, biases = (np.array(value[name], dtype=np.float64) for name in names)
+        shapes = (*coefficients.shape[1:], *constants.shape, *noise.shape, *biases.shape, len(value["angles"]))
+        if coefficients.ndim != 2 or shapes != (len(channels),) * 5:
             raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}")
-        return cls(str(value["key"]), channels, coefficients, constants, noise, tuple(map(int, value["angles"])))
+        return cls(
+            str(value["key"]), channels, coefficients, constants, noise, biases, tuple(map(int, value["angles"]))
+        )
 
     def compare(self, episode: Episode) -> ComparedReadings:
         """The readings of an episode beside the expected ones; angles are not wrapped.
@@ -129,8 +134,8 @@ class ReadingModel:
         inputs, present = features(episode), _steps(episode, self.key)
         readings = _unwrapped(episode, readings_of(episode, self.key)[:, self.channels], self.angles)
         if inputs.shape[1] != len(self.coefficients):
-            return ComparedReadings(readings, readings, np.zeros_like(present), self.noise)
-        return ComparedReadings(readings, inputs @ self.coefficients + self.constants, present, self.noise)
+            return ComparedReadings(readings, readings, np.zeros_like(present), self)
+        return ComparedReadings(readings, inputs @ self.coefficients + self.constants, present, self)
 
 
 def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
@@ -156,23 +161,46 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
             continue
         mean_x, mean_y = (np.mean([row[i].mean(0) for row in rows], axis=0) for i in (0, 1))
         rows = [(x - mean_x, y - mean_y) for x, y in rows]
-        halves = (_left(rows[1::2], _ridge(rows[::2])), _left(rows[::2], _ridge(rows[1::2])))
-        total = np.asarray(sum(len(y) * y.var(0) for _, y in rows))
-        channels = np.flatnonzero(halves[0] + halves[1] < (1.0 - EXPLAINED) * total)
+        coefficients, errors = _best_of_prefixes(rows, _prefixes(episodes[0]))
+        count = np.array([len(y) for _, y in rows], dtype=np.float64)
+        left, total = (np.asarray(sum(len(y) * y.var(0) for y in parts)) for parts in (errors, [y for _, y in rows]))
+        channels = np.flatnonzero(left < (1.0 - EXPLAINED) * total)
         if len(channels):
-            coefficients = _ridge(rows)[:, channels]
+            coefficients = coefficients[:, channels]
             constants = mean_y[channels] - mean_x @ coefficients
-            noise = np.sqrt((halves[0] + halves[1])[channels] / sum(len(y) for _, y in rows))
-            noise = np.maximum(noise, SMALLEST_NOISE * np.sqrt(total[channels] / sum(len(y) for _, y in rows)))
+            variance = np.maximum(left, SMALLEST_NOISE**2 * total)[channels] / count.sum()
+            between = np.var([error.mean(0)[channels] for error in errors], axis=0) - variance * (1.0 / count).mean()
             explained = tuple(channels.tolist())
             turning = tuple(angles[channel] for channel in explained)
-            result.append(ReadingModel(key, explained, coefficients, constants, noise, turning))
+            noise, biases = np.sqrt(variance), np.sqrt(np.maximum(between, 0.0))
+            result.append(ReadingModel(key, explained, coefficients, constants, noise, biases, turning))
     return tuple(result)
 
 
 def readings_of(episode: Episode, key: str) -> Array:
     """(T, d) readings of a vector sensor, or the controls."""
     return (episode.controls if key == CONTROL else episode.observations[key]).astype(np.float64)
+
+
+def _best_of_prefixes(rows: Sequence[tuple[Array, Array]], prefixes: Sequence[int]) -> tuple[Array, list[Array]]:
+    """(F, d) coefficients of the first features only, as many as leave the least of each channel in other episodes.
+
+    Further features, fitted to noise, would change the expected readings from step to step. Also returns the errors
+    (S, d) of each episode, from coefficients that are fitted to half of the others.
+    """
+    order = [*range(1, len(rows), 2), *range(0, len(rows), 2)]
+    results = []
+    for prefix in prefixes:
+        x = [(inputs[:, :prefix], readings) for inputs, readings in rows]
+        errors = [*_errors(x[1::2], _ridge(x[::2])), *_errors(x[::2], _ridge(x[1::2]))]
+        coefficients = np.zeros((prefixes[-1], rows[0][1].shape[1]))
+        coefficients[:prefix] = _ridge(x)
+        results.append((sum(len(e) * e.var(0) for e in errors), coefficients, [errors[i] for i in np.argsort(order)]))
+    best = np.argmin([left for left, _, _ in results], axis=0)  # (d,)
+    columns = np.arange(len(best))
+    chosen = np.stack([coefficients for _, coefficients, _ in results])[best, :, columns].T
+    errors = [np.stack(parts)[best, :, columns].T for parts in zip(*(errors for _, _, errors in results), strict=True)]
+    return chosen, errors
 
 
 def _ridge(rows: Sequence[tuple[Array, Array]]) -> Array:
@@ -184,9 +212,9 @@ def _ridge(rows: Sequence[tuple[Array, Array]]) -> Array:
     return np.asarray(np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y) / scale[:, None])
 
 
-def _left(rows: Sequence[tuple[Array, Array]], coefficients: Array) -> Array:
-    """(d,) sum of squares within episodes that the coefficients leave unexplained."""
-    return np.asarray(sum(len(y) * (y - x @ coefficients).var(0) for x, y in rows))
+def _errors(rows: Sequence[tuple[Array, Array]], coefficients: Array) -> list[Array]:
+    """What the coefficients leave of the readings (S, d) of each episode."""
+    return [y - x @ coefficients for x, y in rows]
 
 
 def _angle_of(episodes: Sequence[Episode], key: str, channel: int) -> int:
@@ -219,7 +247,7 @@ def _steps(episode: Episode, key: str) -> Mask:
 
 
 def features(episode: Episode) -> Array:
-    """(T, F): the state, its first and second changes by step, these in the body frame, and all of them in contact.
+    """(T, F): the state, its first and second changes by step, all in the body frame, and all of them in contact.
 
     Angles that wrap have their cosine and sine as well, rotations are their matrices. Changes are zero where they are
     unknown, at the first two steps.
@@ -231,11 +259,18 @@ def features(episode: Episode) -> Array:
     others, frames = _values(task, states)
     vectors = np.concatenate([others, change, second], axis=1)
     in_frames = (frames[:, :, None] * vectors[:, None]).reshape(len(states), -1)
-    all_ = np.concatenate([vectors, frames, in_frames], axis=1)
+    all_ = np.concatenate([others, frames, change, second, in_frames], axis=1)
     if CONTACT not in task.covariates:
         return all_
     contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
     return np.concatenate([all_, contact, contact * all_], axis=1)
+
+
+def _prefixes(episode: Episode) -> tuple[int, ...]:
+    """Numbers of features: those of the state; with its changes; and all."""
+    others, frames = _values(episode.task, episode.states[:1].astype(np.float64))
+    states = others.shape[1] + frames.shape[1]
+    return states, states + 2 * episode.states.shape[1], features(episode).shape[1]
 
 
 def _values(task: Task, states: Array) -> tuple[Array, Array]:

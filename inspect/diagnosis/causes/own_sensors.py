@@ -83,14 +83,15 @@ def _patterns(key: str, *kinds: str) -> str:
 def _changed_readings(key: str, modality: str) -> list[Cause]:
     """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio."""
     of = partial(_patterns, key)
-    scaled = of(*BIASED, "change", "size", "noise", "reading lag", "reading noise", "reading scatter")
+    delays = ("reading lag", "reading lag scatter")
+    scaled = of(*BIASED, *delays, "change", "size", "noise", "reading noise", "reading scatter")
     noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
     gain = (Symptom(of("size"), 0, otherwise=(Symptom(of("reading gain"), 0),)), Symptom(of("noise"), 0))
     rough = f"{scaled}|{of('roughness', 'stuck')}"
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor."),
-        ("bias", "biased", bias, of(*BIASED), "Tare the sensor."),
+        ("bias", "biased", bias, of(*BIASED, *delays), "Tare the sensor."),
         ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor."),
     )
     return [
