@@ -90,7 +90,7 @@ def correlation_coverage(level: float, size: int, repeats: int = REPEATS, seed: 
 
 
 def main() -> None:
-    print("| quantity | spread between trajectories | " + " | ".join(f"{n}" for n in SIZES) + " |")
+    print("| quantity | spread between episodes | " + " | ".join(f"{n}" for n in SIZES) + " |")
     print("| --- | --- " + "| --- " * len(SIZES) + "|")
 
     def row(name: str, spread: str, values: list[float]) -> None:
@@ -108,7 +108,7 @@ def main() -> None:
         [percentile_coverage("lognormal", 0.8, n) for n in SIZES],
     )
 
-    print("\nStandard deviation of log NEES/n between trajectories, by layer and phase:\n")
+    print("\nStandard deviation of log NEES/n between episodes, by layer and phase:\n")
     for path in sorted(PROFILES.glob("*.profile.json")):
         rows = json.loads(path.read_text())["healthy_profile"]["statistics"]
         nees = [np.array([v for v in row if v]) for name, row in rows.items() if name.startswith("nees/")]

@@ -101,7 +101,7 @@ def main(source: Path, folder: Path, names: Sequence[str]) -> None:
                 consistency.setdefault(name, []).append((values, phases(episodes)))
         for key, value in squares.items():
             pooled.setdefault(key, []).append(value)
-        print(f"division {division}, {len(episodes)} trajectories", *rows(squares, names), sep="\n  ")
+        print(f"division {division}, {len(episodes)} episodes", *rows(squares, names), sep="\n  ")
         first = trained(place, names[0])
         if isinstance(first, InformationFilter):
             print("".join(f"  share of haptics, {key}: {v}\n" for key, v in haptics_share(first, episodes).items()))

@@ -35,7 +35,7 @@ def find_task(task: str | Task) -> Task:
     if task in TASKS:
         return TASKS[task]
     unknown = unknown_name("task", task, TASKS)
-    raise BadInput(f"{unknown} Give a task of your own as path/to/file.py:NAME.")
+    raise BadInput(f"{unknown} Give a task of your own as FILE.py:NAME.")
 
 
 def stored_task(stored: Any, given: Iterable[Task] = ()) -> Task:
@@ -68,7 +68,7 @@ def load_task(task: str | Task) -> Task:
     """Return a built-in task by name, or a user-defined one. Runs user code: not for names read from files.
 
     Args:
-        task: name, definition, or ``path/to/file.py:NAME`` or ``package.module:NAME``, which runs the file once.
+        task: name, definition, or ``FILE.py:NAME`` or ``MODULE:NAME``, which runs the file once.
 
     Raises:
         BadInput: for an unknown name, a file that cannot be run, or a missing or inconsistent task.

@@ -222,7 +222,7 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if "beliefscope" not in metadata:
         raise BadInput(
             f"{str(path)!r} is a safetensors file, but not a checkpoint of Beliefscope; weights of an external filter "
-            f"belong to its build function: FILE.py:NAME@{path}"
+            f"belong to its build function: FILE.py:FUNCTION@{path}"
         )
     try:
         header = read_json(metadata["beliefscope"])

@@ -128,5 +128,5 @@ def is_path(text: str) -> bool:
 
 
 def is_code(text: str) -> bool:
-    """Whether the text names a build function: ``package.module:build`` or ``path/to/file.py:build[@WEIGHTS]``."""
+    """Whether the text names a build function: ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION[@WEIGHTS]``."""
     return ":" in text and (not text.endswith(".safetensors") or "@" in text.rpartition(":")[2])

@@ -19,7 +19,7 @@ def open_filter(task: str | Task, text: str) -> Checkpoint:
     """Load a pretrained filter by name, a checkpoint by path, or an external filter by its build function.
 
     Args:
-        task: definition, name or ``path/to/file.py:NAME``. A checkpoint file needs only the name.
+        task: definition, name or ``FILE.py:NAME``. A checkpoint file needs only the name.
 
     Raises BadInput if there is none, or if it is for another task.
     """
@@ -56,7 +56,7 @@ def _reduce(external: ExternalFilter) -> tuple[Any, ...]:
     if not is_code(external.source):
         raise BadInput(
             f"{external.source} was built in Python and cannot run in other processes: use one worker, or load it by "
-            "its build function, path/to/file.py:NAME"
+            "its build function, FILE.py:FUNCTION"
         )
     return load_external, (external.source, external.task)
 

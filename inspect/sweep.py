@@ -245,7 +245,7 @@ def _probabilities(trace: Trace, n: int) -> dict[str, measures.Array]:
 
 
 def find_checkpoints(patterns: Iterable[str]) -> tuple[Path, ...]:
-    """Checkpoints that match glob patterns; ``FILE.py:FUNCTION`` and ``package.module:function`` are external filters.
+    """Checkpoints that match glob patterns; ``FILE.py:FUNCTION`` and ``MODULE:FUNCTION`` are external filters.
 
     Raises BadInput for a pattern that none matches.
     """
@@ -277,7 +277,7 @@ def source_of(checkpoint: Checkpoint) -> str:
     if not is_code(checkpoint.source):
         raise BadInput(
             f"filter {checkpoint.name!r} was built in Python, and a sweep runs in other processes: give its build "
-            "function, path/to/file.py:NAME"
+            "function, FILE.py:FUNCTION"
         )
     return checkpoint.source
 

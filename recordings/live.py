@@ -113,7 +113,7 @@ class LiveRecorder:
 
         Args:
             checkpoint: of a Beliefscope filter.
-            task: of any other filter: name, ``path/to/file.py:NAME`` or definition.
+            task: of any other filter: name, ``FILE.py:NAME`` or definition.
             modalities: names of the K measurement models (docs/own_filter.md).
             folder: created if missing. ``beliefscope serve --workspace W`` shows runs in ``W/live``.
             start: belief before step 0, N = 1; standardised for a checkpoint, else in SI units. Default: NaN.

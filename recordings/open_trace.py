@@ -19,7 +19,7 @@ from beliefscope.recordings.probe import RecordingProbe
 def open_trace(path: Path, task: str = "") -> Trace:
     """Read a trace. Raises BadInput if the file is damaged or the trace is not of the task.
 
-    task: name or ``path/to/file.py:NAME``, with its functions; by default the definition in the file, without.
+    task: name or ``FILE.py:NAME``, with its functions; by default the definition in the file, without.
     """
     return _open(_read_recording if path.suffix in (".rrd", SUFFIX) else load_trace, path, task)
 

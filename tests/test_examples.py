@@ -157,7 +157,7 @@ def test_filters_of_unknown_tasks_are_rejected(folder: Path) -> None:
     code, _, err = run("trace", "ball", "--filter", "crossmodal-ekf", "-o", folder / "no.trace")
     assert code == 2
     assert "task 'ball' does not exist. Available: door, " in err
-    assert "Give a task of your own as path/to/file.py:NAME." in err
+    assert "Give a task of your own as FILE.py:NAME." in err
     _, _, err = run("evaluate", SPEC, "--filter", folder / "own.safetensors")
     assert "Task 'ball' has no sample set. Give its data with --data." in err
 

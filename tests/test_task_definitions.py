@@ -160,7 +160,7 @@ def run(*arguments: object) -> str:
 
 def test_code_is_requested_in_one_line(folder: Path, tmp_path: Path) -> None:
     assert "task 'rover' does not exist" in run("collect", "rover", "-o", tmp_path / "a.h5")
-    assert "path/to/file.py:NAME" in run("collect", "rover", "-o", tmp_path / "a.h5")
+    assert "FILE.py:NAME" in run("collect", "rover", "-o", tmp_path / "a.h5")
     other = tmp_path / "other.py"
     other.write_text(
         DEFINITION.replace('Component("y", "m")', 'Component("z", "m")').replace('("x", "y")', '("x", "z")')

@@ -102,7 +102,7 @@ def output_file(
 DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=...)
 CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=...)
 TRACE_FILTER = option(
-    "NAME|CHECKPOINT|MODULE:BUILD",
+    "NAME|CHECKPOINT|FILE.py:FUNCTION",
     "Filter that produced the traces. Default: the pretrained filter with the traces' checkpoint hash.",
     "",
 )
@@ -118,20 +118,20 @@ TASK_OF_FILES = option(
 OPTIONS: dict[str, Any] = {
     "task": argument(
         "TASK",
-        "Task: door, push, door-field, push-field, push-real, a variant, or path/to/file.py:NAME (docs/data.md). Where "
-        "--data or a checkpoint contains the definition of your own task, its name is enough.",
+        "Task: door, push, door-field, push-field, push-real, a variant, or your own as FILE.py:NAME (docs/data.md). Its "
+        "name is enough if --data or a checkpoint contains its definition.",
     ),
     "filter": option(
-        "NAME|CHECKPOINT|MODULE:BUILD",
+        "NAME|CHECKPOINT|FILE.py:FUNCTION",
         "Pretrained filter such as crossmodal-pf, path of a .safetensors file, or external filter given by its "
-        "build function: package.module:build or path/to/file.py:build (docs/own_filter.md).",
+        "build function: FILE.py:FUNCTION or MODULE:FUNCTION (docs/own_filter.md).",
     ),
     "data": option(
         "FILE.h5|DIR",
         "Episodes: a Beliefscope HDF5 file or a supported external format (docs/data.md). "
         "Default: the sample set of the task.",
     ),
-    "skip_bad": flag("Skip unusable trajectories and report the reasons.", "--skip-bad", default=...),
+    "skip_bad": flag("Skip unusable episodes and report the reasons.", "--skip-bad", default=...),
     "episode": option("I", "Index of the episode in the data set. Default: the first held-out one.", parser=integer(0)),
     "faults": option(
         "FAULTS",
@@ -351,7 +351,7 @@ def check_workspace(workspace: Path) -> None:
 
 
 def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Dataset:
-    """Open a data set (default: the sample set) and print skipped trajectories. Raises BadInput for another task."""
+    """Open a data set (default: the sample set) and print skipped episodes. Raises BadInput for another task."""
     from beliefscope.datasets.store import open_dataset, sample_path
     from beliefscope.datasets.task_json import difference
 

@@ -1,4 +1,4 @@
-"""Import of user code by name, as in uvicorn: ``path/to/file.py:NAME`` or ``package.module:NAME``."""
+"""Import of user code by name, as in uvicorn: ``FILE.py:NAME`` or ``MODULE:NAME``."""
 
 from __future__ import annotations
 

@@ -146,11 +146,11 @@ class EpisodeFile(Dataset):
     def _find_groups(self) -> list[h5py.Group]:
         count = sum(1 for name in self._file if name.startswith("trajectory"))
         if not count:
-            raise BadInput(f"{self.path} has no trajectory; expected groups 'trajectory0', 'trajectory1', ...")
+            raise BadInput(f"{self.path} has no episode; expected groups 'trajectory0', 'trajectory1', ...")
         groups = [self._file.get(f"trajectory{i}") for i in range(count)]
         for i, group in enumerate(groups):
             if not isinstance(group, h5py.Group):
-                raise BadInput(f"{self.path} has {count} trajectories, but no group 'trajectory{i}'.")
+                raise BadInput(f"{self.path} has {count} episodes, but no group 'trajectory{i}'.")
         return groups
 
     def _usable_groups(self) -> list[h5py.Group]:
@@ -167,9 +167,7 @@ class EpisodeFile(Dataset):
                 continue
             groups.append(group)
         if not groups:
-            raise BadInput(
-                f"{self.path} has no usable trajectory." + (f" First error: {skipped[0]}" if skipped else "")
-            )
+            raise BadInput(f"{self.path} has no usable episode." + (f" First error: {skipped[0]}" if skipped else ""))
         self.skipped = tuple(skipped)
         return groups
 

@@ -174,7 +174,7 @@ class PaperDataset(Dataset):
                     continue
                 usable.append(source)
             if not usable:
-                raise BadInput(f"{path} has no usable trajectory. First error: {skipped[0]}")
+                raise BadInput(f"{path} has no usable episode. First error: {skipped[0]}")
             self._sources, self.summaries, self.skipped = usable, tuple(summaries), tuple(skipped)
         except BaseException:
             self.close()
@@ -201,7 +201,7 @@ class PaperDataset(Dataset):
                 raise read_error(path, error) from None
             if layout is None:
                 keys = ", ".join("/".join(layout.keys) for layout in LAYOUTS)
-                raise BadInput(f"{path} has no trajectory of a known layout; expected the keys {keys}.")
+                raise BadInput(f"{path} has no episode of a known layout; expected the keys {keys}.")
             layouts.setdefault(layout.task, (layout, path))
             if len(layouts) > 1:
                 (task, (_, first)), (other, (_, second)) = layouts.items()

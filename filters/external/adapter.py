@@ -77,7 +77,7 @@ class Adapter:
         initial_std: (n,) standard deviations of the first belief, in its units and order; by default the root of 0.1.
         inputs: observations by key and controls, SI units -> arguments of the module.
         modalities: names of its K measurement models, in order.
-        task: its task, by name, ``path/to/file.py:NAME`` or definition; needed by a server if not given elsewhere.
+        task: its task, by name, ``FILE.py:NAME`` or definition; needed by a server if not given elsewhere.
         batched: whether it filters N trajectories at once. Otherwise it runs once per trajectory, without the axis N.
         log_likelihood: states (C, n) in its units and the inputs of one step, with N = 1 -> (K, C) log-likelihoods of
             its measurement models, or (K + 1, C) with the fused one last; enables likelihood maps.

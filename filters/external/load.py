@@ -328,10 +328,10 @@ class ExternalFilter(Checkpoint):
 def load_external(
     source: str, task: str | Task = "", given: Sequence[Task] = (), named: Sequence[Task] = ()
 ) -> ExternalFilter:
-    """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` returns when called without arguments.
+    """The filter that ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION`` returns when called without arguments.
 
-    The global generators of torch and NumPy are seeded for the call. ``NAME@FILE.safetensors`` loads weights into the
-    module, such as those of a fine-tuning.
+    The global generators of torch and NumPy are seeded for the call. ``FILE.py:FUNCTION@FILE.safetensors`` loads
+    weights into the module, such as those of a fine-tuning.
 
     Args:
         task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.

@@ -20,7 +20,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 
 
 def save_weights(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Write the tensors of a module, for ``FILE.py:NAME@PATH``."""
+    """Write the tensors of a module, for ``FILE.py:FUNCTION@PATH``."""
     write_atomically(path, save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}))
 
 

@@ -61,7 +61,7 @@ class SliceInfo:
 
 EXTERNAL = (
     "The torch module of an external filter is fine-tuned on the command line, on a loss of its own file "
-    "(docs/finetune.md): beliefscope finetune {task} --filter FILE.py:NAME --data DATA -o tuned.safetensors"
+    "(docs/finetune.md): beliefscope finetune {task} --filter FILE.py:FUNCTION --data DATA -o tuned.safetensors"
 )
 """Why an external filter has no choices."""
 

@@ -43,7 +43,7 @@ class Cell:
     """One filter to be trained once, or a given one, and everything its results depend on.
 
     Attributes:
-        task: its name. source: the argument of ``load_task``: the name, or ``path/to/file.py:NAME``.
+        task: its name. source: the argument of ``load_task``: the name, or ``FILE.py:NAME``.
         filter, seed, preset: names of the architecture and of the training schedule.
         data: file or folder of the episodes. data_hash: of the episodes. skip_bad: whether to skip unusable ones.
         given: checkpoint file or build function of a filter that is evaluated only; empty for one to be trained.
@@ -130,7 +130,7 @@ def study_cells(
     """All cells by task, then seed, then filter, so that a table of all filters is available early.
 
     Args:
-        tasks: names or ``path/to/file.py:NAME``; empty for all with training data. filters: names to train; empty for
+        tasks: names or ``FILE.py:NAME``; empty for all with training data. filters: names to train; empty for
             all of each task. Checkpoint files and build functions are evaluated only, with the tasks that they fit.
         files: data of tasks without a sample dataset, or in its place. note: receives each skipped trajectory.
 

@@ -145,7 +145,7 @@ class Consistency(Diagnostic):
             rows.append((*head, *values, entry.miscalibration, entry.nll, entry.assessment))
             components = zip(entry.rmse * scale, entry.sharpness * scale, entry.crps * scale, strict=True)
             error_rows.append((*head, *(float(value) for component in components for value in component)))
-        columns = ("layer", "phase", "trajectories", "steps", "NEES/n", "95 % interval", "NIS/n", "95 % coverage")
+        columns = ("layer", "phase", "episodes", "steps", "NEES/n", "95 % interval", "NIS/n", "95 % coverage")
         tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "result"), tuple(rows))]
         names = [
             f"{with_unit(c.label, unit)}: {quantity}"

@@ -131,11 +131,11 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """``No alarm`` or the largest alarms. One trajectory alone is no evidence of a fault and at most unusual."""
+        """``No alarm`` or the largest alarms. One episode alone is no evidence of a fault and at most unusual."""
         if self.trajectories == 1 and 1.0 / (self.healthy_trajectories + 1) > SINGLE_SIGNIFICANCE:
-            return "Too few trajectories (1; at least 2 needed) to compare with the healthy record."
+            return "Too few episodes (1; at least 2 needed) to compare with the healthy record."
         alarms = self.alarms
-        record = f"the healthy record of {self.healthy_trajectories} trajectories"
+        record = f"the healthy record of {self.healthy_trajectories} episodes"
         if not alarms:
             return f"No alarm: within {record}."
         more = f", and {len(alarms) - 3} more" if len(alarms) > 3 else ""

@@ -30,7 +30,7 @@ def too_few(trajectories: int) -> str | None:
     """Why there is no interval, or None."""
     if trajectories >= MIN_TRAJECTORIES:
         return None
-    return f"too few trajectories ({trajectories}; at least {MIN_TRAJECTORIES} needed)"
+    return f"too few episodes ({trajectories}; at least {MIN_TRAJECTORIES} needed)"
 
 
 def jackknife(sums: Array, statistic: Callable[[Array], Array], level: float = LEVEL) -> tuple[Array, Array, Array]:

@@ -50,10 +50,10 @@ def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkp
 
     Args:
         source: ``TASK/NAME`` of a pretrained filter, such as ``door/crossmodal-pf``; the path of a ``.safetensors``
-            checkpoint; a build function, ``path/to/file.py:build`` or ``package.module:build``, each also with
-            ``@weights.safetensors``; or your own filter: a
-            ``torch.nn.Module``, any other object, a function, or an ``Adapter`` of one (docs/own_filter.md).
-        task: of a filter of your own: its definition, name or ``path/to/file.py:NAME``.
+            checkpoint; a build function, ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION``, each also with
+            ``@weights.safetensors``; or your own filter: a ``torch.nn.Module``, any other object, a function, or an
+            ``Adapter`` of one (docs/own_filter.md).
+        task: of a filter of your own: its definition, name or ``FILE.py:NAME``.
         name: of a filter of your own, for display; default: its class or function.
 
     Raises BadInput if there is no such filter, or if it does not fit the task.

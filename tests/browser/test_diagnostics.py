@@ -154,7 +154,7 @@ def test_held_out_diagnostic_is_a_job_that_can_be_cancelled(open_page: Any) -> N
     assert article.locator("> .verdict").text_content() == "Cancelled."
     article.get_by_role("button", name="Try again").click()
     page.until(READY, timeout=180.0)
-    assert "oo few trajectories" not in article.locator("> .verdict").text_content()  # a note of single trajectories
+    assert "oo few episodes" not in article.locator("> .verdict").text_content()  # a note of single episodes
     assert page.page.locator(".curves figure").count() == 0
     page.screenshot("held-out")
 

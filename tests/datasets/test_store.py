@@ -229,8 +229,8 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
         (attribute("/", "version", 9), "version 9 of the layout; this release reads version 1"),
         (attribute("/", "definition", "{"), "attribute 'definition' is not the JSON of a task: Expecting property"),
         (attribute("/", "definition", "{}"), "incomplete definition of a task: KeyError: 'name'"),
-        (lambda f: [f.__delitem__(k) for k in list(f)], "has no trajectory"),
-        (without("trajectory0"), r"has 1 trajectories, but no group 'trajectory0'"),
+        (lambda f: [f.__delitem__(k) for k in list(f)], "has no episode"),
+        (without("trajectory0"), r"has 1 episodes, but no group 'trajectory0'"),
         (replaced("trajectory1", np.zeros(3)), "no group 'trajectory1'"),
         (without("trajectory1/states"), r"trajectory1 has no 'states'\. It has: contact, controls"),
         (without("trajectory1/observations/force"), "trajectory1 has no 'observations/force'"),
@@ -293,7 +293,7 @@ def test_unusable_trajectories_are_skipped(path: Path, edit: Edit, message: str)
         assert [episode.digest() for episode in data] == [random_episode(1, "val").digest()]
         assert [(s.index, s.split) for s in data.summaries] == [(0, "val")]
     edit_file(path, without("trajectory1/controls"))
-    with pytest.raises(BadInput, match=r"has no usable trajectory\. First error: "):
+    with pytest.raises(BadInput, match=r"has no usable episode\. First error: "):
         open_dataset(path, skip_bad=True)
 
 

@@ -8,7 +8,7 @@ from beliefscope.recordings.report.command_lines import serve_command
 def change(
     before: str = opt.argument(
         "BEFORE",
-        "Path of a .safetensors file, name of a pretrained filter such as crossmodal-ekf, or path/to/file.py:build.",
+        "Pretrained filter such as crossmodal-ekf, path of a .safetensors file, or external filter, FILE.py:FUNCTION.",
     ),
     after: str = opt.argument("AFTER", "As BEFORE."),
     task: str | None = opt.option("TASK", "Task of both filters. Required for two names.", None),

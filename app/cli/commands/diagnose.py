@@ -34,7 +34,7 @@ def diagnose(
         "DATA", "Clean data; the healthy record is measured on their held-out episodes.", None
     ),
     profile_filter: str | None = opt.option(
-        "NAME|CHECKPOINT|MODULE:BUILD", "Filter that runs over --profile-from. Default: --filter.", None
+        "NAME|CHECKPOINT|FILE.py:FUNCTION", "Filter that runs over --profile-from. Default: --filter.", None
     ),
     repair: int | None = opt.option(
         "I", "Also find the smallest repair of the largest failure of this episode.", None, parser=opt.integer(0)

@@ -81,8 +81,8 @@ def finetune(
     target: str = opt.argument("TASK|CHECKPOINT", "Task of the filter given with --filter, or .safetensors file."),
     output: Path = opt.CHECKPOINT,
     filter: str | None = opt.option(
-        "NAME|FILE",
-        "Name of a pretrained filter, .safetensors file, or build function of an external filter (FILE.py:NAME).",
+        "NAME|CHECKPOINT|FILE.py:FUNCTION",
+        "Pretrained filter, path of a .safetensors file, or external filter given by its build function.",
         None,
     ),
     learning: Learning,
@@ -101,7 +101,7 @@ def finetune(
     that the training data lack: occluded or noisy images or, for a filter without images, noisy haptics.
 
     To fine-tune an external filter, define loss(module, windows) in the file of its build function. CHECKPOINT then has
-    the weights of the torch module, and FILE.py:NAME@CHECKPOINT is the fine-tuned filter.
+    the weights of the torch module, and FILE.py:FUNCTION@CHECKPOINT is the fine-tuned filter.
 
     \b
     Examples:

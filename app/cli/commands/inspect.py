@@ -20,7 +20,7 @@ def inspect(
     """Run diagnostics on traces of a filter.
 
     Prints the verdict and tables of every applicable diagnostic, and why the others do not apply. Several traces of
-    one filter count as independent trajectories, which allows bounds and confidence intervals. Details:
+    one filter count as independent episodes, which allows bounds and confidence intervals. Details:
     docs/diagnostics.md.
 
     \b

@@ -9,7 +9,7 @@ from beliefscope.datasets.errors import BadInput
 def mcp(
     task: list[str] | None = opt.option("FILE.py:NAME", "Custom task. Repeatable.", None),
     data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes. Repeatable.", None),
-    filter: list[str] | None = opt.option("CHECKPOINT|MODULE:BUILD", "Additional filter. Repeatable.", None),
+    filter: list[str] | None = opt.option("CHECKPOINT|FILE.py:FUNCTION", "Additional filter. Repeatable.", None),
     url: str = opt.option("URL", "Address of a running dashboard, for the links in answers.", ""),
     particles: int = 300,
     seed: int = 0,

@@ -29,7 +29,7 @@ def serve(
     task: list[str] | None = opt.option("FILE.py:NAME", "Custom task to serve. Repeatable.", None),
     data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes to serve. Repeatable.", None),
     filter: list[str] | None = opt.option(
-        "CHECKPOINT|MODULE:BUILD",
+        "CHECKPOINT|FILE.py:FUNCTION",
         "Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, if it "
         "has none, for that of --task or --data.",
         None,

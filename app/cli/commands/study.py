@@ -18,8 +18,8 @@ def study(
         "TASK", "Task to study. Repeatable. Default: door, push and the tasks with --data.", None, "--task"
     ),
     filters: list[str] | None = opt.option(
-        "NAME|FILE",
-        "Filter to train; or a checkpoint (.safetensors) or build function (FILE.py:NAME) to evaluate only. "
+        "NAME|CHECKPOINT|FILE.py:FUNCTION",
+        "Filter to train; or a checkpoint or an external filter, given by its build function, to evaluate only. "
         "Repeatable. Default: all filters of each task.",
         None,
         "--filter",

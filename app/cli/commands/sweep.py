@@ -5,8 +5,9 @@ from beliefscope.app.cli import console, options as opt
 
 def sweep(
     checkpoints: list[str] = opt.option(
-        "GLOB|MODULE:BUILD",
-        "Checkpoints, such as 'runs/*.safetensors' (quoted), or an external filter. Repeatable.",
+        "GLOB|FILE.py:FUNCTION",
+        "Checkpoints, such as 'runs/*.safetensors' (quoted), or an external filter, given by its build function. "
+        "Repeatable.",
         ...,
         "--checkpoints",
     ),

@@ -184,7 +184,7 @@ def test_held_out_episodes(server: TestClient) -> None:
     assert answer.status_code == 200, answer.text
     assert answer.json()["trajectories"] == 64
     (table, *_) = answer.json()["tables"]
-    trajectories = table["columns"].index("trajectories")
+    trajectories = table["columns"].index("episodes")
     assert max(row[trajectories] for row in table["rows"]) == 64
 
 

@@ -234,7 +234,7 @@ def test_no_usable_trajectory(tmp_path: Path) -> None:
     write(path, push, 1)
     with h5py.File(path, "r+") as file:
         del file["trajectory0/contact"]
-    with pytest.raises(BadInput, match=r"has no usable trajectory\. First error: .* has no 'contact'"):
+    with pytest.raises(BadInput, match=r"has no usable episode\. First error: .* has no 'contact'"):
         open_dataset(path, skip_bad=True)
 
 
@@ -252,7 +252,7 @@ def test_invalid_file_in_the_folder(tmp_path: Path) -> None:
         open_dataset(tmp_path)
     with h5py.File(tmp_path / "b.hdf5", "w") as file:
         file["trajectory0/numbers"] = np.arange(3)
-    with pytest.raises(BadInput, match=r"b\.hdf5 has no trajectory of a known layout; expected the keys object-state/"):
+    with pytest.raises(BadInput, match=r"b\.hdf5 has no episode of a known layout; expected the keys object-state/"):
         open_dataset(tmp_path)
 
 

@@ -90,7 +90,7 @@ def tune(base, episodes, settings=SETTINGS, stop=lambda: False, partial=None, lo
 def test_a_selected_module_learns_and_the_others_stay(
     base: ExternalFilter, episodes: list[Episode], tmp_path: Path
 ) -> None:
-    """The weights are loaded by ``FILE.py:NAME@WEIGHTS``; an interrupted run ends with the same ones."""
+    """The weights are loaded by ``FILE.py:FUNCTION@WEIGHTS``; an interrupted run ends with the same ones."""
     tensors, record = tune(base, episodes)
     save_weights(tensors, tmp_path / "tuned.safetensors")
     tuned = load_external(f"{base.source}@{tmp_path / 'tuned.safetensors'}")
@@ -130,4 +130,4 @@ def test_invalid_losses_modules_and_weights_are_refused(
 
 def test_page_names_the_command() -> None:
     external = load_external("examples/04_own_filter.py:build")
-    assert "beliefscope finetune door --filter FILE.py:NAME" in (choices(external).why_not or "")
+    assert "beliefscope finetune door --filter FILE.py:FUNCTION" in (choices(external).why_not or "")

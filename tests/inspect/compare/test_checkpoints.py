@@ -216,7 +216,7 @@ def test_numbers_equal_evaluate(data: Dataset) -> None:
             assert errors == pytest.approx(metrics.rmse, rel=1e-4)
             beliefs = [getattr(rows[key], side) for key in ("nll", "nees", "coverage95")]
             assert beliefs == pytest.approx([metrics.nll, metrics.nees, metrics.coverage95], rel=1e-3)
-    assert result.verdict == "No verdict: too few trajectories (2; at least 5 needed)."
+    assert result.verdict == "No verdict: too few episodes (2; at least 5 needed)."
     assert not result.improvements()
     assert not result.regressions()
 

@@ -118,7 +118,7 @@ def test_order_of_modalities_is_irrelevant() -> None:
 
 def test_few_trajectories_qualify_the_verdict() -> None:
     result = consistency(plant.simulated(1))
-    assert "Too few trajectories (1; at least 5 needed)" in result.verdict
+    assert "Too few episodes (1; at least 5 needed)" in result.verdict
     assert result.alarms == ()
     assert math.isnan(result.entry("fused").interval[1])
     assert result.nees.shape == (130, 3)
@@ -250,7 +250,7 @@ def test_a_pretrained_filter_is_compared_with_its_healthy_record() -> None:
     assert result.healthy is not None
     assert {d.statistic for d in result.healthy.deviations} >= {"nees/fused/all", "nis/image/all"}
     # A single trace may raise an alarm; bench/false_alarms.py measures how often five episodes do.
-    assert f"the healthy record of {result.healthy.healthy_trajectories} trajectories" in result.verdict
+    assert f"the healthy record of {result.healthy.healthy_trajectories} episodes" in result.verdict
     assert not any(alarm.startswith("NEES/n") for alarm in result.alarms)
     # An overconfident copy: the same errors, standard deviations a fifth.
     planted = replace(

@@ -86,7 +86,7 @@ def test_single_traces_have_no_intervals() -> None:
     result = conventions(traces(MIRRORED)[:1], filter_())
     assert np.isnan(result.low).all()
     assert result.alarms == ()
-    assert "No intervals: too few trajectories (1; at least 5 needed)." in result.verdict
+    assert "No intervals: too few episodes (1; at least 5 needed)." in result.verdict
     assert len(result.tables()[0].columns) == 2 + 2 * len(result.errors)
 
 

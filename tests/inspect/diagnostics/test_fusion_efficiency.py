@@ -83,7 +83,7 @@ def test_efficiency_of_known_errors(correlation: float, trajectories: int) -> No
     assert total.independent[0] == pytest.approx(optimum(0.0), rel=1e-5)
     assert total.efficiency[0] == pytest.approx(optimum(correlation) / achieved, rel=1e-4)
     if trajectories == 1:
-        assert "No interval and no reasons: too few trajectories (1" in result.verdict
+        assert "No interval and no reasons: too few episodes (1" in result.verdict
         best = next(curve for curve in result.curves() if curve.name == "best combination").values
         keep = measures.counted(traces[0])
         assert np.sqrt(np.square(best[keep]).mean()) == pytest.approx(100.0 * optimum(correlation), rel=1e-4)

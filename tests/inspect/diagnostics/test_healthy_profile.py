@@ -62,7 +62,7 @@ def test_overconfidence_raises_an_alarm() -> None:
     results = [compare(reference, trajectories(5, rng, factor=9.0)) for _ in range(20)]
     assert sum(bool(result.alarms) for result in results) >= 19
     first = results[0]
-    assert first.sentence.startswith("Alarm, compared with the healthy record of 100 trajectories: NEES/n of ")
+    assert first.sentence.startswith("Alarm, compared with the healthy record of 100 episodes: NEES/n of ")
     assert all(alarm.statistic.startswith("nees/") for result in results for alarm in result.alarms)
     assert first.alarms[0].value > first.alarms[0].high
 
@@ -89,7 +89,7 @@ def test_p_value_of_one_trajectory_is_its_rank() -> None:
     small = HealthyProfile("", 40, None, {"nees/fused/all": reference.statistics["nees/fused/all"][:40]})
     result = compare(small, [{"nees/fused/all": 1e6}])
     assert result.alarms == ()
-    assert result.sentence == "Too few trajectories (1; at least 2 needed) to compare with the healthy record."
+    assert result.sentence == "Too few episodes (1; at least 2 needed) to compare with the healthy record."
 
 
 def test_one_deviating_trajectory_is_unusual_but_no_alarm_in_words() -> None:
@@ -97,7 +97,7 @@ def test_one_deviating_trajectory_is_unusual_but_no_alarm_in_words() -> None:
     reference = HealthyProfile("", 99, None, {"autocorrelation/haptics hinge_y/all": healthy})
     single, repeated = (compare(reference, count * [{"autocorrelation/haptics hinge_y/all": 0.9}]) for count in (1, 5))
     subject = "autocorrelation at lag 1 of the innovations of haptics (hinge y) is 0.9"
-    compared = f"compared with the healthy record of 99 trajectories: {subject}"
+    compared = f"compared with the healthy record of 99 episodes: {subject}"
     assert single.sentence.startswith(f"Unusual episode (as up to 1 in 50 healthy ones), {compared}")
     assert repeated.sentence.startswith(f"Alarm, {compared}")
 
@@ -116,7 +116,7 @@ def test_no_alarm_reads_well() -> None:
     rng = np.random.default_rng(4)
     result = compare(profile(trajectories(60, rng)), trajectories(5, rng))
     assert isinstance(result, Comparison)
-    assert result.sentence == "No alarm: within the healthy record of 60 trajectories."
+    assert result.sentence == "No alarm: within the healthy record of 60 episodes."
     assert {row[0] for row in result.table().rows} >= {"NEES/n of fused", "effective weight of image in contact"}
 
 

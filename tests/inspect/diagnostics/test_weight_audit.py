@@ -98,7 +98,7 @@ def test_regret_of_a_worked_example() -> None:
         "Position RMSE 0.500 cm, 1.000 cm for the haptics-only update, 0.000 cm with the oracle's weights"
         in result.verdict
     )
-    assert "constant weights: too few trajectories (1; at least 5 needed)." in result.verdict
+    assert "constant weights: too few episodes (1; at least 5 needed)." in result.verdict
     assert UPDATES_NOTE in result.verdict
     assert f"diagnostic {DIAGNOSTICS['standalone'].name} " in UPDATES_NOTE
 

@@ -58,4 +58,4 @@ def test_too_few_trajectories() -> None:
     assert math.isnan(low)
     assert math.isnan(high)
     assert too_few(MIN_TRAJECTORIES) is None
-    assert too_few(4) == "too few trajectories (4; at least 5 needed)"
+    assert too_few(4) == "too few episodes (4; at least 5 needed)"
