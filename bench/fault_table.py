@@ -54,7 +54,7 @@ FAULTS = (
     "torque_noise={torque}",
     "effector_offset=0.02",
     "effector_noise=0.01",
-    "contact_flipped=0.3",
+    "contact_inverted=0.3",
     "contact_delayed=5",
 )
 """``{force}``, ``{torque}``: standard deviation of the sensor in the data; ``{drift}``: the same after 10 s."""

@@ -118,8 +118,8 @@ TASK_OF_FILES = option(
 OPTIONS: dict[str, Any] = {
     "task": argument(
         "TASK",
-        "Task: door, push, door-field, push-field, push-real, a variant, or your own as FILE.py:NAME (docs/data.md). Its "
-        "name is enough if --data or a checkpoint contains its definition.",
+        "Task: door, push, door-field, push-field, push-real, a variant, or your own as FILE.py:NAME (docs/data.md). "
+        "Its name is enough if --data or a checkpoint contains its definition.",
     ),
     "filter": option(
         "NAME|CHECKPOINT|FILE.py:FUNCTION",

@@ -84,7 +84,8 @@ class Spec:
 
     @property
     def rng(self) -> np.random.Generator:
-        return np.random.default_rng([self.seed, zlib.crc32(self.label.encode())])
+        label = self.label.replace("contact.inverted", "contact.flipped")  # its name when results were measured
+        return np.random.default_rng([self.seed, zlib.crc32(label.encode())])
 
 
 def parity(split: str) -> int:

@@ -79,7 +79,7 @@ SENSOR_CAUSES: dict[str, SensorCause] = {
     "torque.bias": SensorCause(_axes("torque_bias", "{t}"), (0.25, 0.35, 1.5, 2.0)),
     "torque.noise": SensorCause(("torque_noise={t}",), (0.25, 0.35, 1.0, 1.5)),
     "effector.noise": SensorCause(("effector_noise={m}",), (0.002, 0.003, 0.01, 0.015)),
-    "contact.flipped": SensorCause(("contact_flipped={m}",), (0.1, 0.15, 1.0, 0.5)),
+    "contact.inverted": SensorCause(("contact_inverted={m}",), (0.1, 0.15, 1.0, 0.5)),
     "contact.delay": SensorCause(("contact_delayed={m}",), (2, 3, 8, 6)),
     "haptics.dropout": SensorCause(("drop=haptics",), (80, 70, 10, 20), onset=True),
 }

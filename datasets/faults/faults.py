@@ -161,7 +161,7 @@ class EffectorNoise(GaussianNoise):
 class ContactFlipped(Fault):
     """The contact flag is inverted, independently at each step."""
 
-    name, sensor = "contact_flipped", "contact"
+    name, sensor = "contact_inverted", "contact"
     probability: float = number_field(1.0, "fraction", "probability of an inversion at a step", 0, 1)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:

@@ -136,11 +136,11 @@ FAULT_PRESETS: dict[str, str] = {
     "force sign inverted": "force_gain=-1",
     "force x and y exchanged": "force_axes=yxz",
     "end-effector offset 2 cm": "effector_offset=0.02",
-    "contact flipped": "contact_flipped",
-    "contact stuck at 0": "contact_stuck=0",
-    "contact delayed 5 steps": "contact_delayed=5",
+    "contact flag inverted": "contact_inverted",
+    "contact flag stuck at 0": "contact_stuck=0",
+    "contact flag delayed 5 steps": "contact_delayed=5",
     "haptics delayed 5 steps": "delay=haptics:steps=5",
-    "haptics dropped": "drop=haptics:from=20",
+    "haptics lost": "drop=haptics:from=20",
     "controls delayed 3 steps": "control_delay=3",
     "controls scaled by 0.5": "control_scale=0.5",
 }
@@ -150,6 +150,7 @@ RENAMED_FAULTS = {
     "image_darker": "image_underexposed",
     "image_patch": "image_occluded",
     "contact_late": "contact_delayed",
+    "contact_flipped": "contact_inverted",
 }
 """Fault name in files of earlier versions -> current name."""
 
@@ -171,7 +172,7 @@ def available_presets(task: Task) -> dict[str, str]:
             presets[f"40 % {display_name(key)} blackout"] = f"blackout=0.4:key={key}"
         presets[f"{display_name(key)} frozen"] = f"sensor_frozen={key}:from=20"
     for name in (name for name in task.modalities if name not in ("image", "haptics")):
-        presets[f"{display_name(name)} dropped"] = f"drop={name}:from=20"
+        presets[f"{display_name(name)} lost"] = f"drop={name}:from=20"
         presets[f"{display_name(name)} delayed 5 steps"] = f"delay={name}:steps=5"
     return presets
 

@@ -160,7 +160,7 @@ def standard_slices(task: Task) -> tuple[Slice, ...]:
 
 OCCLUDED_IMAGES = Slice("image occluded", Faults.parse("image_occluded=12"))
 NOISY_IMAGES = Slice("image noisy", Faults.parse("image_noise=40"))
-NOISY_HAPTICS = Slice("haptics noisy", Faults.parse("force_noise=5,contact_flipped=0.3"))
+NOISY_HAPTICS = Slice("haptics noisy", Faults.parse("force_noise=5,contact_inverted=0.3"))
 
 FAULT_SLICES = {OCCLUDED_IMAGES: "image", NOISY_IMAGES: "image", NOISY_HAPTICS: "haptics"}
 """Slice of all steps with a fault that the training data lack -> modality."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics.measures import (
@@ -135,10 +135,12 @@ class Counterfactual(Diagnostic):
         before, after = self.effective_weights[self.during].mean(0), self.counterfactual_weights[self.during].mean(0)
         name = self.carrier or self.modalities[int(after.argmax())]
         k = self.modalities.index(name)
-        change = f"effective weight of {name} {before[k]:.2f} -> {after[k]:.2f}"
+        change = f"effective weight of {display_name(name)} {before[k]:.2f} -> {after[k]:.2f}"
         if not self.carrier:
-            return f"; {name} remained dominant ({change})"
-        return f"; {name} {'became dominant' if before[k] < 0.5 <= after[k] else 'gained weight'} ({change})"
+            return f"; {display_name(name)} remained dominant ({change})"
+        return (
+            f"; {display_name(name)} {'became dominant' if before[k] < 0.5 <= after[k] else 'gained weight'} ({change})"
+        )
 
     def _main(self) -> tuple[str, ...]:
         task = self.task

@@ -28,7 +28,7 @@ SENSOR_FAULTS = {
     "force.saturation": "force_saturation=2",
     "torque.noise": "torque_noise=0.1",
     "effector.noise": "effector_noise=0.005",
-    "contact.flipped": "contact_flipped=0.3",
+    "contact.inverted": "contact_inverted=0.3",
     "contact.delay": "contact_delayed=5",
     "haptics.dropout": "drop=haptics:from=20",
     "haptics.delay": "delay=haptics:steps=5",

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import MainError
+from beliefscope.datasets.task import MainError, display_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
@@ -54,7 +54,7 @@ class Candidate:
         return self.to - self.first
 
     def __str__(self) -> str:
-        names = " and ".join(self.sensors)
+        names = " and ".join(map(display_name, self.sensors))
         verb = "restoring" if self.restored else "dropping"
         return f"{verb} {names} from step {self.first} to {self.to - 1}"
 

@@ -105,8 +105,15 @@ class Consistency(Diagnostic):
         if self.healthy is not None:
             return tuple(alarm.text for alarm in self.healthy.alarms)
         entries = [entry for entry in self.by_layer if entry.inconsistent]
-        texts = [f"{entry.layer}, {entry.phase}: {entry.assessment}" for entry in entries]
-        return (*texts, *(f"innovations of {test.modality} are not white" for test in self.whiteness if not test.white))
+        texts = [f"{display_name(entry.layer)}, {entry.phase}: {entry.assessment}" for entry in entries]
+        return (
+            *texts,
+            *(
+                f"innovations of {display_name(test.modality)} are not white"
+                for test in self.whiteness
+                if not test.white
+            ),
+        )
 
     def _unimodal_sentence(self, entries: Sequence[LayerConsistency]) -> str:
         worst = max((entry for entry in entries if entry.inconsistent), key=inconsistency, default=None)
@@ -114,7 +121,7 @@ class Consistency(Diagnostic):
             return "All single-modality updates are consistent."
         where = "all steps" if worst.phase == ALL else worst.phase
         return (
-            f"Least consistent single-modality update: {worst.layer} in {where}, {worst.assessment} "
+            f"Least consistent single-modality update: {display_name(worst.layer)} in {where}, {worst.assessment} "
             f"(NEES/n {number(worst.nees)}). {measures.UPDATES_NOTE}"
         )
 
@@ -124,7 +131,7 @@ class Consistency(Diagnostic):
             return "Innovations are white."
         strongest = max(colored, key=lambda test: abs(test.autocorrelation))
         size = number(math.sqrt(self.entry(strongest.modality).nis))
-        subject = f"{strongest.modality}, {display_name(strongest.component)}"
+        subject = f"{display_name(strongest.modality)}, {display_name(strongest.component)}"
         where = f"{subject}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
         text = f"Innovations are not white ({where}) and {size} times as large as predicted"
         if strongest.autocorrelation > 0.2:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.datasets.task import Task, with_unit
+from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
@@ -71,9 +71,9 @@ class Errors(Diagnostic):
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        texts = [f"the estimate is worse than the readings of {key}" for key in self.worse]
+        texts = [f"the estimate is worse than the readings of {display_name(key)}" for key in self.worse]
         slow = [o for o in self.outages if o.unrecovered > o.count / 2]
-        return (*texts, *(f"no recovery from most outages of {o.modality}" for o in slow))
+        return (*texts, *(f"no recovery from most outages of {display_name(o.modality)}" for o in slow))
 
     @property
     def verdict(self) -> str:
@@ -88,7 +88,7 @@ class Errors(Diagnostic):
         parts = [f"{text}."]
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
             noun, verb = ("outage", "has") if outage.count == 1 else ("outages", "have")
-            text = f"{outage.count} {noun} of {outage.modality}, up to {outage.longest:.3g} s, {verb} "
+            text = f"{outage.count} {noun} of {display_name(outage.modality)}, up to {outage.longest:.3g} s, {verb} "
             text += f"{outage.share:.0%} of the squared error in {outage.steps:.0%} of the steps"
             if (long := outage.dominant) is not None and long.steps < outage.steps:
                 text += f"; those over {long.low:g} s have {long.share:.0%} in {long.steps:.0%}, with an error of "
@@ -100,7 +100,7 @@ class Errors(Diagnostic):
             parts.append(f"{text}.")
         for key in self.worse:
             reading, estimate = map(self._text, self.readings[key])
-            text = f"The readings of {key} are closer to the truth ({reading}) than the estimate"
+            text = f"The readings of {display_name(key)} are closer to the truth ({reading}) than the estimate"
             parts.append(f"{text} in the same steps ({estimate}).")
         return " ".join(parts)
 

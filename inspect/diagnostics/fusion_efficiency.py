@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
@@ -92,7 +92,10 @@ class FusionEfficiency(Diagnostic):
     def verdict(self) -> str:
         total = self.phases[0]
         main = self.task.main_error
-        alone = [f"{name} {main.text(x)}" for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)]
+        alone = [
+            f"{display_name(name)} {main.text(x)}"
+            for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)
+        ]
         errors = f"{', '.join(alone)}; correlation {total.correlation[0]:.2f}"
         sentence = (
             f"{main.title} RMSE {main.text(total.fused[0])}{self._gain()}; the standalone errors ({errors}) allow "
@@ -116,7 +119,7 @@ class FusionEfficiency(Diagnostic):
         if not ratio > GAIN:
             return ""
         gain = "little" if ratio < 1.0 else "nothing"
-        return f", {ratio:.2f} times that of the {self.modalities[best]}-only filter: fusion gains {gain}"
+        return f", {ratio:.2f} times that of the {display_name(self.modalities[best])}-only filter: fusion gains {gain}"
 
     def tables(self) -> list[Table]:
         rows: list[tuple[Value, ...]] = []
@@ -127,7 +130,12 @@ class FusionEfficiency(Diagnostic):
                 values = [*(float(factor * length) for length in lengths), *map(float, ratios)]
                 numbers = [value if math.isfinite(value) else None for value in values]
                 rows.append((entry.phase, entry.steps, name, *numbers))
-        heads = ["fused", *(f"{name} standalone" for name in self.modalities), "best combination", "if uncorrelated"]
+        heads = [
+            "fused",
+            *(f"{display_name(name)} standalone" for name in self.modalities),
+            "best combination",
+            "if uncorrelated",
+        ]
         columns = ("phase", "steps", "quantity", *heads, "correlation", "efficiency", "95 % from", "to")
         tables = [Table("Errors of fusion and of the best combination", columns, tuple(rows))]
         if self.reasons:
@@ -146,7 +154,7 @@ class FusionEfficiency(Diagnostic):
         main = self.task.main_error
         chart = f"{main.title} error"
         alone = [
-            Curve(f"{name} standalone", main.factor * self.standalone[:, k], chart, main.unit, name)
+            Curve(f"{display_name(name)} standalone", main.factor * self.standalone[:, k], chart, main.unit, name)
             for k, name in enumerate(self.modalities)
         ]
         best = Curve("best combination", main.factor * self.best, chart, main.unit, "truth")

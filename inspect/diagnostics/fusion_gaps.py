@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Array, Value
@@ -134,7 +135,7 @@ def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
                 high=factor_high,
                 contributes=(factor_low > 1.0 and factor > MIN_FACTOR)
                 or (factor_high < 1.0 and factor < 1.0 / MIN_FACTOR),
-                headline=f"uncalibrated R: standard deviations of the {name} sensor are "
+                headline=f"uncalibrated R: standard deviations of the {display_name(name)} sensor are "
                 f"{'too small' if factor > 1.0 else 'too large'} (NEES/n {factor:.2f})",
             )
         )
@@ -148,7 +149,8 @@ def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
                 low=float(low[k, i]),
                 high=float(high[k, i]),
                 contributes=bool(relevant),
-                headline=f"drifted sensor: {task.components[i].label} of the {name} sensor has a bias of {size}",
+                headline=f"drifted sensor: {task.components[i].label} of the {display_name(name)} sensor has a bias of "
+                f"{size}",
             )
         )
     return sorted(reasons, key=lambda reason: reason.name != CALIBRATION)
@@ -219,8 +221,8 @@ def _weights(traces: Sequence[Trace], of_sensors: bool) -> Reason:
         low=low,
         high=high,
         contributes=low > 1.0 and value > MIN_EXCESS,
-        headline=f"wrong weights: mean weight of {name} {means[k]:.2f}, best {share[k]:.2f}; the best constant weights "
-        f"would reduce the error of the weighted mean by {100.0 * (1.0 - 1.0 / value):.0f} %",
+        headline=f"wrong weights: mean weight of {display_name(name)} {means[k]:.2f}, best {share[k]:.2f}; the best "
+        f"constant weights would reduce the error of the weighted mean by {100.0 * (1.0 - 1.0 / value):.0f} %",
     )
 
 

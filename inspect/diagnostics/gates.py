@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
@@ -95,7 +96,7 @@ class Innovations(Diagnostic):
     def verdict(self) -> str:
         sentences = []
         for entry in self.modalities:
-            size = f"{entry.modality}: NIS/m {entry.nis:.3g}"
+            size = f"{display_name(entry.modality)}: NIS/m {entry.nis:.3g}"
             if not math.isnan(entry.low):
                 size += f" [{entry.low:.3g}, {entry.high:.3g}], "
                 size += "consistent" if entry.consistent else "inconsistent"
@@ -113,9 +114,18 @@ class Innovations(Diagnostic):
     @property
     def alarms(self) -> tuple[str, ...]:
         texts = [
-            f"the gate of {e.modality} {e.gate}" for e in self.modalities if e.gate not in ("", "acts", "never needed")
+            f"the gate of {display_name(e.modality)} {e.gate}"
+            for e in self.modalities
+            if e.gate not in ("", "acts", "never needed")
         ]
-        return (*texts, *(f"innovations of {e.modality} are inconsistent" for e in self.modalities if not e.consistent))
+        return (
+            *texts,
+            *(
+                f"innovations of {display_name(e.modality)} are inconsistent"
+                for e in self.modalities
+                if not e.consistent
+            ),
+        )
 
     def tables(self) -> list[Table]:
         columns = (
@@ -124,7 +134,7 @@ class Innovations(Diagnostic):
         )
         rows = tuple(
             (
-                *(e.modality, e.measurements, e.channels, e.nis),
+                *(display_name(e.modality), e.measurements, e.channels, e.nis),
                 *((None, None) if math.isnan(e.low) else (e.low, e.high)),
                 e.extreme,
                 *((None, None) if math.isnan(e.accepted) else (100.0 * e.accepted, e.longest)),
@@ -137,7 +147,7 @@ class Innovations(Diagnostic):
     def curves(self) -> list[Curve]:
         title = "Innovation in predicted standard deviations (root of NIS/m)"
         return [
-            Curve(e.modality, np.sqrt(self.nis[:, k]), title, "standard deviations", e.modality)
+            Curve(display_name(e.modality), np.sqrt(self.nis[:, k]), title, "standard deviations", e.modality)
             for k, e in enumerate(self.modalities)
             if len(self.nis)
         ]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
@@ -100,7 +100,7 @@ class Shapley(Diagnostic):
         sentences = []
         for values in phases:
             changes = [
-                f"{name} {'lowers' if value < 0 else 'raises'} {{}} by {main.text(abs(value))}"
+                f"{display_name(name)} {'lowers' if value < 0 else 'raises'} {{}} by {main.text(abs(value))}"
                 for name, value in zip(self.modalities, values.shapley[:, 0], strict=True)
             ]
             parts = changes[0].format(f"the {main.name} RMSE"), *(change.format("it") for change in changes[1:])
@@ -108,11 +108,13 @@ class Shapley(Diagnostic):
             sentences.append(
                 f"{PHASE_NAMES.get(values.phase, 'Over all steps')} {', '.join(parts)} "
                 f"({empty} with {self.baseline}, {complete} with "
-                f"{'all modalities' if len(self.modalities) > 1 else self.modalities[0]})."
+                f"{'all modalities' if len(self.modalities) > 1 else display_name(self.modalities[0])})."
             )
         if len(self.modalities) > 1:
             total = self.phases[0].rmse[:, 0]
-            without = [f"{main.text(total[-1 - 2**k])} without {name}" for k, name in enumerate(self.modalities)]
+            without = [
+                f"{main.text(total[-1 - 2**k])} without {display_name(name)}" for k, name in enumerate(self.modalities)
+            ]
             sentences.append(f"All steps: {main.text(total[-1])}, {', '.join(without)}.")
         if self.at_truth:
             sentences.append(f"Runs start at the true state, which favours {self.baseline}.")

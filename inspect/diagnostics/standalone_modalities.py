@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
@@ -80,10 +80,10 @@ class StandaloneModalities(Diagnostic):
         numbers = []
         for name, update, alone in zip(self.modalities, total.updates[:, 0], total.standalone[:, 0], strict=True):
             parts = [] if math.isnan(update) else [f"{main.text(update)} for the {measures.layer_label(name)}"]
-            numbers.append(" and ".join([*parts, f"{main.text(alone)} for {name} standalone"]))
+            numbers.append(" and ".join([*parts, f"{main.text(alone)} for {display_name(name)} standalone"]))
         k = int(total.standalone[:, 0].argmin())
         sentences = [f"{main.title} RMSE {main.text(total.fused[0])} fused; {'; '.join(numbers)}."]
-        ratio = f"fused / {self.modalities[k]} standalone {total.ratio[k]:.2f}"
+        ratio = f"fused / {display_name(self.modalities[k])} standalone {total.ratio[k]:.2f}"
         if math.isnan(total.low[k]):
             sentences.append(f"Ratio {ratio}; no interval: {too_few(total.trajectories)}.")
             return " ".join(sentences)
@@ -91,9 +91,9 @@ class StandaloneModalities(Diagnostic):
         result = (
             "Fusion is more accurate than every standalone modality"
             if high < 1.0
-            else f"Standalone {self.modalities[k]} is more accurate than fusion"
+            else f"Standalone {display_name(self.modalities[k])} is more accurate than fusion"
             if low > 1.0
-            else f"Fusion and {self.modalities[k]} standalone do not differ significantly"
+            else f"Fusion and {display_name(self.modalities[k])} standalone do not differ significantly"
         )
         sentences.append(f"{result} ({ratio}, 95 % interval {low:.2f} to {high:.2f}).")
         return " ".join(sentences)
@@ -106,11 +106,17 @@ class StandaloneModalities(Diagnostic):
                 values = [float(factor * value) for value in (entry.fused[q], *(v for pair in pairs for v in pair))]
                 numbers = [None if math.isnan(value) else value for value in values]
                 rows.append((entry.phase, entry.steps, name, *numbers))
-        heads = [head for name in self.modalities for head in (measures.layer_label(name), f"{name} standalone")]
+        heads = [
+            head
+            for name in self.modalities
+            for head in (measures.layer_label(name), f"{display_name(name)} standalone")
+        ]
         ratios: list[tuple[Value, ...]] = [
             (entry.phase, entry.steps, name, *(None if math.isnan(v) else float(v) for v in values))
             for entry in self.phases
-            for name, *values in zip(self.modalities, entry.ratio, entry.low, entry.high, strict=True)
+            for name, *values in zip(
+                map(display_name, self.modalities), entry.ratio, entry.low, entry.high, strict=True
+            )
         ]
         return [
             Table(
@@ -132,7 +138,7 @@ class StandaloneModalities(Diagnostic):
         for k, name in enumerate(self.modalities):
             if np.isfinite(self.updates[:, k]).any():
                 curves.append(Curve(measures.layer_label(name), scale * self.updates[:, k], chart, unit, name))
-            curves.append(Curve(f"{name} standalone", scale * self.standalone[:, k], chart, unit, name))
+            curves.append(Curve(f"{display_name(name)} standalone", scale * self.standalone[:, k], chart, unit, name))
         return curves
 
     def bands(self) -> dict[str, Mask]:

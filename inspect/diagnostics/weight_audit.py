@@ -156,7 +156,7 @@ class WeightAudit(Diagnostic):
         strongest = int(unimodal.argmin())
         parts = [NO_RECORD if self.healthy is None else self.healthy.sentence]
         parts += [
-            f"The posterior is dominated by {name}: effective weight {mean_weights('effective_weights')}"
+            f"The posterior is dominated by {display_name(name)}: effective weight {mean_weights('effective_weights')}"
             f"{' (mean over components)' if len(self._columns) > 1 else ''}; oracle: {mean_weights('oracle')}.",
             f"{main.title} RMSE {main.text(total.fused[0], 3)}, {main.text(unimodal[strongest], 3)} for the "
             f"{measures.layer_label(self.modalities[strongest])}, {main.text(total.hindsight[0], 3)} with the oracle's "
@@ -208,7 +208,9 @@ class WeightAudit(Diagnostic):
                 values = (entry.fused[q], entry.hindsight[q], entry.regret[q], entry.constant[q], *entry.unimodal[:, q])
                 numbers = (None if math.isnan(value) else float(factor * value) for value in values)
                 errors.append((entry.phase, name, *numbers))
-        heads = [f"{modality}: {LABELS[source]}" for modality in self.modalities for source in self._sources]
+        heads = [
+            f"{display_name(modality)}: {LABELS[source]}" for modality in self.modalities for source in self._sources
+        ]
         unimodal = [measures.layer_label(modality) for modality in self.modalities]
         tables = [
             Table("Mean weights", ("phase", "steps", "component", *heads), tuple(means)),
@@ -248,7 +250,7 @@ class WeightAudit(Diagnostic):
             for source in self._sources:
                 values = getattr(self, source)
                 for k, modality in enumerate(self._independent):
-                    name = f"{modality} {LABELS[source]}" + (f" {column}" if column else "")
+                    name = f"{display_name(modality)} {LABELS[source]}" + (f" {column}" if column else "")
                     curves.append(Curve(name, values[:, k, w], chart, "", modality))
             unit, factor = (units[w], scale[w]) if column else (task.main_error.unit, task.main_error.factor)
             name = f"regret {column or task.main_error.name}"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import is_image, lost_images
-from beliefscope.datasets.task import Task, with_unit
+from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.inspect.traces.data import Trace
 
@@ -33,7 +33,8 @@ def layer_label(layer: str) -> str:
     """Display name of an estimate: that of a modality is an update of the fused filter's prior, not standalone."""
     if layer in ("fused", "truth"):
         return layer
-    return f"{layer} update" if "+" in layer else f"{layer}-only update"
+    name = display_name(layer)
+    return f"{name} update" if "+" in layer else f"{name}-only update"
 
 
 def wrapped(task: Task, difference: NDArray[Any]) -> Array:

@@ -276,6 +276,6 @@ def test_image_faults_of_rgb_images_change_every_channel() -> None:
 def test_presets_fit_the_sensors() -> None:
     presets = available_presets(TASK)
     assert presets["depth frozen"] == "sensor_frozen=depth:from=20"
-    assert presets["touch dropped"] == "drop=touch:from=20"
+    assert presets["touch lost"] == "drop=touch:from=20"
     for text in presets.values():
         Faults.parse(text).check(TASK)

@@ -135,6 +135,7 @@ def test_haptics_update_of_the_door_is_not_the_haptics_filter(name: str) -> None
     assert update < 0.8
     assert alone > 3.0 * update
     assert measures.layer_label("haptics") == "haptics-only update"
+    assert measures.layer_label("wrist_cam") == "wrist cam-only update"
 
 
 def test_standalone_trace_is_saved_and_replayed_exactly(episode: Episode, tmp_path: Path) -> None:

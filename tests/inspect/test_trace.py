@@ -132,7 +132,7 @@ def test_particle_weights_match_the_estimate_and_the_ancestors(traced: Trace) ->
 def test_episode_of_the_trace_has_injected_faults(
     checkpoint: Checkpoint, episode: Episode, traced: Trace, tmp_path: Path
 ) -> None:
-    faults = Faults.parse("blackout,force_noise=3,contact_flipped:from=20")
+    faults = Faults.parse("blackout,force_noise=3,contact_inverted:from=20")
     faulty = trace(checkpoint, episode, seed=7, particles=100, faults=faults)
     assert not faulty.episode.observations["image"].any()
     assert faulty.episode.digest() == faults.apply(episode, 7).digest() != episode.digest()

@@ -213,7 +213,7 @@ test('faults of one kind have levels, and no fault has level 0', () => {
     'blackout=0.4',
     'blackout=0.8',
     'force_bias:x=8',
-    'contact_flipped',
+    'contact_inverted',
     'a=1,b=2',
   ];
   const rows = rowsOf(...texts.map((faults) => ({ faults })));

@@ -4,7 +4,7 @@
 /** @import { Diagnosis } from '../types/server.js' */
 
 import { SHOWN } from '../core/constants.js';
-import { fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
+import { displayName, fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { stepSummary, weightScope } from './step_summary.js';
 
@@ -65,7 +65,7 @@ function healthyHeadline(trace, component, { headline, miscalibrated }) {
     })
     .sort((a, b) => b.share - a.share);
   const weight = most
-    ? `; ${most.name} has ${percent(most.share)} of the effective weight${weightScope(trace, component)}`
+    ? `; ${displayName(most.name)} has ${percent(most.share)} of the effective weight${weightScope(trace, component)}`
     : '';
   return `No fault found: mean ${trace.task.main.name} error ${error}${weight}.`;
 }
@@ -159,11 +159,11 @@ export function outageFinding(trace, component) {
     last + 1 < trace.steps
       ? `until the image returns at ${trace.stepLabel(last + 1)}`
       : 'to the end';
-  const action = successor ? `; ${successor.name} takes over ${end}` : `, ${end}`;
+  const action = successor ? `; ${displayName(successor.name)} takes over ${end}` : `, ${end}`;
   const scope = weightScope(trace, component);
   const evidence = weights.map(
     ({ name, before, during }) =>
-      `the mean effective weight of ${name}${scope} ${change(before, during)}`,
+      `the mean effective weight of ${displayName(name)}${scope} ${change(before, during)}`,
   );
   const worst = Math.max(...(trace.error('fused', 'main')?.subarray(first, last + 1) ?? [NaN]));
   if (worst >= 0)

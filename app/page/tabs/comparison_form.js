@@ -6,7 +6,7 @@
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { fixed } from '../core/units.js';
+import { displayName, fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
 
@@ -113,7 +113,7 @@ export class ComparisonForm {
     const others = (task?.filters ?? []).map((f) => f.name).filter((other) => other !== filter);
     this.#filter.replaceChildren(...others.map((other) => new Option(other, other)));
     this.#only.replaceChildren(
-      ...trace.inputs.map((name) => new Option(`${name} standalone`, name)),
+      ...trace.inputs.map((name) => new Option(`${displayName(name)} standalone`, name)),
     );
     for (const input of [this.#first, this.#last]) input.max = String(trace.steps - 1);
     if (isNew) this.#setSpan(step, step + DEFAULT_SPAN - 1);
@@ -274,7 +274,7 @@ export class ComparisonForm {
       const input = create('input', { type: 'range', min: '0', max: '1', step: '0.01' });
       input.dataset.modality = name;
       input.addEventListener('input', () => this.#setBeta(name, input.valueAsNumber));
-      return create('label', {}, `β ${name}`, input, document.createElement('output'));
+      return create('label', {}, `β ${displayName(name)}`, input, document.createElement('output'));
     });
     html('.sliders', this.#form).replaceChildren(...sliders);
     this.#showBetas();

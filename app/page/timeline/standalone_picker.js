@@ -4,6 +4,7 @@
 /** @import { Trace } from '../data/trace.js' */
 
 import { element } from '../core/dom.js';
+import { displayName } from '../core/units.js';
 
 const PREFIX = 'only=';
 
@@ -26,7 +27,7 @@ export class StandalonePicker {
     this.#select.hidden = !inputs.length;
     this.#select.replaceChildren(
       new Option('no standalone', ''),
-      ...inputs.map((name) => new Option(`${name} standalone`, name)),
+      ...inputs.map((name) => new Option(`${displayName(name)} standalone`, name)),
     );
     this.#update();
   }

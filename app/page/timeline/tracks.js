@@ -116,7 +116,7 @@ function overlay(track, other, standalone) {
   const lines = other.series
     .filter(({ name }) => name !== 'truth')
     .map(({ name, values, stacked }) => ({
-      name: name === 'fused' && standalone ? `${standalone} standalone` : name,
+      name: name === 'fused' && standalone ? `${displayName(standalone)} standalone` : name,
       values,
       stacked,
       comparison: true,
@@ -176,8 +176,8 @@ function missingWeights({ modalities: [model], fuses, header }) {
   if (fuses) return 'None: this filter does not report its fusion weights.';
   if (model)
     return model.includes('+')
-      ? `None: a single measurement model uses ${model.replaceAll('+', ' and ')}.`
-      : `None: ${model} is the only modality.`;
+      ? `None: a single measurement model uses ${displayName(model.replaceAll('+', ' and '))}.`
+      : `None: ${displayName(model)} is the only modality.`;
   if (header.kind === 'external') return 'None: this filter does not report its modalities.';
   return 'None: the network combines all modalities without explicit weights.';
 }

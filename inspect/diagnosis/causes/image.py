@@ -65,7 +65,7 @@ CAUSES = (
     ),
     Cause(
         "image.blur",
-        "Images blurred",
+        "Image blurred",
         (Symptom("sharpness/image/*", -1),),
         f"shift/image*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Focus the camera and clean its lens, or shorten the exposure time.",
@@ -74,7 +74,7 @@ CAUSES = (
     ),
     Cause(
         "image.exposure",
-        "Exposure changed",
+        "Image exposure changed",
         (Symptom("brightness/image/*", 0),),
         f"sharpness/image/*|occlusion/image/*|shift/image*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Restore the camera's exposure or the lighting.",
@@ -83,7 +83,7 @@ CAUSES = (
     ),
     Cause(
         "image.occlusion",
-        "Camera occluded",
+        "Image occluded",
         (Symptom("occlusion/image/*"),),
         f"shift/image*|brightness/image/*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Clear the camera's view.",

@@ -45,7 +45,7 @@ CAUSES = (
         lowers="toggles/contact/*",
     ),
     Cause(
-        "contact.flipped",
+        "contact.inverted",
         "Contact flag inverted",
         (
             Symptom("agreement/contact/*", -1),

@@ -69,7 +69,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         ),
         Cause(
             "control.scale",
-            "Controls with a wrong scale",
+            "Controls scaled",
             (Symptom("reading gain/control*", 0, otherwise=(Symptom("size/control*", 0),)), used),
             f"size/control*|{changed}",
             "Check the units of the controls.",
@@ -84,7 +84,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         ),
         Cause(
             "control.axes",
-            "Channels of the controls exchanged",
+            "Control channels exchanged",
             (Symptom("exchanged/control*"),),
             f"inverted/control*|opposed/control*|size/control*|{changed}",
             "Check the order of the controls.",
@@ -92,7 +92,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         ),
         Cause(
             "control.sign",
-            "Controls with the opposite sign",
+            "Control sign inverted",
             (Symptom("inverted/control*", otherwise=(Symptom("opposed/control*"),)),),
             f"opposed/control*|{changed}",
             "Check the sign convention of the controls.",

@@ -50,9 +50,9 @@ IMAGE = (
 """As ``VECTOR``, of images."""
 
 VIEW = {
-    "blur": "Images of {} blurred",
-    "exposure": "Exposure of {} changed",
-    "occlusion": "Camera {} occluded",
+    "blur": "Image of {} blurred",
+    "exposure": "Image exposure of {} changed",
+    "occlusion": "Image of {} occluded",
 }
 """Mechanisms of causes in the image that other cameras have as well -> title."""
 

@@ -30,7 +30,7 @@ AFFECTED = {
     "torque_noise": {"torque"},
     "effector_offset=0.02": {"effector_position"},
     "effector_noise": {"effector_position"},
-    "contact_flipped": {"contact"},
+    "contact_inverted": {"contact"},
     "contact_delayed": {"contact"},
     "delay=haptics": {"effector_position", "force", "torque", "contact"},
     "delay=image": {"image"},
@@ -95,7 +95,7 @@ def test_faults_are_deterministic(text: str, episode: Episode) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["blackout=0.5", "image_noise", "image_occluded", "force_noise", "contact_flipped=0.5", "drop:probability=0.1"],
+    ["blackout=0.5", "image_noise", "image_occluded", "force_noise", "contact_inverted=0.5", "drop:probability=0.1"],
 )
 def test_randomness_depends_on_seed_episode_and_position(text: str, episode: Episode) -> None:
     key = Faults.parse(text).sequence[0].keys(DOOR)[0]
@@ -110,7 +110,7 @@ def test_controls_follow_the_readings(episode: Episode) -> None:
     assert np.array_equal(
         hand_controls(episode.observations["effector_position"], episode.observations["contact"]), episode.controls
     )
-    offset = inject("effector_offset:x=0.02,contact_flipped", episode)
+    offset = inject("effector_offset:x=0.02,contact_inverted", episode)
     np.testing.assert_allclose(offset.controls[:, 0] - episode.controls[:, 0], 0.02, atol=1e-6)
     np.testing.assert_allclose(offset.controls[:, 3:6], episode.controls[:, 3:6], atol=1e-6)
     assert np.array_equal(offset.controls[:, 6], 1 - episode.controls[:, 6])
@@ -207,11 +207,11 @@ def test_delays_shift_readings(episode: Episode) -> None:
 
 
 def test_flipping_contact_twice_restores_it(episode: Episode) -> None:
-    flipped = inject("contact_flipped", episode)
+    flipped = inject("contact_inverted", episode)
     assert np.array_equal(flipped.observations["contact"], 1 - episode.observations["contact"])
-    assert inject("contact_flipped", flipped).digest() == episode.digest()
+    assert inject("contact_inverted", flipped).digest() == episode.digest()
     fraction = (
-        inject("contact_flipped=0.3", episode).observations["contact"] != episode.observations["contact"]
+        inject("contact_inverted=0.3", episode).observations["contact"] != episode.observations["contact"]
     ).mean()
     assert 0.1 < fraction < 0.5
 
@@ -305,6 +305,7 @@ def test_fault_names_of_earlier_versions_are_read() -> None:
     )
     assert str(old) == "image_underexposed=0.5,image_occluded,contact_delayed"
     assert Faults.parse("image_darker=0.5,image_patch,contact_late") == old
+    assert str(Faults.parse("contact_flipped=0.5")) == "contact_inverted=0.5"
 
 
 def test_presets_fit_the_door_and_change_the_episode(episode: Episode) -> None:

@@ -129,7 +129,7 @@ def test_controls_do_not_depend_on_the_measured_hand(task: Task, monkeypatch: py
 
 
 def test_faults_leave_the_commanded_path_unchanged(task: Task, episode: Episode) -> None:
-    faulty = Faults.parse("effector_offset=0.02,contact_flipped").apply(episode)
+    faulty = Faults.parse("effector_offset=0.02,contact_inverted").apply(episode)
     np.testing.assert_array_equal(faulty.controls, episode.controls)
 
 

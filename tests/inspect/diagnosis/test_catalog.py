@@ -32,7 +32,7 @@ REQUIRED = {
     "force": ("bias", "drift", "gain", "sign", "axes", "noise", "stuck", "saturation"),
     "torque": ("bias", "noise"),
     "effector": ("offset", "noise"),
-    "contact": ("stuck", "flipped", "delay"),
+    "contact": ("stuck", "inverted", "delay"),
     "haptics": ("delay", "dropout"),
     "control": ("delay", "scale"),
     "labels": ("delay", "offset"),

@@ -73,7 +73,7 @@ def change(task: str, faults: str, statistic: str) -> float:
         ("force_noise=4", "noise/force z/all", 4.0, 0.7),
         ("force_stuck=x:from=20", "stuck/force x/all", 0.65, 0.25),
         ("contact_delayed=3", "lag/contact/all", 3.0, 0.3),
-        ("contact_flipped=0.3", "toggles/contact/all", 2 * 0.3 * 0.7, 0.06),
+        ("contact_inverted=0.3", "toggles/contact/all", 2 * 0.3 * 0.7, 0.06),
         ("effector_noise=0.004", "position noise/effector_position/all", 0.004, 4e-4),
         ("drop=haptics:from=50", "stuck/effector_position/all", 0.5, 0.01),
     ],
@@ -87,8 +87,8 @@ def test_the_statistic_changes_by_the_planted_amount(
 @pytest.mark.parametrize("task", TASKS)
 def test_an_inverted_contact_flag_opposes_the_force(task: str) -> None:
     """From the first step: then no step tells what the flag was before."""
-    assert change(task, "contact_flipped=1", "agreement/contact/all") < -1.2
-    assert change(task, "contact_flipped=1", "opposition/contact/all") > 0.3
+    assert change(task, "contact_inverted=1", "agreement/contact/all") < -1.2
+    assert change(task, "contact_inverted=1", "opposition/contact/all") > 0.3
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -281,7 +281,7 @@ def test_image_shift_is_registered() -> None:
         ("image_underexposed=0.4:from=64", "brightness/image/all", (64, 99)),
         ("image_outage=0.4:seconds=1,image_underexposed=0.4:from=64", "brightness/image/all", (64, 99)),
         ("drop=haptics:from=25", "stuck/effector_position/all", (25, 99)),
-        ("contact_flipped:from=40:to=60", "opposition/contact/extreme", (40, 59)),
+        ("contact_inverted:from=40:to=60", "opposition/contact/extreme", (40, 59)),
     ],
 )
 def test_faults_are_localised(faults: str, statistic: str, steps: tuple[int, int]) -> None:

@@ -191,7 +191,7 @@ def test_controls_that_derive_from_readings_are_restored_with_them() -> None:
 
 
 @pytest.mark.parametrize(
-    "fault", ["contact_stuck=0:from=10", "contact_flipped=1", "contact_flipped=0.2", "contact_delayed=30"]
+    "fault", ["contact_stuck=0:from=10", "contact_inverted=1", "contact_inverted=0.2", "contact_delayed=30"]
 )
 def test_the_contact_flag_is_restored_from_the_force(fault: str) -> None:
     """Whatever the flag was: it agrees with the true one at 95 % of the steps, also in the controls."""
