@@ -205,9 +205,7 @@ def test_fault_preset_is_applied_and_removed(open_page: Any) -> None:
     before, image = page.maps(), page.page.evaluate(CAMERA_IMAGE)
     names = page.page.locator("#faults option").all_text_contents()
     assert names[0] == "as recorded"
-    assert {"40 % image blackout", "image frozen", "force drifting", "contact flag inverted", "haptics lost"} <= {
-        *names
-    }
+    assert {"40 % image blackout", "image frozen", "contact flag inverted", "haptics lost"} <= {*names}
     page.page.locator("#faults").select_option("image_frozen=20")
     wait_until(lambda: page.page.evaluate(CAMERA_IMAGE) != image and page.maps()[0] != before[0])
     page.until("() => location.search.includes('faults=image_frozen%3D20')")
