@@ -30,16 +30,21 @@ def check_name(kind: str, name: str, available: Container[str]) -> None:
 
 
 def unknown_name(kind: str, name: str, available: object) -> BadInput:
-    """Return the error for an unknown name: ``filter 'crosmodal-pf' does not exist. Available: ...``.
+    """Return the error for an unknown name: ``modality 'touch' of task 'door' does not exist. Available: ...``.
 
     A long list is preceded by the most similar names, and ends after ``MAX_LISTED``.
+
+    Args:
+        kind: of the name, optionally with its owner, such as ``modality of task 'door'``.
     """
     names = [str(a) for a in available]  # type: ignore[attr-defined]
     similar = get_close_matches(name, names, n=2) if len(names) > LONG_LIST else []
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
     more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
     listed = ", ".join(names[:MAX_LISTED]) or "none"
-    return BadInput(f"{kind} {name!r} does not exist.{hint} Available: {listed}{more}.")
+    noun, *owner = kind.split(" of ", 1)
+    title = " of ".join((f"{noun} {name!r}", *owner))
+    return BadInput(f"{title} does not exist.{hint} Available: {listed}{more}.")
 
 
 def type_name(value: object) -> str:

@@ -65,7 +65,7 @@ def architecture(task: str | Task, name: str, networks: str = "default") -> Arch
     """The named filter's architecture for a task. Raises BadInput for an unknown name."""
     filters = filters_of(find_task(task))
     check_name("filter", name, filters)
-    check_name("set of networks", networks, NETWORKS)
+    check_name("network set", networks, NETWORKS)
     return replace(filters[name], **NETWORKS[networks])
 
 

@@ -74,7 +74,7 @@ class Architecture:
         for name, kind in _type_hints(Architecture).items():
             value = getattr(self, name)
             if get_origin(kind) is Literal and value not in get_args(kind):
-                raise unknown_name(f"{name} of a filter", value, get_args(kind))
+                raise unknown_name(f"filter {name}", value, get_args(kind))
             if kind is str and not isinstance(value, str):
                 raise BadInput(f"{name} of a filter is {value!r:.200}, not a name")
             if kind is int and not (type(value) is int and 1 <= value <= MAX_SIZE):

@@ -187,7 +187,7 @@ TASK = Task(
         (TASK_FILE, "own.py:TASK|a b", r"own\.py:TASK is named 'a b', expected a name without spaces"),
         (TASK_FILE, "own.py:TASK||('touch',)", r"modality 'haptics' has 'touch', which is not an observation"),
         (TASK_FILE, "own.py:TASK||()", r"modality 'haptics' has no observations"),
-        (TASK_FILE, "own.py:TASK||('felt',)|z", r"component of task 'mine' 'z' does not exist\. Available: x, y"),
+        (TASK_FILE, "own.py:TASK||('felt',)|z", r"component 'z' of task 'mine' does not exist\. Available: x, y"),
     ],
 )
 def test_invalid_tasks_are_rejected(

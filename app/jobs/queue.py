@@ -178,7 +178,7 @@ class Jobs:
 
         Raises BadInput for an unknown kind or a full disk, and QueueFull.
         """
-        check_name("kind of job", kind, self._kinds)
+        check_name("job kind", kind, self._kinds)
         id = _id(kind, arguments if key is None else key)
         with self._lock:
             existing = self._jobs.get(id)

@@ -106,7 +106,7 @@ def letters_of(name: str) -> str:
             raise BadInput(f"extra value {name.removeprefix(EXTRA)!r}: a name has up to 80 letters, digits, - and _")
         return ""
     if name not in SHAPES:
-        raise unknown_name("value of a filter", name, [*SHAPES, "extra"])
+        raise unknown_name("filter output", name, [*SHAPES, "extra"])
     return SHAPES[name]
 
 

@@ -140,7 +140,7 @@ class FineTune:
         arguments: dict[str, Any] = {}
         for key, setting in legacy_names.rename_keys(value, legacy_names.SETTINGS).items():
             if key not in settings:
-                raise unknown_name("setting of a fine-tuning", str(key), settings)
+                raise unknown_name("fine-tuning setting", str(key), settings)
             try:
                 arguments[key] = _READERS[settings[key].type](setting)
             except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:

@@ -92,7 +92,7 @@ class Slice:
         value = legacy_names.slice_json(value)
         for key in value:
             if key not in KEYS:
-                raise unknown_name("key of a slice", str(key), KEYS)
+                raise unknown_name("slice key", str(key), KEYS)
         contact, only = value.get("contact"), value.get("only", [])
         if contact not in (None, True, False) or isinstance(contact, int) != isinstance(contact, bool):
             raise BadInput(f"contact of a slice is {contact!r}, expected true, false or null")

@@ -100,7 +100,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 def figure_format(path: Path) -> str:
     """``svg``, ``pdf`` or ``png`` depending on the suffix. Raises BadInput for other suffixes."""
     suffix = path.suffix.removeprefix(".").lower()
-    check_name("format of a figure", suffix, FORMATS)
+    check_name("figure format", suffix, FORMATS)
     return suffix
 
 

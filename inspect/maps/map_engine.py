@@ -180,7 +180,7 @@ class MapEngine:
             BadInput: step, angle, size or components are invalid, or the filter does not have such maps.
         """
         quantity = quantity or self.quantities[0]
-        check_name("quantity of a map", quantity, QUANTITIES)
+        check_name("map quantity", quantity, QUANTITIES)
         if quantity not in self.quantities:
             raise BadInput(no_maps(self.checkpoint, self.trace, quantity) or "")
         trace = self.trace

@@ -237,7 +237,7 @@ def _paths(topics: Sequence[str], references: set[str]) -> dict[str, dict[str, l
 def _topic(topics: Sequence[str], name: str) -> str:
     matches = [topic for topic in topics if name == topic or name.startswith(f"{topic}.")]
     if not matches:
-        raise unknown_name("topic of column", name, topics)
+        raise unknown_name("topic in column", name, topics)
     return max(matches, key=len)
 
 

@@ -268,7 +268,7 @@ def finetune(
     """
     base = load_filter(filter_)
     if unknown := settings.keys() - FineTune.__dataclass_fields__.keys():
-        raise unknown_name("setting of a fine-tuning", min(unknown), FineTune.__dataclass_fields__)
+        raise unknown_name("fine-tuning setting", min(unknown), FineTune.__dataclass_fields__)
     if isinstance(success := settings.get("success"), str):
         settings["success"] = Criterion.parse(success)
     chosen = settings_from(base, train, freeze, slices, faults)

@@ -69,7 +69,7 @@ def test_differences_are_named() -> None:
         ({"observations": {"image": [0, 4]}}, r"observation 'image' has shape \(0, 4\)"),
         ({"observations": {"image": [1e30]}}, "observation 'image' has shape"),
         ({"modalities": {"image": ["touch"]}}, "'touch', which is not an observation"),
-        ({"map_components": ["x", "hinge_y"]}, "component of task 'door' 'x' does not exist"),
+        ({"map_components": ["x", "hinge_y"]}, "component 'x' of task 'door' does not exist"),
         ({"dt": 0}, "dt is 0 s and map_half_width"),
         ({"warmup": -1}, "warmup is -1, expected a whole number"),
         ({"control_size": True}, "control_size is True"),

@@ -167,7 +167,7 @@ def test_blackout_setting_of_an_earlier_version(
 def test_invalid_settings(checkpoint: Checkpoint, episode: Episode) -> None:
     with pytest.raises(BadInput, match="particles must be at least 1, not 0"):
         trace(checkpoint, episode, particles=0)
-    with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist"):
+    with pytest.raises(BadInput, match=r"modality 'touch' of task 'door' does not exist"):
         trace(checkpoint, episode, faults=Faults.parse("drop=touch"))
 
 

@@ -139,8 +139,8 @@ def test_the_page_receives_the_groups(run: Trace) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"contact": True}, "covariate of task 'rover' 'contact' does not exist. Available: fix, stage, speed, height"),
-        ({"stage": "push"}, "group of covariate 'stage' 'push' does not exist. Available: slide, lift"),
+        ({"contact": True}, "covariate 'contact' of task 'rover' does not exist. Available: fix, stage, speed, height"),
+        ({"stage": "push"}, "group 'push' of covariate 'stage' does not exist. Available: slide, lift"),
     ],
 )
 def test_undeclared_covariates_are_rejected(tmp_path: Path, values: dict[str, bool | str], message: str) -> None:

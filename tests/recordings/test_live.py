@@ -304,7 +304,7 @@ def test_no_files_without_steps(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "observations", "options", "message"),
     [
-        ({"estimate": np.zeros(3)}, {}, {}, "value of a filter 'estimate' does not exist"),
+        ({"estimate": np.zeros(3)}, {}, {}, "filter output 'estimate' does not exist"),
         ({"weights": np.ones((2, 1))}, {}, {}, "but not estimate_mean"),
         (np.zeros(2), {}, {}, r"estimate_mean of shape \(1, 2\), expected \(1, 3\)"),
         (np.zeros((2, 3)), {}, {}, r"estimate_mean of shape \(2, 3\), expected \(1, 3\)"),

@@ -225,7 +225,7 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
         "--sql ' '": "has no result",
         "--sql 'SELECT 1; DROP VIEW results'": "has several statements, expected one SELECT",
         "--phase asleep": "no steps in phase 'asleep'. Available: all, blackout, contact, free motion",
-        "--sort speed": "column of the overview 'speed' does not exist",
+        "--sort speed": "column 'speed' of the overview does not exist",
     }.items():
         code, _, error = run(f"experiments {line}", sweep)
         assert code == 2

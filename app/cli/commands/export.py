@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console, options as opt
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, check_name
 
 if TYPE_CHECKING:
     from beliefscope.inspect.trace import Trace
@@ -39,7 +39,7 @@ def export(
       beliefscope export run.trace -o run.html --interactive
       beliefscope export first.trace second.trace -o supplement
     """
-    from beliefscope.recordings.export import export_format, export_trace
+    from beliefscope.recordings.export import FORMATS, export_format, export_trace
     from beliefscope.recordings.open_trace import open_trace
 
     if not output.suffix or output.is_dir():
@@ -51,6 +51,7 @@ def export(
         return opt.trace_result(_page(sources[0], output, task, filter), output)
     if interactive:
         raise BadInput(f"--interactive writes a page: output {str(output)!r} must end in .html")
+    check_name("export format", output.suffix.removeprefix(".").lower(), (*FORMATS, "html"))
     export_format(output)
     trace = open_trace(sources[0], task)
     export_trace(trace, output)

@@ -127,7 +127,7 @@ def test_faults_change_the_images(shared_client: TestClient, shared_trace_url: s
     [
         ("blakout", "fault 'blakout' does not exist. Did you mean blackout? Available: blackout,"),
         ("blackout=2", "blackout's 'probability' is 2, not a number from 0 to 1"),
-        ("drop=touch", "modality of task 'door' 'touch' does not exist. Available: image, haptics."),
+        ("drop=touch", "modality 'touch' of task 'door' does not exist. Available: image, haptics."),
         ("[[", "faults is not JSON"),
         ("secret.json", "fault 'secret.json' does not exist"),
     ],

@@ -68,7 +68,7 @@ def test_events_of_one_phase(run: Run, line: list[object]) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--by", "eror"], "score of task 'door' 'eror' does not exist. Available: error, angle, nees, ess"),
+        (["--by", "eror"], "score 'eror' of task 'door' does not exist. Available: error, angle, nees, ess"),
         (["--phase", "contact"], "phase 'contact' does not exist. Available: contact made"),
         (["--top", "0"], "'0' is not an integer of at least 1"),
     ],

@@ -160,7 +160,7 @@ def test_outdated_cursors_are_skipped(
             json.dumps(cursor(faults="blakout")),
             "fault 'blakout' does not exist. Did you mean blackout? Available: blackout,",
         ),
-        (json.dumps(cursor(faults="delay=touch")), "modality of task 'door' 'touch' does not exist."),
+        (json.dumps(cursor(faults="delay=touch")), "modality 'touch' of task 'door' does not exist."),
         (json.dumps(cursor(size=10**6)), "cursor.size: Input should be 41 or 135."),
         (json.dumps(cursor(angle="wide")), "cursor.angle: Input should be a valid number."),
         (json.dumps(cursor(angle=float("nan"))), "cursor.angle: Input should be a finite number."),

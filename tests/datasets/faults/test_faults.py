@@ -336,7 +336,7 @@ def test_every_fault_is_documented() -> None:
 BAD = {
     "blakout": r"fault 'blakout' does not exist\. Did you mean blackout\? Available: blackout, .*control_scale\.",
     "blackout,,": r"fault '' does not exist\. Available",
-    "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, gray, key, from, ",
+    "blackout:chance=1": r"parameter 'chance' of blackout does not exist\. Available: probability, gray, key, from, ",
     "blackout=1.5": r"blackout's 'probability' is 1\.5, not a number from 0 to 1",
     "blackout=nan": r"blackout's 'probability' is nan, not a number from 0 to 1",
     "blackout=much": r"blackout's 'probability' is 'much', not a number from 0 to 1",
@@ -346,10 +346,10 @@ BAD = {
     "blackout:from": r"'from' in 'blackout:from' is not a new parameter=value",
     "blackout:from=1:from=2": r"'from=2' in 'blackout:from=1:from=2' is not a new parameter=value",
     "force_bias=1e9": r"force_bias's 'x' is 1000000000\.0, not a number from -1e\+06 to 1e\+06",
-    "force_stuck=w": r"axis of force_stuck 'w' does not exist\. Available: x, y, z, all\.",
-    "force_axes=xyz": r"order of force_axes 'xyz' does not exist\. Available: xzy, yxz, yzx, zxy, zyx\.",
+    "force_stuck=w": r"axis 'w' of force_stuck does not exist\. Available: x, y, z, all\.",
+    "force_axes=xyz": r"order 'xyz' of force_axes does not exist\. Available: xzy, yxz, yzx, zxy, zyx\.",
     "contact_stuck=2": r"contact_stuck's 'value' is 2, not a whole number from 0 to 1",
-    "control_scale=0.5:axis=x": r"control_scale 'axis' does not exist\. Available: factor, channel, from, to\.",
+    "control_scale=0.5:axis=x": r"'axis' of control_scale does not exist\. Available: factor, channel, from, to\.",
     "delay=3": r"delay's 'modality' is 3, not a name",
     "delay:steps=-1": r"delay's 'steps' is -1, not a whole number",
     "[1]": r"faults is \[1\], not a list of objects",
@@ -374,7 +374,7 @@ def test_invalid_faults_are_rejected_in_one_line(text: str) -> None:
 
 
 def test_faults_of_missing_sensors_are_rejected(episode: Episode) -> None:
-    with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist\. Available: image, haptics\."):
+    with pytest.raises(BadInput, match=r"modality 'touch' of task 'door' does not exist\. Available: image, haptics\."):
         Faults.parse("delay=touch").check(DOOR)
     no_image = replace(DOOR, observations={"force": (3,)})
     with pytest.raises(BadInput, match=r"blackout needs an image sensor; task 'door' has none\. Its sensors: force\."):
@@ -382,7 +382,7 @@ def test_faults_of_missing_sensors_are_rejected(episode: Episode) -> None:
     flat = replace(episode, observations=dict(episode.observations) | {"force": np.zeros((100, 2), np.float32)})
     with pytest.raises(BadInput, match=r"z=1 uses an axis that the sensor does not have\. Available: x, y\."):
         inject("force_bias:z=1", flat)
-    with pytest.raises(BadInput, match=r"axis of the force 'z' does not exist\. Available: x, y\."):
+    with pytest.raises(BadInput, match=r"axis 'z' of the force does not exist\. Available: x, y\."):
         inject("force_stuck=z", flat)
-    with pytest.raises(BadInput, match=r"axis of the force 'z' does not exist\. Available: x, y\."):
+    with pytest.raises(BadInput, match=r"axis 'z' of the force does not exist\. Available: x, y\."):
         inject("force_axes=zyx", flat)

@@ -106,11 +106,11 @@ def test_several_cameras_have_presets_of_their_own() -> None:
     [
         ("blackout", (), r"blackout needs an image sensor; task 'cameras' has none\. Its sensors: force, tactile\."),
         ("blackout", ("left", "right"), r"name of one of .* 'cameras': blackout:key=left, blackout:key=right$"),
-        ("blackout:key=force", ("left",), r"image sensor of task 'cameras' 'force' does not exist\. Available: left\."),
+        ("blackout:key=force", ("left",), r"image sensor 'force' of task 'cameras' does not exist\. Available: left\."),
         (
             "blackout:key=rigt",
             ("left", "right"),
-            r"image sensor of task 'cameras' 'rigt' does not exist\. Available: left, right\.",
+            r"image sensor 'rigt' of task 'cameras' does not exist\. Available: left, right\.",
         ),
     ],
 )

@@ -188,9 +188,9 @@ def test_collect_switches_ingredients_off(tmp_path: Path) -> None:
     with open_dataset(path) as data:
         assert data.task is PUSH_FIELD
         assert data[1].digest() == simulate_push_field(0, 1, 5, ["outages", "wrist"]).digest()
-    with pytest.raises(BadInput, match=r"ingredient of task 'push-field' 'rain' does not exist\. Available: puck"):
+    with pytest.raises(BadInput, match=r"ingredient 'rain' of task 'push-field' does not exist\. Available: puck"):
         collect("push-field", 2, 5, 0, 1, path, without=["rain"])
-    with pytest.raises(BadInput, match="ingredient of task 'push' 'outages' does not exist"):
+    with pytest.raises(BadInput, match="ingredient 'outages' of task 'push' does not exist"):
         collect("push", 2, 5, 0, 1, path, without=["outages"])
 
 

@@ -145,7 +145,7 @@ def test_hash_covers_code_without_a_file() -> None:
 @pytest.mark.parametrize(
     ("adapter", "message"),
     [
-        ({"components": ("angle", "hinge_x", "hinge_z")}, "component of task 'door' 'hinge_z' does not exist"),
+        ({"components": ("angle", "hinge_x", "hinge_z")}, "component 'hinge_z' of task 'door' does not exist"),
         ({"components": ("angle",)}, "Adapter's components are angle; task 'door' has hinge_x, hinge_y, angle"),
         ({"mean": (0.0, 1.0)}, "Adapter's mean has 2 numbers, expected 3"),
         ({"std": (1.0, 0.0, 1.0)}, r"Adapter's std is \(1.0, 0.0, 1.0\), expected numbers above 0"),

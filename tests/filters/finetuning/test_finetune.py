@@ -301,7 +301,7 @@ def test_settings_survive_json_and_invalid_ones_are_rejected(episodes: list[Epis
     assert FineTune.from_json({}) == FineTune()
     assert list(FineTune().shares()) == [CLEAN]
     for values, message in (
-        ({"step": 3}, "setting of a fine-tuning 'step' does not exist"),
+        ({"step": 3}, "fine-tuning setting 'step' does not exist"),
         ({"steps": "3"}, "setting 'steps' of a fine-tuning is '3'"),
         ({"steps": 0}, "not a whole number from 1 to"),
         ({"train": "all"}, "setting 'train'"),
@@ -313,7 +313,7 @@ def test_settings_survive_json_and_invalid_ones_are_rejected(episodes: list[Epis
     ):
         with pytest.raises(BadInput, match=message):
             FineTune.from_json(values)
-    with pytest.raises(BadInput, match="modality of slice 'x' 'touch' does not exist"):
+    with pytest.raises(BadInput, match="modality 'touch' of slice 'x' does not exist"):
         run(episodes, replace(SMALL, mix=((Slice("x", only=("touch",)), 1.0),)))
     with pytest.raises(BadInput, match="Episode 99 is not in the data, which has episodes 0 to 9"):
         run(episodes, replace(SMALL, events=(StepRange(99),)))

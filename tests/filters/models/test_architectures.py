@@ -111,9 +111,9 @@ def test_missing_keys_of_older_checkpoints_take_their_default() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "kf"}, "kind of a filter 'kf' does not exist. Available: ekf, ukf, pf, lstm."),
-        ({"pooling": "max"}, "pooling of a filter 'max' does not exist. Available: flatten, spatial-softmax, mean."),
-        ({"resampling": "none"}, "resampling of a filter 'none' does not exist. Available: systematic, hard, soft."),
+        ({"kind": "kf"}, "filter kind 'kf' does not exist. Available: ekf, ukf, pf, lstm."),
+        ({"pooling": "max"}, "filter pooling 'max' does not exist. Available: flatten, spatial-softmax, mean."),
+        ({"resampling": "none"}, "filter resampling 'none' does not exist. Available: systematic, hard, soft."),
         ({"soft_share": 0.0}, "soft_share must be above 0 and at most 1, not 0.0"),
         ({"colour": "red"}, "not an architecture of this version: .*'colour'"),
         ({"task": ["door"]}, "incomplete definition of a task"),

@@ -114,7 +114,7 @@ def test_figures_are_written(results: tuple[Diagnostic, Diagnostic, Trace], tmp_
     assert "</svg>" in text
     assert curves[0].name in text
     assert (tmp_path / "several.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(BadInput, match=r"format of a figure 'bmp' does not exist\. Available: svg, pdf, png"):
+    with pytest.raises(BadInput, match=r"figure format 'bmp' does not exist\. Available: svg, pdf, png"):
         write_figure(figure, tmp_path / "one.bmp")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.svg", "several.png"]
 

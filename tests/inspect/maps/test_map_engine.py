@@ -215,7 +215,7 @@ def test_normalised_maps_peak_at_255(pf: MapEngine) -> None:
         ({"step": 10**6}, "it has steps 0 to"),
         ({"step": 0, "size": 1}, "2 to 1024 cells per side, not 1"),
         ({"step": 0, "angle": float("nan")}, "finite number of rad, not nan"),
-        ({"step": 0, "quantity": "prior"}, "quantity of a map 'prior'.*likelihood, posterior"),
+        ({"step": 0, "quantity": "prior"}, "map quantity 'prior'.*likelihood, posterior"),
     ],
 )
 def test_invalid_arguments(pf: MapEngine, arguments: dict, message: str) -> None:

@@ -158,11 +158,11 @@ def test_extents_are_round_in_display_units_and_equal_for_equal_units() -> None:
 
 def test_invalid_choices_are_rejected() -> None:
     maps = engine(make_trace())
-    with pytest.raises(BadInput, match="component of task 'vehicle' 'vz' does not exist"):
+    with pytest.raises(BadInput, match="component 'vz' of task 'vehicle' does not exist"):
         maps.map(0, components=("x", "vz"))
     with pytest.raises(BadInput, match="one component or two different ones, not x and x"):
         maps.map(0, components=("x", "x"))
-    with pytest.raises(BadInput, match="'mean' does not exist"):
+    with pytest.raises(BadInput, match="treatment 'mean' of the components"):
         maps.map(0, others="mean")  # type: ignore[arg-type]
 
 

@@ -326,7 +326,7 @@ INVALID = {
     "returns only particles, expected both particles and log_weights, or neither": {
         "particles": torch.ones(T, 1, 4, 3)
     },
-    "value of a filter 'wieghts' does not exist. Did you mean weights or log_weights? ": {"wieghts": torch.zeros(1)},
+    "filter output 'wieghts' does not exist. Did you mean weights or log_weights? ": {"wieghts": torch.zeros(1)},
     "returns weights as a float, expected an array or a Tensor": {"weights": 0.5},
 }
 

@@ -97,7 +97,7 @@ def test_standalone_runs_see_one_sensor() -> None:
     result = evaluate(filter_, [episode], only="gps", modalities=True)
     assert result.rmse == result.standalone["gps"].rmse
     assert result.rmse["y_cm"] < result.standalone["speed"].rmse["y_cm"]  # the speed sensor measures vx only
-    with pytest.raises(BadInput, match="modality of task 'vehicle' 'lidar' does not exist"):
+    with pytest.raises(BadInput, match="modality 'lidar' of task 'vehicle' does not exist"):
         evaluate(filter_, [episode], only="lidar")
 
 
@@ -154,5 +154,5 @@ def test_occlusion_of_a_step_equals_the_kalman_gain() -> None:
         assert result.occlusion["gps"][0] == pytest.approx(run.estimate_mean[step, 0] - other, abs=1e-5)
         assert "Largest change by one channel or square" in result.verdict
         assert result.views()["tables"]
-    with pytest.raises(BadInput, match="target of filter 'mine' 'z' does not exist"):
+    with pytest.raises(BadInput, match="target 'z' of filter 'mine' does not exist"):
         DIAGNOSTICS["saliency"]([run], filter_, target="z")

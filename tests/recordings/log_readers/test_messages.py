@@ -143,7 +143,7 @@ def test_a_guessed_map_imports_the_log(log: Path, tmp_path: Path) -> None:
         (
             "/truth.pose.pose.position.x",
             "/truth.pose.pose.position.u",
-            "field of column .* 'u' does not exist.* x, y, z",
+            "field 'u' of column .* does not exist.* x, y, z",
         ),
         ("/imu.angular_velocity", "/stage.data", "column '/stage.data' of sensor gyro has text"),
         ("covariance[0,1,5,6,7,11,30,31,35]", "covariance[0,1,99]", r"no \[0,1,99\]"),
@@ -287,7 +287,7 @@ def test_the_command_line_imports_a_log(json_log: Path, tmp_path: Path, run: Cal
         "import", json_log, "--map", map_file(tmp_path, MAP.replace("/imu", "/imi")), "-o", tmp_path / "b.h5"
     )
     assert code == 2
-    assert error.startswith("error: log.mcap: topic of column '/imi.angular_velocity' does not exist")
+    assert error.startswith("error: log.mcap: topic in column '/imi.angular_velocity' does not exist")
     assert error.count("\n") == 1
     unknown = map_file(tmp_path, MAP.replace('"/truth.pose.pose.position.x"', '""'))
     code, _, error = run("import", json_log, "--map", unknown, "-o", tmp_path / "b.h5")
