@@ -52,7 +52,7 @@ def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, epi
         evidence = next(iter(cause["evidence"]), None) or {"text": "", "episode": None, "step": None}
         text = f"Probability {cause['probability']:.2f}: {evidence['text']}"
         if (recovered := cause["recovered"]) and recovered["error"] is not None:
-            text += f"; undoing it removes {100 * recovered['error']:.0f} % of the {recovered['measure']} error"
+            text += f"; undoing it removes {100 * recovered['error']:z.0f} % of the {recovered['measure']} error"
         title = diagnosis["headline"] if cause is diagnosis["causes"][0] else cause["title"]
         at = episode if evidence["episode"] is None else evidence["episode"]
         yield Weakness("diagnosis", title, f"{text}.", at, evidence["step"], settings)

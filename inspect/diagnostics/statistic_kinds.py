@@ -20,7 +20,7 @@ KINDS = {
     "module power": ("sharpness of the measurement model", True, 0.02),
     "module nis": ("squared error over predicted variance of the measurement model", True, 0.05),
     "module spread": ("standard deviation of the error of the measurement model", True, 0.02),
-    "module scatter": ("variation of the bias between episodes of the measurement model", True, 0.05),
+    "module scatter": ("variation between episodes of the bias of the measurement model", True, 0.05),
     "dynamics bias": ("bias of the dynamics model", False, 2e-5),
     "dynamics error": ("error of the dynamics model", True, 0.02),
     "dynamics offset": ("mean error of the dynamics model", False, 2e-5),
@@ -54,14 +54,14 @@ KINDS = {
     "brightness": ("exposure{of} relative to healthy images", True, 0.03),
     "occlusion": ("share of occluded pixels", False, 0.01),
     "shift": ("shift", False, 0.2),
-    "lag": ("delay{of} in steps behind the other sensors", False, 0.5),
-    "contact lag": ("delay{of} in steps behind the labelled contact", False, 0.5),
-    "reading lag": ("delay{of} in steps behind the labels", False, 0.5),
-    "reading lag scatter": ("variation between episodes of the delay{of} in steps behind the labels", False, 0.5),
+    "lag": ("delay{of} behind the other sensors", False, 0.5),
+    "contact lag": ("delay{of} behind the labelled contact", False, 0.5),
+    "reading lag": ("delay{of} behind the labels", False, 0.5),
+    "reading lag scatter": ("variation between episodes of the delay{of} behind the labels", False, 0.5),
     "reading bias": ("error{of} against the value expected from the labels, relative to its noise,", False, 0.3),
-    "reading scatter": ("variation{of} of its error between episodes, relative to its noise,", False, 0.3),
+    "reading scatter": ("variation between episodes of the error{of}, relative to its noise,", False, 0.3),
     "reading gain": ("slope{of} on the value expected from the labels", False, 0.05),
-    "reading noise": ("noise{of} beside the value expected from the labels, relative to healthy noise,", True, 0.05),
+    "reading noise": ("noise{of} around the value expected from the labels, relative to healthy noise,", True, 0.05),
     "inverted": ("evidence for the opposite sign of the channel{of}", False, 0.1),
     "exchanged": ("evidence for another order of the channels{of}", False, 0.1),
     "hand offset": ("distance of the hand in the image from its measured position{axis}", False, 0.1),
@@ -79,7 +79,7 @@ KINDS = {
     "position noise": ("noise", False, 5e-4),
     "stuck": ("share of repeated readings", False, 0.02),
     "saturation": ("share of saturated readings", False, 0.01),
-    "share": ("share of steps with the flag{of}", False, 0.02),
+    "share": ("share of steps with the flag{of} set", False, 0.02),
     "toggles": ("share of steps at which the flag{of} changes", False, 0.01),
     "agreement": ("correlation{of} with the force", False, 0.05),
     "opposition": ("negative correlation{of} with the force", False, 0.05),
@@ -90,7 +90,7 @@ KINDS = {
     "axes": ("evidence for the order of the axes", False, 0.3),
     "direction": ("cosine between force and motion of the hand{axis}", False, 0.05),
     "compliance": ("compliance of the hand to the force{axis}", False, 2e-5),
-    "following": ("delay of the hand in steps behind its set point{axis}", False, 0.05),
+    "following": ("delay of the hand behind its set point{axis}", False, 0.05),
     "opposed": ("evidence for the opposite sign", False, 0.1),
     "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
 }
@@ -149,6 +149,7 @@ OF_KINDS = {
     **dict.fromkeys(("shift", "hand offset", "object offset"), ("px", 1.0)),
     "unflagged force": ("N", 1.0),
     "compliance": ("mm/N", 1e3),
+    **dict.fromkeys(("lag", "contact lag", "reading lag", "following"), ("steps", 1.0)),
     **dict.fromkeys(LENGTHS, display_unit("m")),
 }
 """Kind of statistic -> its unit for display, and the factor from its own."""
@@ -176,7 +177,7 @@ def label_of(statistic: str, has_contact: bool = True) -> str:
     title = KINDS[kind][0] if kind in KINDS else kind
     name, _, axis = subject.partition(" ")
     if (kind, name) == ("lag", "labels"):
-        return f"delay of the labels in steps behind {display_name(axis) or 'all modalities'}"
+        return f"delay of the labels behind {display_name(axis) or 'all modalities'}"
     owner, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
     title = title.format(of=owner + axis, axis=axis) if "{" in title else title + owner + axis
     before, after = PHASES.get(phase, ("", f" in {phase}"))

@@ -22,9 +22,10 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
     ("statistic", "label"),
     [
         ("weight/image hinge_x/contact", "effective weight of image (hinge x) in contact"),
-        ("lag/image/all", "delay of image in steps behind the other sensors"),
-        ("lag/labels wrist_cam/all", "delay of the labels in steps behind wrist cam"),
-        ("lag/labels/all", "delay of the labels in steps behind all modalities"),
+        ("lag/image/all", "delay of image behind the other sensors"),
+        ("lag/labels wrist_cam/all", "delay of the labels behind wrist cam"),
+        ("reading scatter/gps x/all", "variation between episodes of the error of gps (x), relative to its noise,"),
+        ("lag/labels/all", "delay of the labels behind all modalities"),
         ("opposed/control x/all", "evidence for the opposite sign of control (x)"),
     ],
 )
@@ -53,6 +54,7 @@ def test_without_contact_statistics_are_those_of_whole_episodes() -> None:
         ("level/force y/free motion", "N", 1.0),
         ("drift/torque x/all", "N m/s", 1.0),
         ("level/pressure/all", "", 1.0),
+        ("lag/image/all", "steps", 1.0),
         ("hand offset/image x/all", "px", 1.0),
         ("nees/fused/all", "", 1.0),
         ("dynamics slope/hinge_x/all", "", 1.0),
