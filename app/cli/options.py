@@ -178,7 +178,7 @@ OPTIONS: dict[str, Any] = {
     "align": flag(
         "Move data of another frame by the constant offset that explains the difference.", "--align", default=...
     ),
-    "json": option("-", "Print one JSON document instead of text: --json -", callback=_check_json),
+    "json": option("-", "Print one JSON document instead of text.", callback=_check_json),
 }
 """Parameter of a command -> its description, where the command has no own one."""
 

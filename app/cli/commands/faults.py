@@ -5,8 +5,8 @@ def faults() -> console.Result:
     """List the sensor faults available for --faults.
 
     Several faults are separated by commas and applied in order. The value after a fault's name is its first
-    parameter; others follow as :parameter=value. A fault lasts from the first to the last step unless :from=STEP or
-    :to=STEP is given. Values are in SI units, gray levels from 0 to 255, and pixels.
+    parameter; others follow as :parameter=value. By default, a fault covers all steps; :from=STEP is its first step,
+    :to=STEP the first step after it. Values are in SI units, gray levels from 0 to 255, and pixels.
 
     \b
     Examples:

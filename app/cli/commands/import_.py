@@ -15,9 +15,7 @@ RECORDINGS = (".rrd", ".live")
 
 
 def import_(
-    source: Path = opt.argument(
-        "FILE", "Recording (.rrd), file of a live run (.live), or log: a file or folder, see below."
-    ),
+    source: Path = opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log (file or folder)."),
     output: Path | None = opt.output_file(
         "RUN.trace|RUN.live|DATA.h5",
         "Output: a trace, a run for the folder live of a workspace, or a data set.",

@@ -53,7 +53,7 @@ const columnsOf = (task) => [
     ...errorColumn(
       task,
       'rmse',
-      'RMSE without the first 30 steps (field tasks: all steps)',
+      'RMSE without the warm-up of the task: 30 steps by default, none for field tasks',
       (e) => e?.rmse,
     ),
     title: withUnit('RMSE', mainUnit(task).unit),

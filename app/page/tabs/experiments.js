@@ -36,7 +36,7 @@ const EMPTY = {
       'A sweep runs many checkpoints over many episodes. Its table shows which of them fail, where and under which sensor faults; each row opens its worst step.',
     ],
   ],
-  purpose: 'To make one, run your checkpoints and serve the results.',
+  purpose: 'To create one, run your checkpoints and serve the results.',
   commands: [
     "beliefscope sweep --checkpoints 'runs/*.safetensors' -o sweep",
     'beliefscope serve --sweep sweep',

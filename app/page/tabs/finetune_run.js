@@ -25,7 +25,7 @@ const SAVED_AS = {
   saved: 'The fine-tuned checkpoint is in the catalog, next to its base checkpoint.',
   default: 'The fine-tuned checkpoint is in the catalog, as the default filter of this server.',
 };
-const RESUMES = 'It resumes from its last validation.';
+const RESUMES = 'The run resumes from its last validation.';
 
 const BODY = `
   <div class="row"><button type="button" class="text quiet back">‹ New run</button><h3></h3></div>

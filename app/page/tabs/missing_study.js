@@ -35,7 +35,7 @@ export function missingStudy(study, catalog, store) {
       [ABOUT],
       ...(buttons.length ? [[`The ${source} has results for `, ...buttons]] : []),
     ],
-    purpose: `To make one, ${selected?.simulated ? 'collect data' : 'use your data'} of ${name}, train, and serve the results.`,
+    purpose: `To create one, ${selected?.simulated ? 'collect data' : 'use your data'} of ${name}, train, and serve the results.`,
     commands: studyCommands(name, selected?.modalities ?? [], selected?.simulated ?? false),
   });
 }

@@ -19,7 +19,7 @@ export const STEPS = [
   {
     part: '#maps',
     title: 'Likelihood maps',
-    text: 'Where each modality locates the object at this step, and both together. The cross is the truth.',
+    text: 'Where each modality and their fusion locate the object at this step. The cross is the true position.',
   },
   {
     part: '#step',
