@@ -80,7 +80,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             slices=tuning.compared_slices(base.filter),
             particles=settings.particles,
             seed=settings.seed,
-            progress=lambda done: report(share("comparison", done), "comparing the result with its base"),
+            progress=lambda done: report(share("comparison", done), "comparing the result with the base checkpoint"),
         )
     success = None if tuning.success is None else judge(tuning.success, comparison, finetuned.task)
     result_json = _result(comparison, finetuned, arguments["filter"], data_name) | {"success": success}

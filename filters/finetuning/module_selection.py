@@ -243,7 +243,7 @@ def _matches(module: nn.Module, available: Mapping[str, tuple[str, ...]], patter
         candidates = dict.fromkeys([*available, *(prefix for name in tensors for prefix in _prefixes(name))])
         close = get_close_matches(pattern, candidates, n=3, cutoff=0.6)
         hint = f" Did you mean {' or '.join(close)}?" if close else ""
-        raise BadInput(f"pattern {pattern!r} matches no part of this filter.{hint} {_available(module, available)}")
+        raise BadInput(f"pattern {pattern!r} matches no module of this filter.{hint} {_available(module, available)}")
     return names
 
 

@@ -82,7 +82,7 @@ def _captum() -> Any:
     try:
         from captum import attr  # slow to import
     except ImportError:
-        raise BadInput("saliency needs captum, which is not installed: pip install captum") from None
+        raise BadInput("saliency needs the package captum: pip install 'beliefscope[attribution]'") from None
     return attr
 
 

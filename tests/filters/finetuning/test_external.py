@@ -116,7 +116,7 @@ def test_invalid_losses_modules_and_weights_are_refused(
         tune(base, episodes, loss=lambda module, windows: 1.0)
     with pytest.raises(BadInput, match="fails: KeyError"):
         tune(base, episodes, loss=lambda module, windows: windows.observations["image"])
-    with pytest.raises(BadInput, match="pattern 'sensr' matches no part"):
+    with pytest.raises(BadInput, match="pattern 'sensr' matches no module"):
         tune(base, episodes, FineTune(train=("sensr",)))
     with pytest.raises(BadInput, match=r"no training episode has 80 steps"):
         tune(base, episodes, FineTune(length=80))

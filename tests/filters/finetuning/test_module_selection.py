@@ -102,9 +102,11 @@ def test_patterns_match_at_any_depth_and_freeze_takes_precedence() -> None:
 
 def test_patterns_without_match_are_rejected_with_suggestions() -> None:
     filter_ = door()
-    with pytest.raises(BadInput, match=r"'weigth_model' matches no part.*Did you mean weight_model.*Available: .*all;"):
+    with pytest.raises(
+        BadInput, match=r"'weigth_model' matches no module.*Did you mean weight_model.*Available: .*all;"
+    ):
         select_parameters(filter_, freeze=["weigth_model"])
-    with pytest.raises(BadInput, match=r"'touch-only' matches no part .*haptics-only"):
+    with pytest.raises(BadInput, match=r"'touch-only' matches no module .*haptics-only"):
         select_parameters(filter_, ["touch-only"])
     with pytest.raises(BadInput, match=r"--train dynamics-only --freeze dynamics leaves nothing to train"):
         select_parameters(filter_, ["dynamics-only"], ["dynamics"])
