@@ -27,7 +27,7 @@ def test_task_is_consistent(task) -> None:  # type: ignore[no-untyped-def]
 def test_unknown_names_list_the_available_ones() -> None:
     with pytest.raises(BadInput, match=r"task 'dor' does not exist\. Available: door"):
         find_task("dor")
-    with pytest.raises(BadInput, match=r"component of task 'door' 'hinge_z' .*Available: hinge_x, hinge_y, angle"):
+    with pytest.raises(BadInput, match=r"component 'hinge_z' of task 'door' .*Available: hinge_x, hinge_y, angle"):
         find_task("door").index("hinge_z")
 
 

@@ -50,14 +50,17 @@ EDIT = ("counterfactual", "door", "--faults", "blackout", "--from", 40)
         (("figure", "maps", "door", "-o", "new.svg", "--step", 0, "--step", 1), "steps 0 and 1 are both in"),
         (("diagnose", "door", "--repair", 9999), "Episode 9999 is not in"),
         (("diagnose", "door", "--profile-filter", "crossmodal-ekf"), "--profile-filter needs --profile-from"),
-        (("failures", "door", "--by", "eror"), "'eror' does not exist"),
+        (("failures", "door", "--by", "eror"), "score 'eror' of task 'door' does not exist"),
         (("failures", "door", "--url", "foo"), "--url 'foo' is not an address such as http://127.0.0.1:8000"),
         (("evaluate", "door", "--start-offset", "3K"), "start offset '3K' is not in a unit of task 'door': cm, deg"),
         (("evaluate", "door", "--only", "sound"), "'sound'"),
         (("slices", "door", "--alpha", 2), "--alpha is 2, not a probability"),
         (("calibrate", "door", "-o", "new.json", "--level", 2), "level is 2, not a number between 0 and 1"),
         (("live", "door", "--episode", 9999), "Episode 9999 is not in"),
-        (("record", "door", "-o", "new.rrd", "--faults", "blackout:key=force"), "'force' does not exist"),
+        (
+            ("record", "door", "-o", "new.rrd", "--faults", "blackout:key=force"),
+            "image sensor 'force' of task 'door' does not exist",
+        ),
     ],
 )
 def test_arguments_are_checked_before(run: Run, source: str, command: tuple[object, ...], message: str) -> None:

@@ -73,7 +73,7 @@ def test_invalid_interventions(replay: Replay) -> None:
         Intervention(40, 60, weights={"image": 1.5})
     with pytest.raises(BadInput, match="after the last step of this episode"):
         replay.with_intervention(Intervention(40, 101))
-    with pytest.raises(BadInput, match="'touch' does not exist"):
+    with pytest.raises(BadInput, match="modality 'touch' of filter"):
         replay.with_intervention(Intervention(40, 60, weights={"touch": 0.5}))
 
 

@@ -334,7 +334,9 @@ def test_channels_have_names_and_units() -> None:
 
 
 def test_invalid_arguments_are_refused() -> None:
-    with pytest.raises(BadInput, match=r"'beta:touch' does not exist\. Available: hinge_x, hinge_y, angle, log-like"):
+    with pytest.raises(
+        BadInput, match=r"'beta:touch' of filter .* does not exist\. Available: hinge_x, hinge_y, angle, log-"
+    ):
         saliency_of("crossmodal-ekf", target="beta:touch")
     with pytest.raises(BadInput, match="step 40 is not in this trace: it has steps 0 to 39"):
         saliency_of("crossmodal-ekf", step=40)
@@ -346,5 +348,5 @@ def test_invalid_arguments_are_refused() -> None:
 
 def test_missing_captum_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "captum", None)
-    with pytest.raises(BadInput, match="pip install captum"):
+    with pytest.raises(BadInput, match=r"pip install 'beliefscope\[attribution\]'"):
         saliency_of("crossmodal-ekf", step=VISIBLE)

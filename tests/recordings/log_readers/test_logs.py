@@ -241,7 +241,11 @@ def test_times_of_the_log_are_kept(tmp_path: Path) -> None:
         ("[estimate]", '[estimate]\nweights = "sd_x"', "expected a table"),
         ("[estimate]", "[estimate]\nweights = {gps = 1}", "gps in map.toml is 1"),
         ("[estimate]", '[covariates]\nv = {column = "t", cuts = [2, 1]}\n[estimate]', "covariate 'v'"),
-        ("[estimate]", '[modalities]\nradio = ["gps", "imu"]\n[estimate]', "'imu' does not exist. Available: gps"),
+        (
+            "[estimate]",
+            '[modalities]\nradio = ["gps", "imu"]\n[estimate]',
+            "sensor 'imu' of modality 'radio' does not exist. Available: gps",
+        ),
         ("[estimate]", '[modalities]\nradio = "gps"\n[estimate]', "modality 'radio' .* expected a list of sensors"),
         ("[sensors]", '[modalities]\ngps = ["imu"]\n[sensors]\nimu = "gps_x"', "'gps' .* rename one"),
     ],

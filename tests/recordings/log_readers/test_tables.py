@@ -158,7 +158,7 @@ def test_objects_are_refused(tmp_path: Path) -> None:
         ("fps", 0, "fps in info.json is 0"),
         ("fps", "ten", "fps in info.json is 'ten', expected a number above 0"),
         ("fps", None, "fps in info.json is None, expected a number above 0"),
-        ("features", {}, "'observation.images.top' does not exist"),
+        ("features", {}, "column 'observation.images.top' of sensor top does not exist"),
         ("features", {"a": "b"}, "feature 'a' in info.json is 'b', expected a table with dtype and shape"),
         ("total_frames", 21, "data has 20 frames and info.json 21, expected the same"),
     ],
@@ -362,5 +362,7 @@ def test_stacked_episodes_are_explained(tmp_path: Path) -> None:
 def test_errors_list_few_of_many_columns(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", **{f"pixel_{i}": np.zeros(2) for i in range(500)})
     mapping = read_map(map_file(tmp_path, 'dt = 0.1\n[state]\nx = "pixel"\n[sensors]\npose = "pixel_1"\n'))
-    with pytest.raises(BadInput, match=r"'pixel' does not exist.*Available: pixel_0, .*pixel_59 and 440 more\.$"):
+    with pytest.raises(
+        BadInput, match=r"column 'pixel' of .* does not exist.*Available: pixel_0, .*pixel_59 and 440 more\.$"
+    ):
         read_log(read_columns(tmp_path / "log.npz", mapping), mapping, "log.npz")
