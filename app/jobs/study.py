@@ -20,7 +20,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     def progress(cell: Cell) -> Callable[[str, int, int, float], None]:
         def update(stage: str, step: int, count: int, loss: float) -> None:
-            report(len(completed) / len(unfinished), f"{cell}: {stage}, {step / count:.0%}, loss {loss:.3g}")
+            report(len(completed) / len(unfinished), f"{cell}: {stage}, {100.0 * step / count:.0f} %, loss {loss:.3g}")
 
         return update
 

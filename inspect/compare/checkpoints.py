@@ -171,10 +171,10 @@ class CheckpointComparison(Diagnostic):
     def event_table(self) -> Table:
         """One row per regressed event."""
         timed = any(m.time is not None for m in self.events)
-        time = ("time s",) if timed else ()
+        time = ("time (s)",) if timed else ()
         columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", "contact")
         unit, factor = self.conversion
-        columns += tuple(f"{name} {unit}".rstrip() for name in ("before", "after", "increase"))
+        columns += tuple(with_unit(name, unit) for name in ("before", "after", "increase"))
         rows = tuple(
             (
                 m.slice,

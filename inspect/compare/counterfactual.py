@@ -177,7 +177,7 @@ class Counterfactual(Diagnostic):
             (name, largest, unit, step, *(() if self.time is None else (float(self.time[step]),)))
             for name, (largest, step, unit) in self._peaks().items()
         )
-        heads = ("component", "difference", "unit", "step", *(() if self.time is None else ("time s",)))
+        heads = ("component", "difference", "unit", "step", *(() if self.time is None else ("time (s)",)))
         tables.append(Table("Largest difference of the estimates", heads, peaks))
         if self.modalities:
             tables.append(self._modality_table())

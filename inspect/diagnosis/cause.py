@@ -233,7 +233,7 @@ def _evidence_table(title: str, heads: tuple[str, ...], rows: Sequence[tuple[tup
     """A table of deviations, with their times where the data have timestamps. rows: first columns, and deviation."""
     timed = any(e.time is not None for _, e in rows)
     values = tuple((*first, e.text, e.episode, e.step, *((e.time,) if timed else ())) for first, e in rows)
-    return Table(title, (*heads, "deviation", "episode", "step", *(("time s",) if timed else ())), values)
+    return Table(title, (*heads, "deviation", "episode", "step", *(("time (s)",) if timed else ())), values)
 
 
 def index_ranges(indices: Sequence[int]) -> str:

@@ -100,9 +100,8 @@ class Conventions(Diagnostic):
     def verdict(self) -> str:
         count = len(self.changes)
         if not self.relevant_removals:
-            text = (
-                f"None of {count} changes of signs, scales, axes and delays lowers an error by {RELEVANT:.0%} or more."
-            )
+            limit = f"{100.0 * RELEVANT:.0f} %"
+            text = f"None of {count} changes of signs, scales, axes and delays lowers an error by {limit} or more."
         else:
             i, j = self.relevant_removals[0]
             text = f"With {self.changes[i].text}, {self._effect(i, j)}: filter and data may disagree about it."

@@ -97,12 +97,12 @@ class Ensemble(Diagnostic):
         outside = np.mean([c.outside for c in self.components])
         text = (
             f"The ensemble of {self.members} is {self.status}: its error is {self.ratio:.2g} times its spread. "
-            f"The true state is outside of all members in {outside:.1%} of steps ({2 / (self.members + 1):.1%} if "
-            "reliable)."
+            f"The true state is outside of all members in {100.0 * outside:.1f} % of steps "
+            f"({200.0 / (self.members + 1):.1f} % if reliable)."
         )
         worst = max(self.components, key=lambda c: c.collapsed)
         if worst.collapsed:
-            text += f" It collapses in {worst.collapsed:.1%} of steps ({display_name(worst.component)})."
+            text += f" It collapses in {100.0 * worst.collapsed:.1f} % of steps ({display_name(worst.component)})."
         best = max(self.components, key=lambda c: c.correlation)
         predictive = best.correlation > 0.3
         text += " Its spread " + ("predicts" if predictive else "does not predict") + " which steps have large errors"

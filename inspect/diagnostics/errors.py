@@ -84,15 +84,15 @@ class Errors(Diagnostic):
             worst = max(others, key=lambda group: group.position)
             steps = worst.steps / total.steps
             text += f"; largest in {worst.name}: {self._text(worst.position)}"
-            text += f" ({worst.share:.0%} of the squared error in {steps:.0%} of the steps)"
+            text += f" ({100.0 * worst.share:.0f} % of the squared error in {100.0 * steps:.0f} % of the steps)"
         parts = [f"{text}."]
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
             noun, verb = ("outage", "has") if outage.count == 1 else ("outages", "have")
             text = f"{outage.count} {noun} of {display_name(outage.modality)}, up to {outage.longest:.3g} s, {verb} "
-            text += f"{outage.share:.0%} of the squared error in {outage.steps:.0%} of the steps"
+            text += f"{100.0 * outage.share:.0f} % of the squared error in {100.0 * outage.steps:.0f} % of the steps"
             if (long := outage.dominant) is not None and long.steps < outage.steps:
-                text += f"; those over {long.low:g} s have {long.share:.0%} in {long.steps:.0%}, with an error of "
-                text += self._text(math.sqrt(long.square))
+                text += f"; those over {long.low:g} s have {100.0 * long.share:.0f} % in {100.0 * long.steps:.0f} %"
+                text += f", with an error of {self._text(math.sqrt(long.square))}"
             if not math.isnan(outage.recovery):
                 text += f"; recovery takes {outage.recovery:.3g} s" if outage.recovery else "; recovery is immediate"
             if outage.unrecovered:

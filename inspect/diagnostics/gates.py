@@ -106,7 +106,7 @@ class Innovations(Diagnostic):
             elif not entry.gate and entry.extreme > EXCESS * TAIL * entry.measurements:
                 gate = f"{entry.extreme} of {entry.measurements} exceed the 99.9 % quantile, and there is no gate"
             elif entry.gate:
-                share = f"{1.0 - entry.accepted:.1%} of {entry.measurements} measurements rejected"
+                share = f"{100.0 * (1.0 - entry.accepted):.1f} % of {entry.measurements} measurements rejected"
                 gate = f"{gate}, {share}" if gate else "no measurement had to be rejected"
             sentences.append("; ".join(filter(None, [size, gate])) + ".")
         return " ".join(sentences)

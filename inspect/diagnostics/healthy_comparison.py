@@ -143,7 +143,7 @@ class Comparison:
         if self.trajectories > 1:
             return f"Alarm, {texts}"
         rarity = f"as up to 1 in {1.0 / SINGLE_SIGNIFICANCE:.0f} healthy ones"
-        return f"Unusual episode ({rarity}), {texts} Test several episodes before concluding a fault."
+        return f"Unusual episode ({rarity}), {texts} Test several episodes before you conclude that there is a fault."
 
     def table(self) -> Table:
         """One row per statistic."""

@@ -122,9 +122,11 @@ class ParticleHealth(Diagnostic):
     @property
     def verdict(self) -> str:
         total, worst, count = self.phases[0], self.worst, self.particles
-        frequency = f"below {DEGENERATE:.0%} of {count} particles in {total.degenerate:.1%} of steps"
+        frequency = (
+            f"below {100.0 * DEGENERATE:.0f} % of {count} particles in {100.0 * total.degenerate:.1f} % of steps"
+        )
         if not total.degenerate:
-            frequency = f"never below {DEGENERATE:.0%} of {count} particles"
+            frequency = f"never below {100.0 * DEGENERATE:.0f} % of {count} particles"
         conditions = [phase for phase in ("contact", "blackout") if getattr(worst, phase)[0]]
         where = f"step {self.worst_step} of episode {self.worst_episode}" + (
             f", in {' and '.join(conditions)}" if conditions else ""
@@ -138,14 +140,14 @@ class ParticleHealth(Diagnostic):
         phases = [entry for entry in self.phases[1:] if entry.degenerate > 1.5 * total.degenerate > 0.0]
         if phases:
             most = max(phases, key=lambda entry: entry.degenerate)
-            parts.append(f"Degeneracy is most frequent in {most.phase}: {most.degenerate:.1%} of steps.")
+            parts.append(f"Degeneracy is most frequent in {most.phase}: {100.0 * most.degenerate:.1f} % of steps.")
         parts.append(
-            f"The true state is outside of all predicted particles in {total.outside:.1%} of steps."
+            f"The true state is outside of all predicted particles in {100.0 * total.outside:.1f} % of steps."
             if total.outside
             else "The true state is always covered by the predicted particles."
         )
         if total.several_modes:
-            parts.append(f"The posterior is multimodal in {total.several_modes:.1%} of steps.")
+            parts.append(f"The posterior is multimodal in {100.0 * total.several_modes:.1f} % of steps.")
         return " ".join(parts)
 
     def tables(self) -> list[Table]:
@@ -170,7 +172,7 @@ class ParticleHealth(Diagnostic):
             "steps",
             "ESS (median)",
             "ESS (minimum)",
-            f"ESS below {DEGENERATE:.0%} (% of steps)",
+            f"ESS below {100.0 * DEGENERATE:.0f} % (% of steps)",
             "largest weight (median)",
             "with offspring (median)",
             "resampled (% of steps)",

@@ -181,7 +181,7 @@ class Failures(Diagnostic):
     def phase_table(self) -> Table:
         """One row per phase."""
         factor = self.conversion[1]
-        columns = ("phase", "steps %", "events", "events %", "lift x", "p-value", "mean inside", "mean outside")
+        columns = ("phase", "steps (%)", "events", "events (%)", "lift", "p-value", "mean inside", "mean outside")
         rows = [
             (
                 g.name,
@@ -201,13 +201,13 @@ class Failures(Diagnostic):
         """One row per event with the values at its peak; updates that the filter does not report have no column."""
         known = [i for i, n in enumerate(self.layers) if n == "fused" or any(np.isfinite(e.error[i]) for e in events)]
         columns: tuple[str, ...] = ("episode", "step", "from", "to")
-        columns += ("time s", "from s", "to s") if self.timed else ()
+        columns += ("time (s)", "from (s)", "to (s)") if self.timed else ()
         columns += (self._label, "phase")
-        columns += tuple(f"{layer_label(self.layers[i])} {self.error_conversion[0]}".rstrip() for i in known)
-        columns += tuple(f"{display_name(name)} deg" for name in self.angles)
+        columns += tuple(with_unit(layer_label(self.layers[i]), self.error_conversion[0]) for i in known)
+        columns += tuple(f"{display_name(name)} (deg)" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         if any(event.effective_weights is not None for event in events):
-            columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1])
+            columns += tuple(f"effective weight of {display_name(layer)} (%)" for layer in self.layers[:-1])
         return Table("Worst events", columns, tuple(self._row(event, known) for event in events))
 
     def _row(self, event: Event, known: list[int]) -> tuple[Value, ...]:

@@ -12,6 +12,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.task import with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
@@ -118,9 +119,15 @@ class ErrorSlices(Diagnostic):
     def tables(self) -> list[Table]:
         """One row per slice; scores in display units."""
         unit, factor = self.conversion
-        label = f" {unit}".rstrip()
-        columns: tuple[str, ...] = ("slice", "ratio x", "from", "to", f"inside{label}", f"outside{label}")
-        columns += ("episodes", "steps", "steps %", "p-value")
+        columns: tuple[str, ...] = (
+            "slice",
+            "ratio",
+            "from",
+            "to",
+            with_unit("inside", unit),
+            with_unit("outside", unit),
+        )
+        columns += ("episodes", "steps", "steps (%)", "p-value")
         rows = [
             (
                 s.where,

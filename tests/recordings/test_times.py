@@ -197,7 +197,7 @@ def test_tables_name_the_times(run: Trace, episode: Episode) -> None:
     result = compare(run, counterfactual, Intervention(5, 9, Faults.parse("sensor_bias=range:offset=1")))
     assert f"(step 9, {episode.times[9]:.2f} s)" in result.verdict
     table = next(table for table in result.tables() if table.title == "Largest difference of the estimates")
-    assert (table.columns[-1], table.rows[0][-2:]) == ("time s", (9, episode.times[9]))
+    assert (table.columns[-1], table.rows[0][-2:]) == ("time (s)", (9, episode.times[9]))
     assert f"(step 9, {episode.times[9]:.2f} s)" in compare_runs(run, counterfactual).verdict
     assert event_table(run, 9, None).title == f"Step 9 ({episode.times[9]:.2f} s) of episode 0"
     plain = replace(run, episode=replace(episode, time=None))

@@ -37,7 +37,7 @@ def test_effective_sample_size_of_equal_weights_is_their_number(count: int) -> N
     total = result.phases[0]
     assert (total.phase, total.steps) == ("all", 30)
     assert total.degenerate == float(count < 0.1 * M)
-    assert ("never below 10% of 100 particles" in result.verdict) == (count >= 10)
+    assert ("never below 10 % of 100 particles" in result.verdict) == (count >= 10)
 
 
 def test_effective_sample_size_of_unequal_weights() -> None:
@@ -91,7 +91,7 @@ def test_true_state_outside_of_all_particles() -> None:
         sentence = (
             "always covered by the predicted particles"
             if share
-            else "outside of all predicted particles in 100.0% of steps"
+            else "outside of all predicted particles in 100.0 % of steps"
         )
         assert sentence in result.verdict
 

@@ -218,9 +218,11 @@ def test_timestamps_give_events_and_phases_their_times(traces: list[Trace]) -> N
     assert f"at step 42 ({times[42]:.2f} s) of episode" in after.verdict
     assert " s)" not in before.verdict
     columns = after.tables()[1].columns
-    assert columns[:7] == ("episode", "step", "from", "to", "time s", "from s", "to s")
+    assert columns[:7] == ("episode", "step", "from", "to", "time (s)", "from (s)", "to (s)")
     assert after.tables()[1].rows[0][4:7] == (times[42], times[37], times[47])
-    assert before.tables()[1].columns == tuple(name for name in columns if name not in {"time s", "from s", "to s"})
+    assert before.tables()[1].columns == tuple(
+        name for name in columns if name not in {"time (s)", "from (s)", "to (s)"}
+    )
     assert all(len(row) == len(columns) for row in after.tables()[1].rows)
 
 
@@ -354,7 +356,7 @@ def test_the_table_of_a_filter_without_weights_and_updates_has_none(traces: list
     failures = failures_of(survey_over(runs), "error")
     events = [replace(event, error=np.where(np.arange(3) < 2, np.nan, event.error)) for event in failures.events]
     table = replace(failures, events=tuple(events)).tables()[-1]
-    assert [name for name in table.columns if name.endswith((" cm", "weight %"))] == ["fused cm"]
+    assert [name for name in table.columns if name.endswith(("d (cm)", "e (cm)", "(%)"))] == ["fused (cm)"]
     assert {len(row) for row in table.rows} == {len(table.columns)}
 
 

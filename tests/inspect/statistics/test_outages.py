@@ -80,7 +80,7 @@ def test_outages_of_a_masked_sensor_by_duration() -> None:
     assert [c.share for c in outage.classes] == pytest.approx([45 / total, 240 / total, 24400 / total], rel=1e-3)
     assert outage.dominant is not None
     assert (outage.dominant.low, outage.dominant.count) == (60, 1)
-    assert "those over 60 s have 90% in 6%, with an error of 2000 cm" in result.verdict
+    assert "those over 60 s have 90 % in 6 %, with an error of 2000 cm" in result.verdict
     assert [table.title for table in result.tables()][1:3] == ["Outages", "Outages by duration"]
 
 
