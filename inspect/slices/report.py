@@ -105,11 +105,11 @@ class ErrorSlices(Diagnostic):
         return f"{count} slice{'s' * (len(self.slices) > 1)} with a larger {self.title} in {scope}."
 
     def sentence(self, slice_: ErrorSlice) -> str:
-        """``Position error is 2.3 x larger (1.8 to 2.9) where friction > 2.1: 14 of 60 episodes, 23 % of steps.``"""
+        """``Position error is 2.3 times as large (1.8 to 2.9) where friction > 2.1: 14 of 60 episodes, ...``"""
         interval = f" ({slice_.low:.2g} to {slice_.high:.2g})" if np.isfinite(slice_.low) else ""
         size = f"{len(slice_.episodes)} of {self.episodes} episodes, {100 * slice_.share:.0f} % of steps"
         title = self.title[0].upper() + self.title[1:]
-        return f"{title} is {slice_.ratio:.2g} x larger{interval} where {slice_.where}: {size}."
+        return f"{title} is {slice_.ratio:.2g} times as large{interval} where {slice_.where}: {size}."
 
     def to_dict(self) -> dict[str, Any]:
         sentences = [{"where": s.where, "sentence": self.sentence(s)} for s in self.slices]

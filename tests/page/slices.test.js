@@ -47,9 +47,9 @@ test('a slice without an interval, and with one', () => {
     scale: 100,
   };
   const end = 'where blackout: 2 of 9 episodes, 20 % of steps.';
-  assert.equal(sliceSentence(slice, score, 9), `Position error is 1.5 × larger ${end}`);
+  assert.equal(sliceSentence(slice, score, 9), `Position error is 1.5 times as large ${end}`);
   assert.equal(
     sliceSentence({ ...slice, low: 1.34, high: 1.7 }, score, 9),
-    `Position error is 1.5 × larger (1.3 to 1.7) ${end}`,
+    `Position error is 1.5 times as large (1.3 to 1.7) ${end}`,
   );
 });

@@ -120,7 +120,7 @@ function headingsOf(score) {
 }
 
 /**
- * Describes a slice, its effect and its size: Position error is 1.5 × larger (1.3 to 1.7) where blackout: ...
+ * Describes a slice, its effect and its size: Position error is 1.5 times as large (1.3 to 1.7) where blackout: ...
  * @param {FailureSlice} slice
  * @param {FailureScore} score
  * @param {number} count of searched episodes
@@ -130,7 +130,9 @@ export function sliceSentence(slice, score, count) {
   const interval = low === null || high === null ? '' : ` (${factor(low)} to ${factor(high)})`;
   const size = `${episodes.length} of ${count} episodes, ${percent(share)} of steps`;
   const where = slice.conditions.map(conditionText).join(' and ');
-  return sentence(`${score.title} is ${factor(ratio)} × larger${interval} where ${where}: ${size}`);
+  return sentence(
+    `${score.title} is ${factor(ratio)} times as large${interval} where ${where}: ${size}`,
+  );
 }
 
 /** @param {FailureSlice} slice */

@@ -99,7 +99,7 @@ def test_a_planted_slice_in_words(traces: list[Trace]) -> None:
         measures.main_error(planted[i])[measures.counted(planted[i]), -1].max() for i in heavy_ones
     )
     sentence = report.sentence(slice_)
-    assert sentence.startswith(f"Position error is {slice_.ratio:.2g} x larger (")
+    assert sentence.startswith(f"Position error is {slice_.ratio:.2g} times as large (")
     assert sentence.endswith("where heavy load: 10 of 24 episodes, 42 % of steps.")
     assert sentence in report.verdict
     document = report.to_dict()
