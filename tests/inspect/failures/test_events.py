@@ -374,7 +374,9 @@ def test_inconsistent_traces_are_refused(traces: list[Trace], change, message: s
 
 
 def test_unknown_names_list_the_available_ones(checkpoint: Checkpoint, survey: Survey) -> None:
-    with pytest.raises(BadInput, match=r"'eror' does not exist\. Available: error, nees, ess, disagreement, regret"):
+    with pytest.raises(
+        BadInput, match=r"'eror' of task .* does not exist\. Available: error, nees, ess, disagreement, regret"
+    ):
         find_failures(checkpoint, {}, by="eror")
     with pytest.raises(BadInput, match=r"phase 'contact' does not exist\. Available: contact made, contact lost"):
         failures_of(survey).worst(phase="contact")
