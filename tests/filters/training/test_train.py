@@ -191,7 +191,7 @@ def test_invalid_checkpoint_files(tmp_path: Path) -> None:
         load_checkpoint(sample_path("door"))
     other = tmp_path / "other.safetensors"
     save_file({"weight": torch.zeros(3)}, other)
-    with pytest.raises(BadInput, match=r"FILE\.py:NAME@"):
+    with pytest.raises(BadInput, match=r"FILE\.py:FUNCTION@"):
         load_checkpoint(other)
     with safe_open(source, framework="pt") as file:
         metadata = file.metadata()
