@@ -66,6 +66,7 @@ def collect(
             "authors": paper,
             "data_hash": data.hash,
         }
-    summary = f"{count} episodes of {length} steps, {100.0 * ours['contact_fraction']:.0f} % in contact"
+    contact = f"{ours['contact_fraction']:.0%}".replace("%", " %")
+    summary = f"{count} episodes of {length} steps, {contact} in contact"
     table = format_table("Statistics over all steps", *comparison_table(ours, paper))
     return console.Result(document, f"{summary}\n\n{table}", output)
