@@ -120,7 +120,7 @@ class Saliency(Diagnostic):
     def _occlusion_sentence(self) -> str:
         """Largest effect of an occluded square or channel of each modality."""
         largest = {name: values.flat[int(np.abs(values).argmax())] for name, values in self.occlusion.items()}
-        text = ", ".join(f"{name} {self._format(float(value), '+')}" for name, value in largest.items())
+        text = ", ".join(f"{display_name(name)} {self._format(float(value), '+')}" for name, value in largest.items())
         return f"Largest change by one channel or square: {text}; no integrated gradients of an external filter."
 
     @property

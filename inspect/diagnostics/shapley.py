@@ -128,7 +128,7 @@ class Shapley(Diagnostic):
         return "controls only" if self.kind in ("lstm", "transformer") else "dynamics only"
 
     def _title(self, subset: tuple[str, ...]) -> str:
-        return " + ".join(subset) or self.baseline
+        return " + ".join(map(display_name, subset)) or self.baseline
 
     def tables(self) -> list[Table]:
         # With many modalities, list single modalities and leave-one-out subsets only.
@@ -148,12 +148,14 @@ class Shapley(Diagnostic):
                 numbers = [None if math.isnan(v) else float(v) for v in (rmse[0], *phi, rmse[-1], *ends)]
                 value_rows.append((phase.phase, phase.steps, title, *numbers))
                 subset_rows.append((phase.phase, phase.steps, title, *map(float, rmse[listed])))
-        interval_names = [f"{m}: 95 % {end}" for m in self.modalities for end in ("from", "to") if self._has_intervals]
+        interval_names = [
+            f"{display_name(m)}: 95 % {end}" for m in self.modalities for end in ("from", "to") if self._has_intervals
+        ]
         head = ("phase", "steps", "RMSE of")
         return [
             Table(
                 "Shapley values of the RMSE",
-                (*head, self.baseline, *self.modalities, "all modalities", *interval_names),
+                (*head, self.baseline, *map(display_name, self.modalities), "all modalities", *interval_names),
                 tuple(value_rows),
             ),
             Table(
@@ -174,7 +176,7 @@ class Shapley(Diagnostic):
         main = task.main_error
         chart = f"Shapley values of the {main.name} error"
         curves = [
-            Curve(name, main.factor * self.position_values[:, k], chart, main.unit, name)
+            Curve(display_name(name), main.factor * self.position_values[:, k], chart, main.unit, name)
             for k, name in enumerate(self.modalities)
         ]
         for i, subset in enumerate(self.subsets):
@@ -187,7 +189,7 @@ class Shapley(Diagnostic):
         for c, (component, unit, factor) in enumerate(zip(task.components, *measures.display_units(task), strict=True)):
             chart = f"Shapley values of the estimate: {component.label}"
             curves += [
-                Curve(name, factor * self.estimate_values[:, k, c], chart, unit, name)
+                Curve(display_name(name), factor * self.estimate_values[:, k, c], chart, unit, name)
                 for k, name in enumerate(self.modalities)
             ]
         return curves
