@@ -38,7 +38,10 @@ def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None
     larger. Raises BadInput for a lower rate, and for a record of fewer than ``MIN_HEALTHY`` episodes.
     """
     if healthy < MIN_HEALTHY:
-        raise BadInput(f"a healthy record of {healthy} episodes is too small; measure it from at least {MIN_HEALTHY}")
+        raise BadInput(
+            f"a healthy record of {healthy} episode{'s' * (healthy != 1)} is too small; "
+            f"measure it from at least {MIN_HEALTHY}"
+        )
     smallest = 1 / (healthy + 1) if count == 1 else 0.0
     if alarm_rate is not None and alarm_rate < smallest:
         raise BadInput(

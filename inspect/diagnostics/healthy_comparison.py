@@ -316,5 +316,5 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
         count = document.get("episodes") if isinstance(document, dict) else None
         if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
             return None
-        lacking = f"a healthy record of {count} episodes, fewer than the {MIN_HEALTHY} needed"
+        lacking = f"a healthy record of {count} episode{'s' * (count != 1)}, fewer than the {MIN_HEALTHY} needed"
     return f"this filter has {lacking}"

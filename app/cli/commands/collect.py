@@ -67,6 +67,6 @@ def collect(
             "data_hash": data.hash,
         }
     contact = f"{ours['contact_fraction']:.0%}".replace("%", " %")
-    summary = f"{count} episodes of {length} steps, {contact} in contact"
+    summary = f"{count} episode{'s' * (count != 1)} of {length} steps, {contact} in contact"
     table = format_table("Statistics over all steps", *comparison_table(ours, paper))
     return console.Result(document, f"{summary}\n\n{table}", output)

@@ -78,6 +78,6 @@ def evaluate(
         "start_offset": dict(offset.lengths),
         **metrics,
     }
-    title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episodes"
+    title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episode{'s' * (len(held_out) != 1)}"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
     return console.Result(document, "\n\n".join(map(str, accuracy_tables(title, metrics))))
