@@ -149,7 +149,7 @@ OF_KINDS = {
     **dict.fromkeys(("shift", "hand offset", "object offset"), ("px", 1.0)),
     "unflagged force": ("N", 1.0),
     "compliance": ("mm/N", 1e3),
-    **dict.fromkeys(("lag", "contact lag", "reading lag", "following"), ("steps", 1.0)),
+    **dict.fromkeys(("lag", "contact lag", "reading lag", "reading lag scatter", "following"), ("steps", 1.0)),
     **dict.fromkeys(LENGTHS, display_unit("m")),
 }
 """Kind of statistic -> its unit for display, and the factor from its own."""
