@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.dataset import SPLITS
+from beliefscope.datasets.dataset import SPLITS, EpisodeList
 from beliefscope.datasets.episode import Episode, time_error
 from beliefscope.datasets.errors import BadInput
 
@@ -34,11 +35,12 @@ def array_error(array: NDArray[Any], shape: tuple[int | None, ...], kind: type, 
     return ""
 
 
-def check_episode(episode: Episode, name: str) -> None:
+def check_episode(episode: Episode, name: str, absent: str = "") -> None:
     """Refuse an episode that could not be read from a file. Raises BadInput that names the array and the step.
 
     Args:
         name: of the episode, for the error.
+        absent: end of the error about a reading that is NaN.
     """
     task, steps = episode.task, len(episode)
     if steps < 1:
@@ -66,8 +68,16 @@ def check_episode(episode: Episode, name: str) -> None:
         )
     for key, (shape, kind) in expected.items():
         if error := array_error(arrays[key], shape, kind, unknown=key in covariates):
-            raise BadInput(f"{key!r} of {name} {error}.")
+            hint = absent if key.startswith("observations/") and " nan " in error else ""
+            raise BadInput(f"{key!r} of {name} {error}{hint}.")
     if episode.time is None:
         return
     if error := array_error(episode.time, (steps,), np.float64) or time_error(episode.time):
         raise BadInput(f"'time' of {name} {error}.")
+
+
+def checked_list(episodes: Sequence[Episode]) -> EpisodeList:
+    """Episodes in memory. Raises BadInput as ``check_episode``, and if there is none or their tasks differ."""
+    for index, episode in enumerate(episodes):
+        check_episode(episode, f"episode {index}", "; an absent reading repeats the last one and needs a mask")
+    return EpisodeList(episodes)

@@ -74,10 +74,12 @@ def test_task_and_episode_need_few_fields(tmp_path: Path) -> None:
     stored, listed = bs.open_dataset(path, task), bs.open_dataset(episodes)
     assert stored.hash == listed.hash
     assert stored[1].dt == 0.1
-    run = bs.trace(
-        bs.load_filter(lambda **inputs: np.repeat(inputs["observations"]["gauge"], 2, -1), task), episodes, 1
-    )
-    assert run.estimate_mean[0].tolist() == [1.0, 1.0]
+
+    def twice(**inputs: Any) -> Any:
+        return np.repeat(inputs["observations"]["gauge"], 2, -1)
+
+    for filter_ in (bs.load_filter(twice, task), twice):
+        assert bs.trace(filter_, episodes, 1).estimate_mean[0].tolist() == [1.0, 1.0]
     with pytest.raises(bs.BadInput, match="empty list"):
         bs.open_dataset([])
     with pytest.raises(bs.BadInput, match="tasks 'tank' and 'push'"):
@@ -92,7 +94,7 @@ def test_episodes_that_no_command_could_read_are_not_saved(tmp_path: Path) -> No
     gauge = np.ones((5, 1))
     gauge[3] = np.nan
     cases = {
-        "'observations/gauge' of episode 1 is nan at step 3, expected finite numbers": {"gauge": gauge},
+        "'observations/gauge' of episode 1 is nan at step 3, expected finite numbers; .* a mask": {"gauge": gauge},
         r"'observations/gauge' of episode 1 has shape \(4, 1\), expected \(5, 1\)": {"gauge": np.ones((4, 1))},
         "'observations/eye' of episode 1 is float32, expected uint8": {"eye": np.zeros((5, 4, 4))},
         "has 'observations/nose', which task 'tank' does not declare. Available: observations/gauge": {"nose": gauge},
@@ -100,6 +102,8 @@ def test_episodes_that_no_command_could_read_are_not_saved(tmp_path: Path) -> No
     for message, changed in cases.items():
         with pytest.raises(bs.BadInput, match=message):
             bs.save_dataset([good, replace(good, observations={**good.observations, **changed})], path)
+    with pytest.raises(bs.BadInput, match="'observations/gauge' of episode 0 is nan at step 3"):
+        bs.open_dataset([replace(good, observations={**good.observations, "gauge": gauge})])
     for message, other in {
         "episode 1 has no 'observations/gauge'": replace(good, observations={"eye": good.observations["eye"]}),
         "'split' of episode 1 is 'training'. Available: train, val, test": replace(good, split="training"),
@@ -147,6 +151,26 @@ def test_representations(run: bs.Trace) -> None:
     for figure in (map_.plot(), bs.inspect_run(run)["errors"].plot()):
         assert figure._repr_png_().startswith(b"\x89PNG")  # displayed without pyplot
     assert repr(map_) == "<LikelihoodMap: likelihood of image, haptics, fused at step 40, 41 x 41 cells>"
+
+
+def test_diagnosis_against_the_record_of_another_filter() -> None:
+    task = bs.Task("tank", (bs.Component("level", "m"),), {"gauge": (1,)}, {"g": ("gauge",)}, 0, 0.1, warmup=0)
+    rng = np.random.default_rng(0)
+    levels = [np.cumsum(rng.normal(0.0, 0.1, (40, 1)), axis=0) for _ in range(23)]
+    readings = [level + rng.normal(0.0, 0.05, (40, 1)) for level in levels]
+    episodes = [bs.Episode(task, x, observations={"gauge": z}) for x, z in zip(levels, readings, strict=True)]
+    clean, data = episodes[:20], episodes[20:]
+
+    def correct(**inputs: Any) -> Any:
+        return inputs["observations"]["gauge"]
+
+    def wrong(**inputs: Any) -> Any:
+        return inputs["observations"]["gauge"] + 1.0
+
+    assert bs.diagnose(wrong, data, profile_from=clean).state == "healthy"  # an error of its record
+    assert bs.diagnose(wrong, data, profile_from=clean, profile_filter=correct).state != "healthy"
+    with pytest.raises(bs.BadInput, match="profile_filter needs profile_from"):
+        bs.diagnose(wrong, data, profile_filter=correct)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from beliefscope.datasets import store
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.dataset import Dataset, EpisodeList
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.episode_check import check_episode
+from beliefscope.datasets.episode_check import checked_list
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import Faults, read_faults
 from beliefscope.datasets.task import Task
@@ -80,7 +80,7 @@ def open_dataset(source: str | Path | Sequence[Episode], task: Task | None = Non
     Raises BadInput if there is none, or if it is damaged.
     """
     if not isinstance(source, str | Path):
-        return EpisodeList(source)
+        return checked_list(source)
     if isinstance(source, str) and source in TASKS and not Path(source).exists():
         return store.open_dataset(store.sample_path(load_task(source)))
     return store.open_dataset(source, task)
@@ -92,9 +92,7 @@ def save_dataset(episodes: Sequence[Episode], path: str | Path) -> Path:
     Raises BadInput, and writes nothing, if an episode does not fit its task: a missing or undeclared sensor, another
     shape or type, a number that is not finite, times that do not ascend.
     """
-    source = EpisodeList(episodes)
-    for index, episode in enumerate(episodes):
-        check_episode(episode, f"episode {index}")
+    source = checked_list(episodes)
     store.write_dataset(path, source.task, source)
     return Path(path)
 
@@ -165,6 +163,7 @@ def diagnose(
     particles: int = 300,
     alarm_rate: float | None = None,
     profile_from: Data | None = None,
+    profile_filter: Filter | None = None,
 ) -> Diagnosis:
     """Name the probable cause of a fault, with evidence and the effect of undoing it (docs/diagnose.md).
 
@@ -173,20 +172,22 @@ def diagnose(
         alarm_rate: probability that a healthy filter is not called healthy. Default: 0.02, or 1 / (n + 1) for one
             episode and a healthy record of n < 49 episodes.
         profile_from: clean data whose held-out episodes become the healthy record; default: that of the filter.
+        profile_filter: filter that runs over ``profile_from``, such as an earlier version; default: the same one.
 
     Raises BadInput for a filter without a healthy record.
     """
+    if profile_filter is not None and profile_from is None:
+        raise BadInput("profile_filter needs profile_from, the clean episodes that it runs over")
     checkpoint = _filter(filter_, data)
     source, injected = _episodes(data, checkpoint), _faults(faults, checkpoint)
     indices = source.held_out() if episodes is None else episodes
     profile = None
     if profile_from is not None:
         clean = _episodes(profile_from, checkpoint)
-        profile = profile_of(checkpoint, [clean[i] for i in clean.held_out()], str(clean.path))
-    by_index = injected.apply_all(source, indices, seed)
-    return diagnose_episodes(
-        checkpoint, by_index, seed=seed, particles=particles, alarm_rate=alarm_rate, profile=profile
-    )
+        correct = checkpoint if profile_filter is None else _filter(profile_filter, clean)
+        profile = profile_of(correct, [clean[i] for i in clean.held_out()], str(clean.path))
+    faulty = injected.apply_all(source, indices, seed)
+    return diagnose_episodes(checkpoint, faulty, seed=seed, particles=particles, alarm_rate=alarm_rate, profile=profile)
 
 
 def evaluate(
@@ -387,7 +388,8 @@ def _pretrained_path(text: str) -> Path:
 def _filter(filter_: object, data: Data) -> Checkpoint:
     """The filter. The data define the task of a filter object of your own."""
     own = not isinstance(filter_, Checkpoint | str | Path)
-    return load_filter(filter_, data.task if own and isinstance(data, Dataset) else "")
+    source = data if isinstance(data, Dataset | str | Path) else EpisodeList(data)
+    return load_filter(filter_, source.task if own and isinstance(source, Dataset) else "")
 
 
 def _episodes(data: Data, checkpoint: Checkpoint) -> Dataset:
