@@ -20,7 +20,7 @@ TURN_AND_NOISE = 6.6
 """Range of the readings of an angle, rad: a turn, and some noise."""
 
 TURN = 1.0
-"""Largest distance of an innovation from a full turn, rad, that counts as one."""
+"""Largest distance of an innovation from a full turn, rad, that counts as one, and of readings from the ends of one."""
 
 
 def innovation_statistics(trace: Trace) -> dict[str, float]:
@@ -62,15 +62,16 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
 
 
 def _angles(trace: Trace, modality: str, count: int) -> list[int]:
-    """Channels of a modality whose readings may be angles in rad: all within one turn, from -pi or from 0."""
+    """Channels of a modality whose readings may be angles in rad: within -pi to pi, or anywhere in 0 to 2 pi."""
     keys = trace.task.modalities.get(modality, ())
     readings = [trace.episode.observations[key] for key in keys]
     if any(values.ndim != 2 for values in readings) or not readings:
         return []
     values = np.concatenate(readings, axis=1)[:, :count]
     low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    within = (high - low < TURN_AND_NOISE) & (low > -TURN_AND_NOISE / 2.0) & (high < TURN_AND_NOISE)
-    return np.flatnonzero(within).tolist()
+    around_zero = (low > -TURN_AND_NOISE / 2.0) & (low < 0.0) & (high < TURN_AND_NOISE / 2.0)
+    from_zero = (low > -TURN) & (low < TURN) & (high > 2.0 * math.pi - TURN) & (high < 2.0 * math.pi + TURN)
+    return np.flatnonzero(around_zero | from_zero).tolist()
 
 
 def measurement_noise(trace: Trace) -> dict[str, float]:

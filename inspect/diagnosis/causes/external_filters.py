@@ -30,7 +30,7 @@ def in_predictions(cause: Cause) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates."""
     changed = {
         "dynamics": "dynamics offset/*|dynamics scatter/*",
-        "process_noise": "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "offset", "slope", "spread")),
+        "process_noise": "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "offset", "spread")),
     }
     others = f"{DYNAMICS}|process noise/*"
     return replace(cause, consequences=f"{cause.consequences}|{changed.get(cause.component, others)}")
