@@ -130,7 +130,7 @@ def test_compare_with_another_filter_or_other_faults(
         ("from=40&to=5000&faults=blackout", "after the last step of this episode"),
         ("from=40&to=60&weights=touch=1", "touch"),
         ("from=40&to=60&weights=image=2", "must be between 0 and 1"),
-        ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part of an intervention"),
+        ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part 'filter' of an intervention"),
         ("from=40&to=60&faults=blackout:from=2", "has its own steps"),
     ],
 )
