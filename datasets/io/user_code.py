@@ -14,6 +14,8 @@ from types import CodeType, ModuleType
 from beliefscope.datasets.errors import BadInput
 
 _places: set[str] = set()
+_folders: set[Path] = set()
+"""Folders of the files that this process has run."""
 
 
 def has_run() -> bool:
@@ -41,6 +43,21 @@ def importable(place: str) -> Iterator[None]:
         sys.path.reverse()
 
 
+def _forget_namesakes(folder: Path) -> None:
+    """Lets a file import files next to it whose names are those of files next to another file that has run.
+
+    Without this, two versions of a filter in two folders would share the imports of the first.
+    """
+    for name, module in list(sys.modules.items()):
+        top, source = name.partition(".")[0], getattr(module, "__file__", None)
+        if source is None or not ((folder / f"{top}.py").is_file() or (folder / top).is_dir()):
+            continue
+        path = Path(source).resolve()
+        homes = [home for home in (folder, *_folders) if path == home / f"{top}.py" or home / top in path.parents]
+        if homes and folder not in homes:
+            del sys.modules[name]
+
+
 class _SourceLoader(SourceFileLoader):
     """Ignores stored bytecode: Python compares times in whole seconds, so it would run the file before a quick edit."""
 
@@ -51,6 +68,9 @@ class _SourceLoader(SourceFileLoader):
 def _run_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInput(f"{path} does not exist.")
+    folder = path.resolve().parent
+    _forget_namesakes(folder)
+    _folders.add(folder)
     name = f"beliefscope_user_{path.stem}"
     spec = spec_from_file_location(name, path, loader=_SourceLoader(name, str(path)))
     assert spec is not None
