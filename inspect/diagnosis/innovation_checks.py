@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from beliefscope.inspect.statistics.innovations import innovations
+from beliefscope.inspect.statistics.innovations import has_one_prediction, innovations
 from beliefscope.inspect.statistics.measures import Array, Mask, counted
 from beliefscope.inspect.trace import Trace
 
@@ -27,11 +27,10 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     """``KIND/MODALITY/all`` -> value, of innovations nu with covariance S.
 
     ``innovation bias``, by channel: mean of nu, in standard deviations. ``innovation std``: geometric mean of the
-    standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a
-    channel of angles. ``updates``: share of
-    steps with an accepted innovation. ``measurement noise``: geometric mean of the standard deviations R
-    (``measurement_noise``). ``innovation share``: innovation std relative to that of all modalities, where the
-    measurement noise of some is unknown.
+    standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a channel
+    of angles. ``updates``: share of steps with an accepted innovation. ``measurement noise``: geometric mean of the
+    standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of all
+    modalities, where the measurement noise of some is unknown.
     """
     if trace.innovation is None or (pair := innovations(trace)) is None:
         return {}
@@ -53,7 +52,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
         if len(angles := [i for i in _angles(trace, modality, nu.shape[-1]) if i in channels]):
             turns = np.any(np.abs(np.abs(nu[:, k, angles]) - 2.0 * math.pi) < TURN, axis=-1)
             values[f"innovation turns/{modality}/all"] = float(turns[used[:, k].any(-1)].mean())
-    noise = measurement_noise(trace)
+    noise = measurement_noise(trace, *pair)
     if "measurement noise//all" in noise:
         sizes = {m: values[name] for m in trace.modalities if (name := f"innovation std/{m}/all") in values}
         mean = math.exp(np.mean(np.log([*sizes.values()])))
@@ -74,7 +73,7 @@ def _angles(trace: Trace, modality: str, count: int) -> list[int]:
     return np.flatnonzero(around_zero | from_zero).tolist()
 
 
-def measurement_noise(trace: Trace) -> dict[str, float]:
+def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     """``measurement noise/MODALITY/all``: geometric mean of the standard deviations R of each modality's channels.
 
     An update has ``det P / det P+ = det S / det R``, whatever the measurement function, and several updates in turn
@@ -82,13 +81,13 @@ def measurement_noise(trace: Trace) -> dict[str, float]:
     modalities that are always used together, they only give the mean of all, ``measurement noise//all``.
 
     Only of filters whose modalities share one prediction and whose beliefs have a covariance of full rank.
+
+    Args:
+        nu: (T, K, m) innovations. s: (T, K, m, m) their covariance.
     """
-    pair, predicted = innovations(trace), trace.predicted_covariance
-    if pair is None or predicted is None or trace.predicted_mean is None or not trace.has_covariance:
+    predicted = trace.predicted_covariance
+    if predicted is None or not trace.has_covariance or not has_one_prediction(trace):
         return {}
-    if not np.allclose(trace.predicted_mean, trace.predicted_mean[:, :1], rtol=1e-3, equal_nan=True):
-        return {}
-    nu, s = pair
     used = _accepted(trace, np.isfinite(nu))
     s = np.where(used[..., :, None] & used[..., None, :], s, np.eye(nu.shape[-1]))
     before, after = predicted[:, 0].astype(np.float64), trace.estimate_covariance.astype(np.float64)

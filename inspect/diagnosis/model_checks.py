@@ -26,6 +26,7 @@ from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, r
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.innovations import has_one_prediction
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.signals import lag
 from beliefscope.inspect.trace import Trace
@@ -232,7 +233,7 @@ def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
     mean, covariance = trace.predicted_mean, trace.predicted_covariance
     states, task = trace.episode.states.astype(np.float64), trace.task
     keep = measures.counted(trace)[1:]
-    if mean is None or task.rotations or keep.sum() < MIN_STEPS or not np.allclose(mean, mean[:, :1], rtol=1e-3):
+    if mean is None or task.rotations or keep.sum() < MIN_STEPS or not has_one_prediction(trace):
         return {}
     predicted = task.difference(mean[1:, 0].astype(np.float64), trace.estimate_mean[:-1].astype(np.float64))[keep]
     change = task.difference(states[1:], states[:-1])[keep]

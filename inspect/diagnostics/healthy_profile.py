@@ -80,9 +80,8 @@ class HealthyProfile:
             }
             data, images = str(document["data"]), document.get("reference")
             reference = None if images is None else Reference.from_json(images)
-            models = (
-                model for model in document.get("readings", ()) if "biases" in model
-            )  # others have other features
+            # Models without biases are of an earlier version, with other features.
+            models = (model for model in document.get("readings", ()) if "biases" in model)
             readings = tuple(map(ReadingModel.from_json, models))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"the healthy record is malformed: {error!r}") from None

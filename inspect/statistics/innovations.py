@@ -75,6 +75,12 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
     return trace.task.difference(z, predicted), p + r
 
 
+def has_one_prediction(trace: Trace) -> bool:
+    """Whether the filter reports predictions that its modalities share."""
+    mean = trace.predicted_mean
+    return mean is not None and np.allclose(mean, mean[:, :1], rtol=1e-3)
+
+
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
     """``nu^T S^-1 nu`` (T, K), NaN without a measurement, and the number of its channels (T, K).
 

@@ -161,7 +161,7 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
             continue
         mean_x, mean_y = (np.mean([row[i].mean(0) for row in rows], axis=0) for i in (0, 1))
         rows = [(x - mean_x, y - mean_y) for x, y in rows]
-        coefficients, errors = _best_of_prefixes(rows, _prefixes(episodes[0]))
+        coefficients, errors = _best_of_prefixes(rows, _prefixes(episodes[0], inputs[0].shape[1]))
         count = np.array([len(y) for _, y in rows], dtype=np.float64)
         left, total = (np.asarray(sum(len(y) * y.var(0) for y in parts)) for parts in (errors, [y for _, y in rows]))
         channels = np.flatnonzero(left < (1.0 - EXPLAINED) * total)
@@ -186,16 +186,15 @@ def _best_of_prefixes(rows: Sequence[tuple[Array, Array]], prefixes: Sequence[in
     """(F, d) coefficients of the first features only, as many as leave the least of each channel in other episodes.
 
     Further features, fitted to noise, would change the expected readings from step to step. Also returns the errors
-    (S, d) of each episode, from coefficients that are fitted to half of the others.
+    (S, d) of each episode, in any order, from coefficients that are fitted to half of the others.
     """
-    order = [*range(1, len(rows), 2), *range(0, len(rows), 2)]
     results = []
     for prefix in prefixes:
         x = [(inputs[:, :prefix], readings) for inputs, readings in rows]
         errors = [*_errors(x[1::2], _ridge(x[::2])), *_errors(x[::2], _ridge(x[1::2]))]
         coefficients = np.zeros((prefixes[-1], rows[0][1].shape[1]))
         coefficients[:prefix] = _ridge(x)
-        results.append((sum(len(e) * e.var(0) for e in errors), coefficients, [errors[i] for i in np.argsort(order)]))
+        results.append((sum(len(e) * e.var(0) for e in errors), coefficients, errors))
     best = np.argmin([left for left, _, _ in results], axis=0)  # (d,)
     columns = np.arange(len(best))
     chosen = np.stack([coefficients for _, coefficients, _ in results])[best, :, columns].T
@@ -266,11 +265,11 @@ def features(episode: Episode) -> Array:
     return np.concatenate([all_, contact, contact * all_], axis=1)
 
 
-def _prefixes(episode: Episode) -> tuple[int, ...]:
-    """Numbers of features: those of the state; with its changes; and all."""
+def _prefixes(episode: Episode, count: int) -> tuple[int, ...]:
+    """Numbers of features: those of the state; with its changes; and all, ``count``."""
     others, frames = _values(episode.task, episode.states[:1].astype(np.float64))
     states = others.shape[1] + frames.shape[1]
-    return states, states + 2 * episode.states.shape[1], features(episode).shape[1]
+    return states, states + 2 * episode.states.shape[1], count
 
 
 def _values(task: Task, states: Array) -> tuple[Array, Array]:
