@@ -190,7 +190,9 @@ def named_values(output: Any, source: str, task: Task) -> Values:
     for name, value in named.items():
         if isinstance(value, list | tuple) and name in MEASUREMENTS:
             parts = [None if part is None else _tensor(part, name, source) for part in value]
-            values[name] = _padded(parts, len(letters[name]) - 1, np.shape(named["estimate_mean"])[:-1])
+            leading = np.shape(named["estimate_mean"])[:-1]
+            _check_parts(parts, len(letters[name]) - 1, leading, f"{source} returns {name}")
+            values[name] = _padded(parts, len(letters[name]) - 1, leading)
         else:
             values[name] = _tensor(value, name, source)
     for pair in PAIRS:
@@ -219,6 +221,15 @@ def _tensor(value: Any, name: str, source: str) -> Tensor:
 def copied(values: Values) -> Values:
     """Copies, since a filter may modify its own values in place."""
     return {name: value.clone() for name, value in values.items()}
+
+
+def _check_parts(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int], returns: str) -> None:
+    """Raises BadInput for values of another shape than (..., m) or (..., m, m), with the arguments of ``_padded``."""
+    for k, part in enumerate(parts):
+        shape = () if part is None else tuple(part.shape)
+        if part is not None and shape != (*leading, *shape[-1:] * axes):
+            expected = ", ".join(map(str, [*leading, *("m",) * axes]))
+            raise BadInput(f"{returns} of measurement {k + 1} of shape {shape}, expected ({expected})")
 
 
 def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -> Tensor:
@@ -368,11 +379,11 @@ def model_names(
     """
     counts = [values[name].shape[axis] for name, shape in SHAPES.items() if shape[0] == "K" and name in values]
     count, modalities = max(counts, default=0), tuple(task.modalities)
-    for candidates in (tuple(names), modalities):
-        if count and len(candidates) > count == len(models):
-            return tuple(candidates[k] for k in models)
-        if count and len(candidates) == count:
-            return candidates
+    candidates = tuple(names) or modalities
+    if count and len(candidates) > count == len(models):
+        return tuple(candidates[k] for k in models)
+    if count and len(candidates) == count:
+        return candidates
     if names and count:
         raise BadInput(f"{source} names {len(names)} modalities, {', '.join(names)}, but has {count}")
     return tuple(f"model-{k + 1}" for k in range(count))

@@ -55,6 +55,18 @@ def dtype_of(filter_: Any) -> torch.dtype:
     return next(types, torch.float32)
 
 
+def described(error: Exception, adapter: Adapter, is_first: bool) -> str:
+    """An exception of a filter in one line.
+
+    is_first: whether it is of the first step, where the shape of the inputs may be unexpected.
+    """
+    message = (str(error).strip().splitlines() or ["no message"])[0]
+    text = f"{type(error).__name__}: {message}"
+    if is_first and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
+        text += "; the first axis of its inputs is that of N trajectories; Adapter(filter, batched=False) has none"
+    return text
+
+
 def call(adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device) -> Any:
     """The filter's output for inputs on the CPU, (N, ...) or (T, N, ...), in the types that it takes.
 

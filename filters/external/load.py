@@ -46,6 +46,7 @@ from beliefscope.filters.external.adapter import (
 )
 from beliefscope.filters.external.calls import (
     call,
+    described,
     device_of,
     dtype_of,
     has_own_start,
@@ -318,8 +319,7 @@ class ExternalFilter(Checkpoint):
 
     def _error(self, where: str, error: Exception) -> BadInput:
         """An exception of the module as BadInput with the location."""
-        message = (str(error).strip().splitlines() or ["no message"])[0]
-        return BadInput(f"{self.source} fails at {where}: {type(error).__name__}: {message}")
+        return BadInput(f"{self.source} fails at {where}: {described(error, self.adapter, where == 'step 0')}")
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)

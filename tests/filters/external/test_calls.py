@@ -207,6 +207,11 @@ def test_hash_of_an_object_covers_its_arrays() -> None:
     [
         ({"accepted": np.ones((2, 2))}, r"accepted of shape \(1, 2, 2\), expected \(1, K\)"),
         ({"innovation": [np.ones(2)]}, "returns only innovation, expected both innovation and innovation_covariance"),
+        (
+            {"innovation": [np.ones(2), None], "innovation_covariance": [np.ones(2), None]},
+            r"innovation_covariance of measurement 1 of shape \(2,\), expected \(m, m\)",
+        ),
+        ({"innovation": [None, np.ones((2, 1))]}, r"innovation of measurement 2 of shape \(2, 1\), expected \(m\)"),
         ({"extra": {"a b": 1.0}}, r"extra value 'a b': a name has up to 80 letters, digits, - and _$"),
         ({"extra": {"a" * 81: 1.0}}, r"extra value 'a{81}': a name has up to 80 letters"),
         ({"extra": {"a": np.inf}}, "extra/a with a number that is not finite"),
@@ -220,6 +225,17 @@ def test_invalid_measurements_are_refused(values: dict[str, Any], message: str) 
 
     with pytest.raises(BadInput, match=message):
         trace(external(Invalid(), batched=False), vehicle.drive(7, 10))
+
+
+def test_names_of_other_measurement_models_are_refused() -> None:
+    names = ("gps", "speed", "compass")
+    with pytest.raises(BadInput, match="names 3 modalities, gps, speed, compass, but has 2"):
+        trace(external(vehicle.NumpyKalman(), batched=False, modalities=names), vehicle.drive(7, 10))
+
+
+def test_a_filter_of_one_trajectory_without_batched_false_is_told_of_the_axis() -> None:
+    with pytest.raises(BadInput, match=r"fails at step 0: .*; the first axis of its inputs is that of N trajectories"):
+        trace(external(vehicle.NumpyKalman()), vehicle.drive(7, 10))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
