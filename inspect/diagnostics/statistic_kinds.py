@@ -71,7 +71,7 @@ KINDS = {
     "contact distance": ("distance of the hand from the labelled object minus the healthy distance{axis}", False, 5e-4),
     "contact distance error": ("deviation of the hand from the labelled object{axis}", False, 5e-4),
     "contact distance scatter": ("variation of the hand's deviation between episodes{axis}", False, 5e-4),
-    "offset": ("offset{of} from the measured hand or the estimates", False, 0.002),
+    "offset": ("offset{of} from the measured hand", False, 0.002),
     "level": ("level", False, 0.15),
     "drift": ("drift", False, 0.01),
     "change": ("second difference", False, 0.05),
@@ -178,6 +178,8 @@ def label_of(statistic: str, has_contact: bool = True) -> str:
     name, _, axis = subject.partition(" ")
     if (kind, name) == ("lag", "labels"):
         return f"delay of the labels behind {display_name(axis) or 'all modalities'}"
+    if (kind, name) == ("offset", "labels"):
+        return f"offset of the labels ({display_name(axis)}) from what all modalities measure"
     owner, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
     title = title.format(of=owner + axis, axis=axis) if "{" in title else title + owner + axis
     before, after = PHASES.get(phase, ("", f" in {phase}"))

@@ -26,6 +26,8 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
         ("lag/labels wrist_cam/all", "delay of the labels behind wrist cam"),
         ("reading scatter/gps x/all", "variation between episodes of the error of gps (x), relative to its noise,"),
         ("lag/labels/all", "delay of the labels behind all modalities"),
+        ("offset/labels x/all", "offset of the labels (x) from what all modalities measure"),
+        ("offset/control x/all", "offset of control (x) from the measured hand"),
         ("opposed/control x/all", "evidence for the opposite sign of control (x)"),
     ],
 )
