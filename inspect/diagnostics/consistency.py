@@ -52,6 +52,7 @@ class Consistency(Diagnostic):
         nees, nis: (T, L), (T, K) NEES / n and NIS / n by step of a single trace; (0, L), (0, K) for several.
         contact, blackout: (T,) masks of a single trace.
         healthy: comparison with the filter's healthy record, if it has one.
+        indefinite: number of counted steps of all traces whose fused covariance is not positive definite.
     """
 
     task: Task
@@ -65,6 +66,7 @@ class Consistency(Diagnostic):
     contact: Mask
     blackout: Mask
     healthy: Comparison | None = None
+    indefinite: int = 0
 
     def entry(self, layer: str, phase: str = ALL) -> LayerConsistency:
         """Consistency of a layer in a phase. Raises KeyError if the phase has no steps."""
@@ -83,9 +85,10 @@ class Consistency(Diagnostic):
     @property
     def verdict(self) -> str:
         fused = self.entry(FUSED)
+        parts = [f"The covariance is not positive definite in {self.indefinite} steps."] if self.indefinite else []
         if self.healthy is not None:
-            return f"{self.healthy.sentence} {fused.evidence}; 1 in theory."
-        parts = [f"{NO_RECORD} {_sentence(f'{fused.assessment} ({fused.evidence})')}"]
+            return " ".join((*parts, f"{self.healthy.sentence} {fused.evidence}; 1 in theory."))
+        parts += [f"{NO_RECORD} {_sentence(f'{fused.assessment} ({fused.evidence})')}"]
         candidates = [entry for entry in self.by_layer if entry.refusal is None]
         phases = [entry for entry in candidates if entry.layer == FUSED and entry.phase != ALL]
         worst = max(phases, key=inconsistency, default=fused)
@@ -102,11 +105,13 @@ class Consistency(Diagnostic):
 
     @property
     def alarms(self) -> tuple[str, ...]:
+        steps = (f"the covariance is not positive definite in {self.indefinite} steps",) if self.indefinite else ()
         if self.healthy is not None:
-            return tuple(alarm.text for alarm in self.healthy.alarms)
+            return (*steps, *(alarm.text for alarm in self.healthy.alarms))
         entries = [entry for entry in self.by_layer if entry.inconsistent]
         texts = [f"{display_name(entry.layer)}, {entry.phase}: {entry.assessment}" for entry in entries]
         return (
+            *steps,
             *texts,
             *(
                 f"innovations of {display_name(test.modality)} are not white"
@@ -212,6 +217,9 @@ class Consistency(Diagnostic):
         return plots
 
 
+INDEFINITE = 1e-3
+"""Eigenvalue of a correlation matrix below zero that is not rounding."""
+
 ERROR_QUANTITIES = ("RMSE", "predicted", "CRPS")
 
 
@@ -253,7 +261,24 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
         healthy=healthy,
+        indefinite=sum(
+            int(_is_indefinite(trace.estimate_covariance[measures.counted(trace)].astype(float)).sum())
+            for trace in traces
+        ),
     )
+
+
+def _is_indefinite(covariance: Array) -> Mask:
+    """(T,): whether a covariance (T, n, n) has a negative variance, or correlations that no errors have.
+
+    The tolerance covers the rounding of single precision. Unknown covariances, NaN, are not indefinite.
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    correlation = covariance / (scale[:, :, None] * scale[:, None])
+    known = np.isfinite(correlation).all((-2, -1))
+    eigenvalues = np.linalg.eigvalsh(np.where(known[:, None, None], correlation, 1.0))
+    return known & ((variance < 0.0).any(-1) | (eigenvalues[:, 0] < -INDEFINITE))
 
 
 def trajectory_statistics(trace: Trace) -> dict[str, float]:
@@ -283,7 +308,7 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
         nis[:, :-1] = values
     if trace.log_likelihood is None or trace.prior_log_weights is None:
         level = gaussian_level(n * nees, n)
-        crps = gaussian_crps(error, np.sqrt(variance))
+        crps = gaussian_crps(error, np.sqrt(np.where(variance < 0.0, np.nan, variance)))
     else:
         assert trace.particles is not None
         level, crps = np.empty(nees.shape), np.empty(error.shape)
@@ -322,7 +347,7 @@ def _summarise(
         miscalibration=float(np.abs(curve - LEVELS).mean()),
         nll=float(steps["nll"].mean()),
         rmse=np.sqrt(np.square(error).mean(0)),
-        sharpness=np.sqrt(steps["variance"].mean(0)),
+        sharpness=np.sqrt(np.maximum(steps["variance"].mean(0), 0.0)),
         crps=steps["crps"].mean(0),
     )
 

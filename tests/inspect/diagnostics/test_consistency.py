@@ -54,6 +54,18 @@ def test_an_exact_filter_is_consistent(exact: Consistency) -> None:
     assert "Innovations are white." in exact.verdict
 
 
+@pytest.mark.parametrize("entry", [(0, 0), (0, 1)])
+def test_a_covariance_that_is_not_positive_definite_is_named(entry: tuple[int, int]) -> None:
+    (run,) = plant.simulated(1)
+    covariance = run.estimate_covariance.copy()
+    first, second = entry
+    limit = np.sqrt(covariance[-5:, first, first] * covariance[-5:, second, second])
+    covariance[-5:, first, second] = covariance[-5:, second, first] = -1.1 * limit
+    result = consistency([replace(run, estimate_covariance=covariance)])
+    assert result.verdict.startswith("The covariance is not positive definite in 5 steps. No healthy record")
+    assert result.alarms[0] == "the covariance is not positive definite in 5 steps"
+
+
 def test_nll_of_a_consistent_filter_is_the_entropy(exact: Consistency) -> None:
     covariance = plant.simulated(1)[0].estimate_covariance[-1].astype(float)
     entropy = 0.5 * np.linalg.slogdet(2.0 * math.pi * math.e * covariance)[1]
