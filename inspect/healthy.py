@@ -95,7 +95,9 @@ def profile_of(
         raise BadInput(f"{error} (healthy episode {failed})") from None
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return HealthyProfile(data, len(rows), particles, columns, sensors.reference, sensors.readings)
+    lengths = [len(episode) for episode in episodes]
+    steps = (min(lengths), max(lengths))
+    return HealthyProfile(data, len(rows), particles, columns, sensors.reference, sensors.readings, steps)
 
 
 def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> str | None:

@@ -251,6 +251,8 @@ def _share(recovery: Recovery | None) -> str:
     """Recovered share of the error with its interval, empty without one."""
     if recovery is None or math.isnan(recovery.error):
         return ""
+    if recovery.error < 0.0:  # most undos of sensors remove them
+        return "none"
     share = f"{100 * recovery.error:z.0f} %"
     if not math.isnan(recovery.low):  # a single episode has no interval
         share += f" ({100 * recovery.low:z.0f} to {100 * recovery.high:z.0f})"

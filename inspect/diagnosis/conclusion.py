@@ -62,6 +62,9 @@ MAX_NEES = 2.0
 WRONG_NEES = 10.0
 """As ``MAX_NEES``, from which the filter is not called healthy, although it does not deviate from its record."""
 
+LENGTHS = 1.5
+"""Largest ratio of the number of steps of an episode to those of the record that is not mentioned."""
+
 CONVENTIONS = "test the signs, scales and axes of its inputs: diagnostic Conventions of the inputs"
 
 
@@ -129,6 +132,8 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
 def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
     """What the diagnosis cannot judge: sensors without statistics, and statistics that the episodes or the record lack.
 
+    Also whether the length of the episodes causes deviations, if it is not that of the record (``LENGTHS``).
+
     Episodes of contact only lack those of free motion, for example, and records of earlier versions those of new kinds.
 
     Args:
@@ -143,14 +148,29 @@ def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
     outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
-    return sensors + absent + (outdated if new else [])
+    return _other_lengths(case) + sensors + absent + (outdated if new else [])
+
+
+def _other_lengths(case: Case) -> list[str]:
+    """Episodes that are longer or shorter than those of the record."""
+    if case.profile.steps is None:
+        return []
+    low, high = case.profile.steps
+    lengths = [len(trace) for trace in case.traces if not low / LENGTHS <= len(trace) <= high * LENGTHS]
+    if not lengths:
+        return []
+    own, healthy = (
+        f"{a} steps" if a == b else f"{a} to {b} steps" for a, b in ((min(lengths), max(lengths)), (low, high))
+    )
+    return [f"what the length changes: episodes have {own}, those of the healthy record {healthy}"]
 
 
 def missing_statistics(case: Case) -> int:
     """Number of statistics of kinds that the healthy record does not have, since an earlier version measured it."""
     kinds = {name.partition("/")[0] for name in case.profile.statistics}
     finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}
-    return sum(name.partition("/")[0] not in kinds for name in finite)
+    models = () if case.profile.readings else (n for n in case.profile.statistics if n.startswith("reading "))
+    return sum(name.partition("/")[0] not in kinds for name in finite) + len([*models])
 
 
 def _of_sensors(case: Case) -> set[str]:

@@ -6,6 +6,7 @@ Named ``KIND/SUBJECT/PHASE`` like all statistics of a profile; NaN where one is 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
 from beliefscope.inspect.diagnosis.reading_checks import reading_statistics
 from beliefscope.inspect.diagnosis.vector_checks import (
+    angle_channels,
     axis_index,
     contact_changes,
     contact_distance_statistics,
@@ -43,6 +45,7 @@ def sensor_statistics(
     episode: Episode, reference: Reference | None, readings: Sequence[ReadingModel] = ()
 ) -> dict[str, float]:
     """All statistics of sensors and controls; some of images only with a reference, of others only with a model."""
+    episode = with_continuous_angles(episode)
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
@@ -52,6 +55,17 @@ def sensor_statistics(
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1
     return {name: np.nan if ambiguous and name.startswith("opposition/") else value for name, value in values.items()}
+
+
+def with_continuous_angles(episode: Episode) -> Episode:
+    """The episode with vector sensors whose angles, such as bearings, do not jump where they wrap around."""
+    changed = {}
+    for key, readings in episode.observations.items():
+        if angles := angle_channels(episode, key):
+            values, at = readings.astype(np.float64), np.ix_(episode.present(key), np.array(angles))
+            values[at] = np.unwrap(values[at], axis=0)
+            changed[key] = values
+    return replace(episode, observations={**episode.observations, **changed}) if changed else episode
 
 
 def localise(statistic: str, episode: Episode, reference: Reference | None) -> tuple[int, int] | None:
@@ -64,6 +78,7 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
     key, _, axis = subject.partition(" ")
     if key not in episode.observations:
         return None
+    episode = with_continuous_angles(episode)
     marked = _marked_steps(kind, key, axis, episode)
     if marked is not None:
         steps = np.flatnonzero(marked)

@@ -14,6 +14,7 @@ from beliefscope.inspect.statistics.signals import (
     MIN_STEPS,
     Array,
     Mask,
+    is_angle,
     lag,
     noise_level,
     repeats,
@@ -322,6 +323,14 @@ def free_motion(episode: Episode) -> Mask:
     flag = contact_flag(episode)
     touched = np.zeros(len(episode), dtype=bool) if flag is None else flag
     return np.convolve(touched, np.ones(3), mode="same") == 0
+
+
+def angle_channels(episode: Episode, key: str) -> list[int]:
+    """Channels of a vector sensor that are angles in rad and wrap around in the episode; not of sensors of contact."""
+    readings = episode.observations[key]
+    if readings.ndim != 2 or key in (HAND, FORCE, TORQUE, CONTACT):
+        return []
+    return [i for i, channel in enumerate(readings[episode.present(key)].T) if is_angle(channel)]
 
 
 def _vector_keys(episode: Episode) -> list[str]:

@@ -47,6 +47,7 @@ class HealthyProfile:
             in a phase of too few steps.
         reference: healthy images; None in profiles of format 1 and for tasks without images.
         readings: models of the vector sensors of unknown physics; none in profiles of earlier versions.
+        steps: smallest and largest number of steps of the trajectories; None in profiles of earlier versions.
     """
 
     data: str
@@ -55,6 +56,7 @@ class HealthyProfile:
     statistics: Mapping[str, Array]
     reference: Reference | None = None
     readings: tuple[ReadingModel, ...] = ()
+    steps: tuple[int, int] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, rounded to ``DIGITS``; NaN as null."""
@@ -65,7 +67,8 @@ class HealthyProfile:
         head = {"format": FORMAT, "data": self.data, "episodes": self.episodes, "particles": self.particles}
         reference = None if self.reference is None else self.reference.to_json()
         models = {"readings": [model.to_json() for model in self.readings]} if self.readings else {}
-        return {**head, "statistics": rows, "reference": reference, **models}
+        steps = {"steps": list(self.steps)} if self.steps else {}
+        return {**head, **steps, "statistics": rows, "reference": reference, **models}
 
     @classmethod
     def from_json(cls, document: Any) -> HealthyProfile:
@@ -80,15 +83,17 @@ class HealthyProfile:
             }
             data, images = str(document["data"]), document.get("reference")
             reference = None if images is None else Reference.from_json(images)
-            # Models without biases are of an earlier version, with other features.
-            models = (model for model in document.get("readings", ()) if "biases" in model)
+            # Models without limits are of an earlier version, with other features.
+            models = (model for model in document.get("readings", ()) if "limits" in model)
             readings = tuple(map(ReadingModel.from_json, models))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            steps = document.get("steps")
+            lengths = None if steps is None else (int(steps[0]), int(steps[1]))
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"the healthy record is malformed: {error!r}") from None
         for name, values in rows.items():
             if values.shape != (count,) or name.count("/") != 2:
                 raise BadInput(f"the healthy record is malformed: {name!r} has {len(values)} values of {count}")
-        return cls(data, count, None if particles is None else int(particles), rows, reference, readings)
+        return cls(data, count, None if particles is None else int(particles), rows, reference, readings, lengths)
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:

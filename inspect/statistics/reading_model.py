@@ -1,4 +1,4 @@
-"""Linear model of a vector sensor or of the controls: values that the labels lead to expect, from healthy episodes.
+"""Model of a vector sensor or of the controls: values that the labels lead to expect, from healthy episodes.
 
 It shows what the readings of a sensor of unknown physics cannot show by themselves: channels that are inverted or
 exchanged, a gain, a bias, and a delay behind the labels.
@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.reference_images import CONTACT
-from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask
+from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, is_angle, wrapped
+
+Indices = NDArray[np.intp]
 
 CONTROL = "control"
 """Key of the model of the controls."""
@@ -38,8 +42,8 @@ MAX_STEPS = 20_000
 MIN_EPISODES = 4
 """Smallest number of episodes of a model."""
 
-SLIGHTLY = 0.01
-"""rad: by how much readings of angles may exceed half a turn."""
+DEGREES = {3: 4, 2: 12}
+"""Degree of a polynomial of the state -> largest number of its components."""
 
 DIGITS = 4
 """Significant digits of stored coefficients."""
@@ -71,6 +75,8 @@ class ComparedReadings:
             return np.full((2, readings.shape[1], readings.shape[1]), np.nan)
         signs = np.array([1.0, -1.0])[:, None, None, None]
         difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
+        both = np.logical_and.outer(self.model.angles, self.model.angles)
+        difference[:, :, both] = wrapped(difference[:, :, both])
         return np.asarray(np.square(difference / self.model.noise).mean(1))
 
 
@@ -85,8 +91,8 @@ class ReadingModel:
         constants: (A,) in units of the readings.
         noise: (A,) standard deviations of the readings from the expected ones, in episodes to which it is not fitted.
         biases: (A,) standard deviations between these episodes of the mean of this noise, beyond those of its average.
-        angles: A indices of the state components that the channels measure modulo a turn, such as a heading; -1 for
-            channels that do not wrap around.
+        angles: (A,) whether a channel is an angle that wraps around, such as a heading or a bearing.
+        limits: (2, n) smallest and largest true state, beyond which polynomials are constant.
     """
 
     key: str
@@ -95,7 +101,8 @@ class ReadingModel:
     constants: Array
     noise: Array
     biases: Array
-    angles: tuple[int, ...]
+    angles: tuple[bool, ...]
+    limits: Array
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -111,31 +118,34 @@ class ReadingModel:
             "noise": rounded(self.noise),
             "biases": rounded(self.biases),
             "angles": list(self.angles),
+            "limits": [rounded(row) for row in self.limits],
         }
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReadingModel:
         """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
         channels = tuple(int(channel) for channel in value["channels"])
-        names = ("coefficients", "constants", "noise", "biases")
-        coefficients, constants, noise, biases = (np.array(value[name], dtype=np.float64) for name in names)
+        names = ("coefficients", "constants", "noise", "biases", "limits")
+        coefficients, constants, noise, biases, limits = (np.array(value[name], dtype=np.float64) for name in names)
         shapes = (*coefficients.shape[1:], *constants.shape, *noise.shape, *biases.shape, len(value["angles"]))
-        if coefficients.ndim != 2 or shapes != (len(channels),) * 5:
-            raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}")
-        return cls(
-            str(value["key"]), channels, coefficients, constants, noise, biases, tuple(map(int, value["angles"]))
-        )
+        if coefficients.ndim != 2 or shapes != (len(channels),) * 5 or limits.ndim != 2 or len(limits) != 2:
+            raise ValueError(f"{len(channels)} channels, coefficients {coefficients.shape}, limits {limits.shape}")
+        angles = tuple(map(bool, value["angles"]))
+        return cls(str(value["key"]), channels, coefficients, constants, noise, biases, angles, limits)
 
     def compare(self, episode: Episode) -> ComparedReadings:
-        """The readings of an episode beside the expected ones; angles are not wrapped.
+        """The readings of an episode beside the expected ones; angles are within half a turn of these.
 
         No step has both if the model has the features of another version.
         """
-        inputs, present = features(episode), _steps(episode, self.key)
-        readings = _unwrapped(episode, readings_of(episode, self.key)[:, self.channels], self.angles)
+        readings, present = readings_of(episode, self.key)[:, self.channels], _steps(episode, self.key)
+        inputs, _ = features(episode, self.limits)
         if inputs.shape[1] != len(self.coefficients):
             return ComparedReadings(readings, readings, np.zeros_like(present), self)
-        return ComparedReadings(readings, inputs @ self.coefficients + self.constants, present, self)
+        expected = inputs @ self.coefficients + self.constants
+        turning = np.array(self.angles)
+        readings[:, turning] = (expected + wrapped(readings - expected))[:, turning]
+        return ComparedReadings(readings, expected, present, self)
 
 
 def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
@@ -146,14 +156,16 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
     episodes = [episode for episode in episodes if np.isfinite(episode.states).all()]
     if len(episodes) < MIN_EPISODES or not keys:
         return ()
-    inputs = [features(episode) for episode in episodes]
+    states = np.concatenate([episode.states for episode in episodes]).astype(np.float64)
+    limits = np.stack([states.min(0), states.max(0)])
+    inputs, (groups, *_) = zip(*(features(episode, limits) for episode in episodes), strict=True)
     result = []
     for key in keys:
-        angles = [_angle_of(episodes, key, channel) for channel in range(readings_of(episodes[0], key).shape[1])]
+        angles = [_centre_of(episodes, key, channel) for channel in range(readings_of(episodes[0], key).shape[1])]
         present = [np.flatnonzero(_steps(episode, key)) for episode in episodes]
         stride = 1 + sum(map(len, present)) // MAX_STEPS
         rows = [
-            (x[steps[::stride]], _unwrapped(episode, readings_of(episode, key), angles)[steps[::stride]])
+            (x[steps[::stride]], _around(episode, readings_of(episode, key), angles)[steps[::stride]])
             for x, episode, steps in zip(inputs, episodes, present, strict=True)
             if len(steps) // stride >= MIN_STEPS
         ]
@@ -161,7 +173,7 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
             continue
         mean_x, mean_y = (np.mean([row[i].mean(0) for row in rows], axis=0) for i in (0, 1))
         rows = [(x - mean_x, y - mean_y) for x, y in rows]
-        coefficients, errors = _best_of_prefixes(rows, _prefixes(episodes[0], inputs[0].shape[1]))
+        coefficients, errors = _best_of(groups, rows)
         count = np.array([len(y) for _, y in rows], dtype=np.float64)
         left, total = (np.asarray(sum(len(y) * y.var(0) for y in parts)) for parts in (errors, [y for _, y in rows]))
         channels = np.flatnonzero(left < (1.0 - EXPLAINED) * total)
@@ -171,9 +183,9 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
             variance = np.maximum(left, SMALLEST_NOISE**2 * total)[channels] / count.sum()
             between = np.var([error.mean(0)[channels] for error in errors], axis=0) - variance * (1.0 / count).mean()
             explained = tuple(channels.tolist())
-            turning = tuple(angles[channel] for channel in explained)
+            turning = tuple(angles[channel] is not None for channel in explained)
             noise, biases = np.sqrt(variance), np.sqrt(np.maximum(between, 0.0))
-            result.append(ReadingModel(key, explained, coefficients, constants, noise, biases, turning))
+            result.append(ReadingModel(key, explained, coefficients, constants, noise, biases, turning, limits))
     return tuple(result)
 
 
@@ -182,18 +194,18 @@ def readings_of(episode: Episode, key: str) -> Array:
     return (episode.controls if key == CONTROL else episode.observations[key]).astype(np.float64)
 
 
-def _best_of_prefixes(rows: Sequence[tuple[Array, Array]], prefixes: Sequence[int]) -> tuple[Array, list[Array]]:
-    """(F, d) coefficients of the first features only, as many as leave the least of each channel in other episodes.
+def _best_of(groups: Sequence[Indices], rows: Sequence[tuple[Array, Array]]) -> tuple[Array, list[Array]]:
+    """(F, d) coefficients of one group of features only, that which leaves the least of each channel in other episodes.
 
     Further features, fitted to noise, would change the expected readings from step to step. Also returns the errors
     (S, d) of each episode, in any order, from coefficients that are fitted to half of the others.
     """
     results = []
-    for prefix in prefixes:
-        x = [(inputs[:, :prefix], readings) for inputs, readings in rows]
+    for group in groups:
+        x = [(inputs[:, group], readings) for inputs, readings in rows]
         errors = [*_errors(x[1::2], _ridge(x[::2])), *_errors(x[::2], _ridge(x[1::2]))]
-        coefficients = np.zeros((prefixes[-1], rows[0][1].shape[1]))
-        coefficients[:prefix] = _ridge(x)
+        coefficients = np.zeros((rows[0][0].shape[1], rows[0][1].shape[1]))
+        coefficients[group] = _ridge(x)
         results.append((sum(len(e) * e.var(0) for e in errors), coefficients, errors))
     best = np.argmin([left for left, _, _ in results], axis=0)  # (d,)
     columns = np.arange(len(best))
@@ -216,26 +228,35 @@ def _errors(rows: Sequence[tuple[Array, Array]], coefficients: Array) -> list[Ar
     return [y - x @ coefficients for x, y in rows]
 
 
-def _angle_of(episodes: Sequence[Episode], key: str, channel: int) -> int:
-    """Index of the component that wraps around as a channel does, and is closest to it; -1 for other channels."""
+def _centre_of(episodes: Sequence[Episode], key: str, channel: int) -> tuple[Array, float] | None:
+    """What a channel that wraps around is near, modulo a turn: coefficients (n,) of the state, and a constant.
+
+    That is the wrapping component, or its opposite, that varies most like it, such as the heading; zero coefficients
+    if its mean direction is closer. None for other channels.
+    """
     task = episodes[0].task
-    wrapping = [i for i, component in enumerate(task.components) if component.wraps]
-    readings = [readings_of(episode, key)[:, channel] for episode in episodes]
-    jumps = any((np.abs(np.diff(values)) > np.pi).any() for values in readings)
-    if not wrapping or not jumps or max(np.abs(values).max() for values in readings) > np.pi + SLIGHTLY:
-        return -1
-    states = np.concatenate([episode.states[:, wrapping] for episode in episodes]).astype(np.float64)
-    alike = np.abs(np.exp(1j * (np.concatenate(readings)[:, None] - states)).mean(0))
-    return wrapping[int(alike.argmax())]
+    readings = [readings_of(episode, key)[_steps(episode, key), channel] for episode in episodes]
+    if not any(map(is_angle, readings)):
+        return None
+    states = np.concatenate([e.states[_steps(e, key)] for e in episodes]).astype(np.float64)
+    values = np.concatenate(readings)
+    unit = np.eye(states.shape[1])
+    candidates = [0.0 * unit[0], *(s * unit[i] for i, c in enumerate(task.components) if c.wraps for s in (1.0, -1.0))]
+    directions = [np.exp(1j * (values - states @ candidate)).mean() for candidate in candidates]
+    best = int(np.abs(directions).argmax())
+    return candidates[best], float(np.angle(directions[best]))
 
 
-def _unwrapped(episode: Episode, readings: Array, angles: Sequence[int]) -> Array:
-    """Readings (T, d): those of angles are unwrapped, within half a turn of the components (``angles``)."""
-    result = readings.copy()
-    for channel, component in enumerate(angles):
-        if component >= 0:
-            angle = np.unwrap(episode.states[:, component].astype(np.float64))
-            result[:, channel] = angle + (readings[:, channel] - angle + np.pi) % (2.0 * np.pi) - np.pi
+def _around(episode: Episode, readings: Array, centres: Sequence[tuple[Array, float] | None]) -> Array:
+    """Readings (T, d): those of angles are continuous where what they are near is (``_centre_of``)."""
+    states, result = episode.states.astype(np.float64), readings.copy()
+    for i, component in enumerate(episode.task.components):
+        if component.wraps:
+            states[:, i] = np.unwrap(states[:, i])
+    for channel, centre in enumerate(centres):
+        if centre is not None:
+            angle = states @ centre[0] + centre[1]
+            result[:, channel] = angle + wrapped(readings[:, channel] - angle)
     return result
 
 
@@ -245,11 +266,12 @@ def _steps(episode: Episode, key: str) -> Mask:
     return np.asarray(present & (np.arange(len(episode)) >= FIRST_CHANGES))
 
 
-def features(episode: Episode) -> Array:
+def features(episode: Episode, limits: Array) -> tuple[Array, list[Indices]]:
     """(T, F): the state, its first and second changes by step, all in the body frame, and all of them in contact.
 
     Angles that wrap have their cosine and sine as well, rotations are their matrices. Changes are zero where they are
-    unknown, at the first two steps.
+    unknown, at the first two steps. Polynomials of the state within its limits (2, n) are further features: they are
+    bounded. Also returns the groups of features among which the model of a channel chooses, as their indices.
     """
     task, states = episode.task, episode.states.astype(np.float64)
     change, second = np.zeros((2, *states.shape))
@@ -258,18 +280,33 @@ def features(episode: Episode) -> Array:
     others, frames = _values(task, states)
     vectors = np.concatenate([others, change, second], axis=1)
     in_frames = (frames[:, :, None] * vectors[:, None]).reshape(len(states), -1)
-    all_ = np.concatenate([others, frames, change, second, in_frames], axis=1)
-    if CONTACT not in task.covariates:
-        return all_
-    contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
-    return np.concatenate([all_, contact, contact * all_], axis=1)
+    powers = _polynomials(task, states, limits)
+    linear = np.concatenate([others, frames, change, second, in_frames], axis=1)
+    all_ = np.concatenate([linear, powers], axis=1)
+    if CONTACT in task.covariates:
+        contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
+        all_ = np.concatenate([all_, contact, contact * linear], axis=1)
+    index, state = np.arange(all_.shape[1]), others.shape[1] + frames.shape[1]
+    first, last = linear.shape[1], linear.shape[1] + powers.shape[1]
+    groups: list[Indices] = [index[:state], index[: state + 2 * states.shape[1]], np.delete(index, np.s_[first:last])]
+    if powers.shape[1]:
+        groups += [np.concatenate([index[:state], index[first:last]]), index]
+    return all_, groups
 
 
-def _prefixes(episode: Episode, count: int) -> tuple[int, ...]:
-    """Numbers of features: those of the state; with its changes; and all, ``count``."""
-    others, frames = _values(episode.task, episode.states[:1].astype(np.float64))
-    states = others.shape[1] + frames.shape[1]
-    return states, states + 2 * episode.states.shape[1], count
+def _polynomials(task: Task, states: Array, limits: Array) -> Array:
+    """(T, P): monomials of the second and third degree of components that neither wrap around nor rotate.
+
+    The components are scaled from their limits (2, n) to [-1, 1], and constant beyond.
+    """
+    excluded = {i for i, c in enumerate(task.components) if c.wraps}
+    excluded |= {i for at in task.rotations for i in range(at.start, at.stop)}
+    chosen = [i for i in range(states.shape[1]) if i not in excluded]
+    low, high = limits[:, chosen]
+    scaled = ((2.0 * states[:, chosen] - high - low) / np.maximum(high - low, 1e-12)).clip(-1.0, 1.0)
+    degrees = [degree for degree, most in DEGREES.items() if len(chosen) <= most]
+    factors = [f for degree in degrees for f in combinations_with_replacement(range(len(chosen)), degree)]
+    return np.array([scaled[:, f].prod(1) for f in factors]).T.reshape(len(states), -1)
 
 
 def _values(task: Task, states: Array) -> tuple[Array, Array]:

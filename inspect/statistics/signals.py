@@ -39,6 +39,15 @@ MIN_STEPS = 10
 FIT_ITERATIONS = 6
 """Of a robust fit; further ones hardly change it."""
 
+TURN = 2.0 * np.pi
+"""rad: a full turn."""
+
+NEAR_TURN = 1.0
+"""rad: largest distance of a jump from a full turn that is one, and largest excess of angles over a turn."""
+
+OTHER_JUMPS = 0.02
+"""Largest share of steps in which an angle that wraps around turns by a quarter of a turn or more."""
+
 NORMAL_MAD = 0.6745
 """Median absolute deviation of the standard normal distribution."""
 
@@ -73,6 +82,23 @@ def robust_fit(columns: Array, values: Array) -> Array:
         weight = 1.0 / np.maximum(left / np.maximum(np.median(left, axis=1, keepdims=True), 1e-9), 1.0)
     result: Array = fit[..., 0] / scale[:, 0]
     return result
+
+
+def is_angle(values: Array) -> bool:
+    """Whether a signal (T,) is an angle in rad that wraps around: from -pi to pi or 0 to 2 pi, with jumps of a turn.
+
+    Other jumps of more than a quarter of a turn are rare (``OTHER_JUMPS``), unlike those of noise.
+    """
+    if len(values) < 2 or min(np.abs(values - middle).max() for middle in (0.0, np.pi)) > (TURN + NEAR_TURN) / 2.0:
+        return False
+    jumps = np.abs(np.diff(values))
+    turns = jumps > TURN - NEAR_TURN
+    return bool(turns.any() and np.mean((jumps > TURN / 4.0) & ~turns) < OTHER_JUMPS)
+
+
+def wrapped(angles: Array) -> Array:
+    """Angles in rad modulo a turn, in [-pi, pi)."""
+    return np.asarray((angles + np.pi) % TURN - np.pi)
 
 
 def noise_level(values: Array, present: Mask | None = None) -> Array:

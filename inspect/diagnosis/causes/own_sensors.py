@@ -87,7 +87,8 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     scaled = of(*BIASED, *delays, "change", "size", "noise", "reading noise", "reading scatter")
     noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
-    gain = (Symptom(of("size"), 0, otherwise=(Symptom(of("reading gain"), 0),)), Symptom(of("noise"), 0))
+    slope = (Symptom(of("reading gain"), 0),)
+    gain = (Symptom(of("size"), 0, otherwise=slope), Symptom(of("noise"), 0, otherwise=slope))
     rough = f"{scaled}|{of('roughness', 'stuck')}"
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor."),

@@ -165,6 +165,33 @@ def test_sensors_without_statistics_are_named() -> None:
     )
 
 
+def test_episodes_of_another_length_than_those_of_the_record_are_mentioned() -> None:
+    record = HealthyProfile("test", 20, None, {"noise/force x/all": 1.0 + 0.1 * np.arange(20)})
+    rows, inputs = [{"noise/force x/all": 2.0}] * 3, RunInputs(checkpoint(), {}, 300, frozenset())
+    length = len(runs()[0])
+    for steps, text in (
+        (None, None),
+        ((length, length), None),
+        ((length, 9 * length), None),
+        ((5 * length, 5 * length), f"{length} steps, those of the healthy record {5 * length} steps"),
+        (
+            (length // 4, length // 3),
+            f"{length} steps, those of the healthy record {length // 4} to {length // 3} steps",
+        ),
+    ):
+        result = healthy(compared(inputs, runs(), rows, rows, replace(record, steps=steps), 0.05))
+        first = result.to_json()["unmeasured"][0]
+        assert first == (f"what the length changes: episodes have {text}" if text else "image"), steps
+
+
+def test_reading_models_of_an_earlier_version_are_measured_again() -> None:
+    """Their record has statistics of readings that the episodes cannot have."""
+    of_readings = {"reading bias/gps x/all": 0.1 * np.arange(20)}
+    record = HealthyProfile("test", 20, None, {"noise/force x/all": 1.0 + 0.1 * np.arange(20), **of_readings})
+    rows, inputs = [{"noise/force x/all": 2.0}] * 3, RunInputs(checkpoint(), {}, 300, frozenset())
+    assert healthy(compared(inputs, runs(), rows, rows, record, 0.05)).to_json()["outdated"]
+
+
 def test_faults_after_all_steps_are_refused() -> None:
     """By everything that injects faults before a diagnosis."""
     with pytest.raises(BadInput, match=r"blackout:from=100 starts after the last step, 99"):

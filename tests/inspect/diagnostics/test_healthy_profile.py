@@ -121,9 +121,9 @@ def test_no_alarm_reads_well() -> None:
 
 
 def test_json_round_trip() -> None:
-    reference = profile(trajectories(30, np.random.default_rng(5)))
+    reference = replace(profile(trajectories(30, np.random.default_rng(5))), steps=(90, 100))
     again = HealthyProfile.from_json(json.loads(json.dumps(reference.to_json(), allow_nan=False)))
-    assert again.data == reference.data
+    assert (again.data, again.steps) == (reference.data, (90, 100))
     for name in NAMES:
         np.testing.assert_allclose(again.statistics[name], reference.statistics[name], rtol=5e-3)
 
@@ -165,6 +165,7 @@ def test_a_measured_profile_is_that_of_new_episodes() -> None:
         {"statistics": {"nees": [1.0]}},
         {"statistics": {"nees/fused/all": "abc"}},
         {"statistics": None},
+        {"steps": [100]},
     ],
 )
 def test_malformed_profiles_are_refused(change: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Linear models of sensors: exact on readings that are linear in their features, and none where labels say nothing."""
+"""Models of sensors: exact on readings that are linear in their features, and none where labels say nothing."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task, rotation
 from beliefscope.inspect.diagnosis.reading_checks import modelled_keys, modelled_sensors, reading_statistics
 from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
+from beliefscope.inspect.statistics.signals import wrapped
 
 DT, STEPS, NOISE = 0.05, 120, 0.01
 PLANE = Task(
@@ -178,7 +179,7 @@ OF_FLIGHTS = fit_reading_models(FLIGHTS, modelled_keys(IMU))
 
 def test_angles_are_compared_modulo_a_turn() -> None:
     compass, flight = OF_FLIGHTS[0], fly(100)
-    assert (compass.key, compass.angles) == ("compass", (2,))
+    assert (compass.key, compass.angles) == ("compass", (True,))
     assert np.abs(np.diff(flight.observations["compass"][:, 0])).max() > np.pi, "it wraps around"
     turned = (flight.observations["compass"] + 0.4 + np.pi) % (2.0 * np.pi) - np.pi
     before, after = (
@@ -186,6 +187,61 @@ def test_angles_are_compared_modulo_a_turn() -> None:
         for readings in (flight.observations["compass"], turned)
     )
     assert (after - before) * compass.noise[0] == pytest.approx(0.4, abs=1e-4)
+
+
+PORT = replace(
+    PLANE,
+    name="port",
+    observations={"beacon": (2,), "range": (2,)},
+    modalities={"beacon": ("beacon",), "range": ("range",)},
+)
+BEACONS = np.array([[4.0, 3.0], [-5.0, 1.0]])
+
+
+def cruise(seed: int) -> Episode:
+    """Bearings of two beacons, which wrap around with the opposite of the heading, and their distances."""
+    rng = np.random.default_rng(seed)
+    position, yaw = 0.4 * smooth(rng, 2), 3.0 * smooth(rng, 1)[:, 0]
+    x, y = (BEACONS - position[:, None]).transpose(2, 0, 1)
+    bearing = np.arctan2(y, x) - yaw[:, None] + rng.normal(0.0, 2.0 * NOISE, (STEPS, 2))
+    distance = np.hypot(x, y) + rng.normal(0.0, 2.0 * NOISE, (STEPS, 2))
+    states = np.column_stack([position, wrapped(yaw)])
+    observations = {"beacon": wrapped(bearing), "range": distance}
+    return Episode(PORT, states, np.zeros((STEPS, 0)), observations, contact=np.zeros(STEPS))
+
+
+def test_bearings_and_distances_of_unknown_beacons_are_expected() -> None:
+    """Polynomials of the position, and angles that turn against the heading, leave hardly more than the noise."""
+    beacon, distance = fit_reading_models([cruise(seed) for seed in range(20)], ["beacon", "range"])
+    assert (beacon.angles, distance.angles) == ((True, True), (False, False))
+    episode = cruise(100)
+    for model in (beacon, distance):
+        compared = model.compare(episode)
+        assert (compared.readings - compared.expected)[compared.present].std(0).max() < 2.0 * 2.0 * NOISE
+    bearings = episode.observations["beacon"]
+    clean, inverted, biased, longer = (
+        reading_statistics(with_readings(episode, key, readings), [beacon, distance])
+        for key, readings in (
+            ("beacon", bearings),
+            ("beacon", -bearings),
+            ("beacon", wrapped(bearings + 0.1)),
+            ("range", 1.1 * episode.observations["range"]),
+        )
+    )
+    assert clean["inverted/beacon x/all"] == 0.0 < 1.0 < inverted["inverted/beacon x/all"]
+    shift = biased["reading bias/beacon x/all"] - clean["reading bias/beacon x/all"]
+    assert shift * beacon.noise[0] == pytest.approx(0.1, abs=1e-4)
+    assert longer["reading gain/range x/all"] == pytest.approx(1.1, abs=0.02)
+
+
+def test_polynomials_are_constant_beyond_the_states_of_the_record() -> None:
+    """A cubic that fits the healthy states says nothing about others; linear features remain."""
+    (model,) = fit_reading_models([cruise(seed) for seed in range(20)], ["range"])
+    near, far, farther = (
+        model.compare(replace(NEW, task=PORT, states=np.full((STEPS, 3), x), observations=cruise(0).observations))
+        for x in (5.0, 30.0, 55.0)
+    )
+    np.testing.assert_allclose(farther.expected - far.expected, far.expected - near.expected, rtol=1e-3)
 
 
 def test_controls_in_the_body_frame_are_sensors() -> None:
