@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 
-from beliefscope.inspect.statistics.innovations import has_one_prediction, innovations
+from beliefscope.inspect.diagnosis.vector_checks import angle_channels
+from beliefscope.inspect.statistics.innovations import innovations, prediction
 from beliefscope.inspect.statistics.measures import Array, Mask, counted
+from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN
 from beliefscope.inspect.trace import Trace
 
 MIN_STEPS = 10
@@ -15,12 +17,6 @@ MIN_STEPS = 10
 
 LARGEST_LOGARITHM = 30.0
 """Largest absolute logarithm of a standard deviation; larger ones are those of a covariance without full rank."""
-
-TURN_AND_NOISE = 6.6
-"""Range of the readings of an angle, rad: a turn, and some noise."""
-
-TURN = 1.0
-"""Largest distance of an innovation from a full turn, rad, that counts as one, and of readings from the ends of one."""
 
 
 def innovation_statistics(trace: Trace) -> dict[str, float]:
@@ -49,9 +45,9 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
             at = used[:, k, i]
             values[f"innovation bias/{modality} {i + 1}/all"] = float((nu[at, k, i] / deviation[at, k, i]).mean())
         values[f"innovation std/{modality}/all"] = float(np.exp(np.nanmean(np.log(deviation[:, k, channels]))))
-        if len(angles := [i for i in _angles(trace, modality, nu.shape[-1]) if i in channels]):
-            turns = np.any(np.abs(np.abs(nu[:, k, angles]) - 2.0 * math.pi) < TURN, axis=-1)
-            values[f"innovation turns/{modality}/all"] = float(turns[used[:, k].any(-1)].mean())
+        angles = [i for i in _angles(trace, modality) if i in channels]
+        turns = np.any(np.abs(np.abs(nu[:, k, angles]) - TURN) < NEAR_TURN, axis=-1)
+        values[f"innovation turns/{modality}/all"] = float(turns[used[:, k].any(-1)].mean())
     noise = measurement_noise(trace, *pair)
     if "measurement noise//all" in noise:
         sizes = {m: values[name] for m in trace.modalities if (name := f"innovation std/{m}/all") in values}
@@ -60,17 +56,13 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     return values | noise
 
 
-def _angles(trace: Trace, modality: str, count: int) -> list[int]:
-    """Channels of a modality whose readings may be angles in rad: within -pi to pi, or anywhere in 0 to 2 pi."""
-    keys = trace.task.modalities.get(modality, ())
-    readings = [trace.episode.observations[key] for key in keys]
-    if any(values.ndim != 2 for values in readings) or not readings:
-        return []
-    values = np.concatenate(readings, axis=1)[:, :count]
-    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    around_zero = (low > -TURN_AND_NOISE / 2.0) & (low < 0.0) & (high < TURN_AND_NOISE / 2.0)
-    from_zero = (low > -TURN) & (low < TURN) & (high > 2.0 * math.pi - TURN) & (high < 2.0 * math.pi + TURN)
-    return np.flatnonzero(around_zero | from_zero).tolist()
+def _angles(trace: Trace, modality: str) -> list[int]:
+    """Channels of a modality, that of all its sensors, which are angles and wrap around in the episode."""
+    angles, count = [], 0
+    for key in trace.task.modalities.get(modality, ()):
+        angles += [count + i for i in angle_channels(trace.episode, key)]
+        count += math.prod(trace.episode.observations[key].shape[1:])
+    return angles
 
 
 def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
@@ -80,17 +72,17 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     have the product of these ratios: the logarithms of the steps are linear equations for those of the modalities. For
     modalities that are always used together, they only give the mean of all, ``measurement noise//all``.
 
-    Only of filters whose modalities share one prediction and whose beliefs have a covariance of full rank.
+    Only of filters that report their prediction and whose beliefs have a covariance of full rank.
 
     Args:
         nu: (T, K, m) innovations. s: (T, K, m, m) their covariance.
     """
-    predicted = trace.predicted_covariance
-    if predicted is None or not trace.has_covariance or not has_one_prediction(trace):
+    predicted = prediction(trace)
+    if predicted is None or predicted[1] is None or not trace.has_covariance:
         return {}
     used = _accepted(trace, np.isfinite(nu))
     s = np.where(used[..., :, None] & used[..., None, :], s, np.eye(nu.shape[-1]))
-    before, after = predicted[:, 0].astype(np.float64), trace.estimate_covariance.astype(np.float64)
+    before, after = predicted[1], trace.estimate_covariance.astype(np.float64)
     (sign_s, of_s), (sign, of_before), (sign_after, of_after) = map(np.linalg.slogdet, (s, before, after))
     channels = used.sum(-1)  # (T, K)
     keep = counted(trace) & (sign_s > 0).all(-1) & (sign > 0) & (sign_after > 0) & (channels.sum(-1) > 0)

@@ -26,7 +26,7 @@ from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, r
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import has_one_prediction
+from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.signals import lag
 from beliefscope.inspect.trace import Trace
@@ -227,20 +227,20 @@ def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
     """Those of ``dynamics_statistics`` from the predictions of an external filter, which start at its estimates.
 
     The process noise is what a prediction adds to the variance of the estimate. ``dynamics offset``: mean residual,
-    which differs between episodes if the filter does not estimate a bias. Only of filters whose models share one
-    prediction.
+    which differs between episodes if the filter does not estimate a bias.
     """
-    mean, covariance = trace.predicted_mean, trace.predicted_covariance
+    belief = prediction(trace)
     states, task = trace.episode.states.astype(np.float64), trace.task
     keep = measures.counted(trace)[1:]
-    if mean is None or task.rotations or keep.sum() < MIN_STEPS or not has_one_prediction(trace):
+    if belief is None or task.rotations or keep.sum() < MIN_STEPS:
         return {}
-    predicted = task.difference(mean[1:, 0].astype(np.float64), trace.estimate_mean[:-1].astype(np.float64))[keep]
+    mean, covariance = belief
+    predicted = task.difference(mean[1:], trace.estimate_mean[:-1].astype(np.float64))[keep]
     change = task.difference(states[1:], states[:-1])[keep]
     residual = measures.wrapped(task, predicted - change)
     more: dict[str, Array] = {"dynamics offset": residual.mean(0)}
     if covariance is not None and trace.has_covariance:
-        added = covariance[1:, 0].astype(np.float64) - trace.estimate_covariance[:-1].astype(np.float64)
+        added = covariance[1:] - trace.estimate_covariance[:-1].astype(np.float64)
         variance = np.median(np.diagonal(added, axis1=-2, axis2=-1)[keep], axis=0)
         variance = np.where(variance > 0.0, variance, np.nan)
         more |= {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}

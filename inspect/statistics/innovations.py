@@ -75,10 +75,21 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
     return trace.task.difference(z, predicted), p + r
 
 
-def has_one_prediction(trace: Trace) -> bool:
-    """Whether the filter reports predictions that its modalities share."""
-    mean = trace.predicted_mean
-    return mean is not None and np.allclose(mean, mean[:, :1], rtol=1e-3)
+def prediction(trace: Trace) -> tuple[Array, Array | None] | None:
+    """Mean (T, n) and covariance (T, n, n) of the belief before all updates of a step; None if it is not reported.
+
+    Of a filter that reports the belief before each of several updates, it is the least certain one.
+    """
+    if trace.predicted_mean is None:
+        return None
+    mean = trace.predicted_mean.astype(np.float64)
+    covariance = None if trace.predicted_covariance is None else trace.predicted_covariance.astype(np.float64)
+    if np.allclose(mean, mean[:, :1], rtol=1e-3):
+        return mean[:, 0], None if covariance is None else covariance[:, 0]
+    if covariance is None or not np.isfinite(covariance).all():
+        return None
+    steps, first = np.arange(len(mean)), np.linalg.slogdet(covariance)[1].argmax(1)
+    return mean[steps, first], covariance[steps, first]
 
 
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:

@@ -29,11 +29,15 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
 def in_predictions(cause: Cause) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates."""
     changed = {
-        "dynamics": "dynamics offset/*|dynamics scatter/*",
+        "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*",
         "process_noise": "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "offset", "spread")),
     }
     others = f"{DYNAMICS}|process noise/*"
-    return replace(cause, consequences=f"{cause.consequences}|{changed.get(cause.component, others)}")
+    consequences = f"{cause.consequences}|{changed.get(cause.component, others)}"
+    # Predicted changes that are too small, such as those of a shorter time step, add too little noise as well.
+    is_smaller = cause.name in ("dynamics.frozen", "dynamics.inverted")
+    lowers = f"{cause.lowers}|process noise/*" if is_smaller else cause.lowers
+    return replace(cause, consequences=consequences, lowers=lowers)
 
 
 def _of_updates(modality: str) -> tuple[Cause, ...]:
@@ -64,6 +68,14 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
     return (
         *noise,
         Cause(
+            f"measurement.{modality}.bias",
+            f"Measurement function of {name} biased",
+            (Symptom(f"innovation bias/{modality} *", 0),),
+            FILTER,
+            f"Compare h of {name} at the true states with its readings: positions of landmarks, offsets, units.",
+            prior=-0.6,
+        ),
+        Cause(
             f"innovation.{modality}.turns",
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
@@ -74,7 +86,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"updates.{modality}.missing",
             f"Updates with {name} missing",
             (Symptom(f"updates/{modality}/*", -1),),
-            FILTER,
+            f"measurement noise//*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
         ),
     )

@@ -15,6 +15,7 @@ import beliefscope as bs
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
+from beliefscope.inspect.diagnosis.model_checks import reported_dynamics_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.trace import Trace
@@ -76,14 +77,19 @@ class Boat:
     H: ClassVar = {"compass": np.eye(4)[2:3]}
 
     def __init__(
-        self, radar: float = 1.0, compass: float = 1.0, wraps: bool = True, has_bias: bool = True, updates: float = 1.0
+        self,
+        radar: float = 1.0,
+        compass: float = 1.0,
+        wraps: bool = True,
+        has_bias: bool = True,
+        updates: float = 1.0,
+        turn: float = 1.0,
+        offset: float = 0.0,
+        separate: bool = False,
     ) -> None:
-        self.factors, self.wraps, self.has_bias, self.updates = (
-            {"radar": radar, "compass": compass},
-            wraps,
-            has_bias,
-            updates,
-        )
+        self.factors = {"radar": radar, "compass": compass}
+        self.wraps, self.has_bias, self.updates = wraps, has_bias, updates
+        self.turn, self.offset, self.separate = turn, offset, separate
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.mean, self.covariance, self.random = mean, covariance, np.random.default_rng(0)
@@ -91,13 +97,14 @@ class Boat:
     def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
         x, y, heading, bias = self.mean
         speed, c, s = 0.1 * controls[0], math.cos(heading), math.sin(heading)
-        turn = 0.1 * (controls[1] - (bias if self.has_bias else 0.0))
+        turn = 0.1 * self.turn * (controls[1] - (bias if self.has_bias else 0.0))
         mean, jacobian = np.array([x + speed * c, y + speed * s, heading + turn, bias]), np.eye(4)
         jacobian[:2, 2], jacobian[2, 3] = (-speed * s, speed * c), -0.1 if self.has_bias else 0.0
         noise = np.diag([1e-4, 1e-4, 4e-6, 1e-8])
         covariance = jacobian @ self.covariance @ jacobian.T + noise
-        predicted, innovations, covariances = (mean, covariance), [], []
+        beliefs, innovations, covariances = [], [], []
         for key in STD:
+            beliefs.append((mean, covariance))
             if not observations.get(f"{key}.present", True) or (
                 key == "compass" and self.random.random() > self.updates
             ):
@@ -115,12 +122,13 @@ class Boat:
             innovations.append(innovation)
             covariances.append(size)
         mean[2] = wrapped(mean[2])
+        predicted = [np.stack(parts) for parts in zip(*(beliefs if self.separate else [beliefs[0]] * 2), strict=True)]
         self.mean, self.covariance = mean, covariance
         return {
             "estimate_mean": mean,
             "estimate_covariance": covariance,
-            "predicted_mean": np.stack([predicted[0]] * 2),
-            "predicted_covariance": np.stack([predicted[1]] * 2),
+            "predicted_mean": predicted[0],
+            "predicted_covariance": predicted[1],
             "innovation": innovations,
             "innovation_covariance": covariances,
         }
@@ -131,7 +139,8 @@ class Boat:
             return self.H["compass"], mean[2:3]
         x, y = mean[:2]
         r = math.hypot(x, y)
-        return np.array([[x / r, y / r, 0, 0], [-y / r**2, x / r**2, 0, 0]]), np.array([r, math.atan2(y, x)])
+        expected = np.array([r + self.offset, math.atan2(y, x)])
+        return np.array([[x / r, y / r, 0, 0], [-y / r**2, x / r**2, 0, 0]]), expected
 
 
 def loaded(filter_: Boat, every: int = 4) -> Checkpoint:
@@ -176,6 +185,13 @@ def test_rejected_measurements_change_no_covariance() -> None:
     assert innovation_statistics(gated)["updates/compass/all"] == 0.0
 
 
+def test_predictions_before_each_update_have_the_statistics_of_those_before_all() -> None:
+    shared, separate = run(Boat()), run(Boat(separate=True))
+    assert not np.array_equal(shared.predicted_mean, separate.predicted_mean)
+    for statistics in (innovation_statistics, reported_dynamics_statistics):
+        assert statistics(separate) == pytest.approx(statistics(shared), nan_ok=True)
+
+
 def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None:
     assert innovation_statistics(replace(run(Boat()), innovation=None, innovation_covariance=None)) == {}
 
@@ -189,6 +205,10 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         (Boat(wraps=False), "innovation.compass.turns"),
         (Boat(has_bias=False), "dynamics.drift"),
         (Boat(updates=0.5), "updates.compass.missing"),
+        (Boat(turn=-1.0), "dynamics.inverted"),
+        (Boat(turn=0.6), "dynamics.frozen"),
+        (Boat(offset=0.5), "measurement.radar.bias"),
+        (Boat(radar=0.1, separate=True), "measurement_noise.radar.small"),
     ],
 )
 def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:
