@@ -16,6 +16,7 @@ from beliefscope.datasets.covariate import CONTACT, Covariate, Kind
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.task import Component, Ingredient, Task
+from beliefscope.datasets.text import plural
 
 FUNCTIONS = ("replay", "outline", "ridge_direction", "simulate")
 """Fields of a task that are code."""
@@ -154,7 +155,7 @@ def check_definition(task: Task, where: str = "") -> None:
         parts = [i for i, component in enumerate(task.components) if name and component.rotation == name]
         alike = {task.components[i].unit for i in parts} == {"rad"} and [*np.diff(parts)] == [1, 1]
         if not isinstance(name, str) or (name and not alike):
-            raise BadInput(f"{place}: rotation {name!r:.200} has {len(parts)} components, expected three of unit rad.")
+            raise BadInput(f"{place}: rotation {name!r:.200} has {plural(len(parts), 'component')}, not 3 of unit rad.")
     if len(set(task.map_indices)) != len(task.map_components) or len(task.map_components) not in (1, 2):
         raise BadInput(f"{place}: map components are {list(task.map_components)!r:.200}, expected one or two names.")
     for key, shape in task.observations.items():

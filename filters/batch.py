@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import plural
 from beliefscope.filters.angles import Angles
 
 MIN_STD = 1e-6
@@ -106,7 +107,7 @@ class Steps:
         room = (self.length - steps + 1).clamp_min(0)
         ends = room.cumsum(0)
         if int(ends[-1]) == 0:
-            raise BadInput(f"no episode has {steps} steps: the longest has {int(self.length.max())}")
+            raise BadInput(f"no episode has {plural(steps, 'step')}: the longest has {int(self.length.max())}")
         draw = torch.randint(int(ends[-1]), (count,), generator=generator).to(ends.device)
         episode = torch.searchsorted(ends, draw, right=True)
         return self.windows(self.first[episode] + draw - (ends - room)[episode], steps)

@@ -11,6 +11,7 @@ from scipy.special import chdtri
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import display_name
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.calibration import Calibration, Layer, conformal_radius
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table
@@ -57,13 +58,13 @@ class CalibrationReport(Diagnostic):
     def verdict(self) -> str:
         """Coverage of the fused estimate over all steps."""
         shares = [
-            f"{c.region} {100 * c.share:.1f} %{_interval(c)}"
+            f"{c.region} {percent(c.share, '.1f')}{_interval(c)}"
             for c in self.coverage
             if c.layer == "fused" and c.phase == "all"
         ]
         return (
-            f"Coverage of {100 * self.calibration.level:g} % regions over {len(self.tested)} other episodes: "
-            f"{', '.join(shares)}."
+            f"Coverage of {percent(self.calibration.level, 'g')} regions over "
+            f"{plural(len(self.tested), 'other episode')}: {', '.join(shares)}."
         )
 
     def tables(self) -> list[Table]:
@@ -85,9 +86,9 @@ class CalibrationReport(Diagnostic):
         keys = dict.fromkeys((c.layer, c.phase, c.episodes) for c in self.coverage)
         lines = tuple((*key, *(cells.get((*key[:2], region)) for region in regions)) for key in keys)
         return [
-            Table(f"Calibration from {self.calibration.episodes} episodes", columns, tuple(rows)),
+            Table(f"Calibration from {plural(self.calibration.episodes, 'episode')}", columns, tuple(rows)),
             Table(
-                f"Coverage % of {100 * self.calibration.level:g} % regions",
+                f"Coverage % of {percent(self.calibration.level, 'g')} regions",
                 ("layer", "phase", "episodes", *map(display_name, regions)),
                 lines,
             ),
@@ -101,8 +102,8 @@ def check_level(level: float, fitted: int, tested: int) -> None:
     needed = math.ceil(level / (1.0 - level) - 1e-9)
     if fitted < needed or not tested:
         raise BadInput(
-            f"{fitted} episodes to fit and {tested} to test: regions of level {level:g} need at least {needed} and 1; "
-            "give more held-out episodes or a lower level"
+            f"{plural(fitted, 'episode')} to fit and {tested} to test: regions of level {level:g} need at least "
+            f"{needed} and 1; give more held-out episodes or a lower level"
         )
 
 

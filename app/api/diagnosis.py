@@ -19,6 +19,7 @@ from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import plural
 from beliefscope.inspect.diagnosis.cause import Evidence, Recovery
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
@@ -141,7 +142,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     @router.post("/api/diagnosis/{task}/{filter}/{episode}", status_code=202)
     def find_cause(selection: RequestedRun, over: Over = "episode") -> JobReply:
         arguments = _arguments(store, selection, over)
-        scope = "" if over == "episode" else f"{len(arguments['episodes'])} held-out episodes"
+        scope = "" if over == "episode" else plural(len(arguments["episodes"]), "held-out episode")
         title, link = f"Diagnosis of {selection.describe(scope)}", _link(selection, arguments["data"], over)
         return JobReply(job=jobs.submit("diagnosis", title, arguments, link=link))
 
@@ -172,10 +173,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def measure_record(task: str, filter: str, data: str = "") -> JobReply:
         """Measures the healthy record of a filter, also if it was measured before."""
         arguments = _record_arguments(store, task, filter, data)
-        count, name = len(arguments["episodes"]), arguments["data"]
-        if count < MIN_HEALTHY:
-            raise BadInput(f"{name!r} has {count} held-out episodes; a healthy record needs at least {MIN_HEALTHY}")
-        title = f"Healthy record of {filter}, {task}, {count} held-out episodes of {name}"
+        name, episodes = arguments["data"], plural(len(arguments["episodes"]), "held-out episode")
+        if len(arguments["episodes"]) < MIN_HEALTHY:
+            raise BadInput(f"{name!r} has {episodes}; a healthy record needs at least {MIN_HEALTHY}")
+        title = f"Healthy record of {filter}, {task}, {episodes} of {name}"
         link = page_link(task=task, filter=filter, data=name, tab="diagnosis")
         job = jobs.submit("healthy", title, arguments, link=link, output_exists=False)  # a new job replaces the record
         return JobReply(job=job)

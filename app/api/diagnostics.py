@@ -17,6 +17,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.text import plural
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Entry
 
@@ -109,7 +110,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     ) -> JobReply:
         _check(entry, store.request(selection))
         arguments = _arguments(store, entry, selection, options, episodes)
-        scope = f"all {len(arguments['selections'])} held-out episodes" if episodes else ""
+        scope = f"all {plural(len(arguments['selections']), 'held-out episode')}" if episodes else ""
         title, link = f"{entry.title} of {selection.describe(scope)}", _link(entry, selection, options, episodes)
         return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
 

@@ -17,6 +17,7 @@ from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.text import plural
 from beliefscope.inspect.failures import by_episode
 from beliefscope.inspect.failures.events import Event, PhaseStatistics
 from beliefscope.inspect.slices.report import ErrorSlice
@@ -135,7 +136,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def find_failures(request: RequestedSurvey) -> JobReply:
         arguments = _arguments(store, request)
         count, faults = len(arguments["episodes"]), arguments["faults"]
-        scope = f"all {count} episodes" if request.among == "all" else f"{count} held-out episodes"
+        scope = f"all {plural(count, 'episode')}" if request.among == "all" else plural(count, "held-out episode")
         title = ", ".join(filter(None, [f"Failures of {request.filter}", request.task, scope, faults]))
         state = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults")}
         link = page_link(**state, tab="failures")

@@ -31,6 +31,7 @@ from beliefscope.app.workspace.recordings import ENDING, Recording, RecordingFol
 from beliefscope.app.workspace.trash import DeletedFile
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.traces.live_file import SUFFIX
@@ -253,7 +254,7 @@ class RunMatcher:
         elif info.seed != settings.seed:
             reason = f"The run has seed {info.seed}; this server uses seed {settings.seed}."
         elif info.particles not in (None, settings.particles):
-            reason = f"The run has {info.particles} particles; this server uses {settings.particles}."
+            reason = f"The run has {plural(info.particles or 0, 'particle')}; this server uses {settings.particles}."
         elif (data := self._find_data(task, episode, info.data_hash)) is None:
             reason = f"No data set of this server contains its episode {episode}, {info.data_hash[:8]}."
         else:

@@ -17,6 +17,7 @@ from typer.models import ParameterInfo
 from beliefscope.app.cli import console
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.parallel import prepare_processes
+from beliefscope.datasets.text import plural
 
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
@@ -369,9 +370,9 @@ def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:
     from beliefscope.inspect.traces.provenance import describe
 
     document = describe(trace) | extra
-    run = f"{trace.filter} over {document['steps']} steps of {trace.task.name} episode {trace.episode_index}"
-    text = run + (f" with {trace.faults}" if trace.faults else "")
-    return console.Result(document, text, path)
+    steps = plural(document["steps"], "step")
+    run = f"{trace.filter} over {steps} of {trace.task.name} episode {trace.episode_index}"
+    return console.Result(document, run + (f" with {trace.faults}" if trace.faults else ""), path)
 
 
 def checkpoint_result(

@@ -6,6 +6,7 @@ from typing import Any
 
 from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import percent
 from beliefscope.filters.training.study import Cell, run_local
 
 
@@ -20,7 +21,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     def progress(cell: Cell) -> Callable[[str, int, int, float], None]:
         def update(stage: str, step: int, count: int, loss: float) -> None:
-            report(len(completed) / len(unfinished), f"{cell}: {stage}, {100.0 * step / count:.0f} %, loss {loss:.3g}")
+            report(len(completed) / len(unfinished), f"{cell}: {stage}, {percent(step / count)}, loss {loss:.3g}")
 
         return update
 

@@ -24,6 +24,7 @@ from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.readers.hdf5_guard import HDF5_ERRORS, open_hdf5, read_error
 from beliefscope.datasets.readers.hdf5_limits import check_array
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import plural
 
 FORMAT = "beliefscope-episodes"
 VERSION = 1
@@ -150,7 +151,7 @@ class EpisodeFile(Dataset):
         groups = [self._file.get(f"trajectory{i}") for i in range(count)]
         for i, group in enumerate(groups):
             if not isinstance(group, h5py.Group):
-                raise BadInput(f"{self.path} has {count} episodes, but no group 'trajectory{i}'.")
+                raise BadInput(f"{self.path} has {plural(count, 'episode')}, but no group 'trajectory{i}'.")
         return groups
 
     def _usable_groups(self) -> list[h5py.Group]:

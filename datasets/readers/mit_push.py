@@ -41,6 +41,7 @@ from beliefscope.datasets.readers.push_real_task import (
 from beliefscope.datasets.simulation.ingredients import draw, finish, moved_camera
 from beliefscope.datasets.simulation.simulate import hand_controls, path_controls
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import plural
 
 Array = NDArray[np.float64]
 
@@ -221,7 +222,7 @@ def _validate(path: Path, key: str, rows: object) -> Array:
     clock = stream[:, 0]
     stream = stream[np.concatenate([[True], clock[1:] > np.maximum.accumulate(clock)[:-1]])] if len(clock) else stream
     if len(stream) < 2:
-        raise BadInput(f"{place} has {len(stream)} rows of different times, expected at least 2.")
+        raise BadInput(f"{place} has {plural(len(stream), 'row')} of different times, expected at least 2.")
     gaps = np.diff(stream[:, 0])
     at = int(gaps.argmax())
     if gaps[at] > MAX_GAP:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, type_name
 from beliefscope.datasets.io import user_code
+from beliefscope.datasets.text import plural
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.calls import inputs_of, seeded
 from beliefscope.filters.external.load import ExternalFilter
@@ -140,7 +141,7 @@ class ExternalLoop(FineTuneLoop):
         self._train = [slice_.apply_faults(groups["train"], settings.seed) for slice_, _ in self._slices]
         long = [i for i, episode in enumerate(groups["train"]) if len(episode) >= settings.length]
         if not long:
-            raise BadInput(f"no training episode has {settings.length} steps; use a smaller --length")
+            raise BadInput(f"no training episode has {plural(settings.length, 'step')}; use a smaller --length")
         self._long = np.array(long)
 
     def step_loss(self, step: int) -> Tensor:

@@ -14,6 +14,7 @@ import torch
 from beliefscope.datasets.dataset import SPLITS, no_training_episodes
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
@@ -92,7 +93,8 @@ def finetune(
     frozen_digest = digest(filter_, frozen)
     groups, events = split_episodes(episodes, settings.events)
     if settings.length > (longest := max(map(len, groups["train"]))):
-        raise BadInput(f"windows of {settings.length} steps are longer than every training episode: {longest} steps")
+        steps = plural(longest, "step")
+        raise BadInput(f"windows of {settings.length} steps are longer than every training episode: {steps}")
     mixes, images = _mixes(filter_, groups, events, settings, device)
     key = cache_key(base=base.hash, settings=settings.to_json(), data=data_hash, versions=versions(), device=device)
     state = Partial(partial, key) if partial else None
@@ -192,7 +194,7 @@ def split_episodes(
         steps = len(episodes[event.episode])
         if event.first >= steps or (event.last or 0) > steps:
             where = "begins" if event.first >= steps else "ends"
-            raise BadInput(f"event {event} {where} after its episode's {steps} steps")
+            raise BadInput(f"event {event} {where} after its episode's {plural(steps, 'step')}")
         by_episode.setdefault(event.episode, []).append(event)
     split = {name: [i for i, e in enumerate(episodes) if e.split == name and i not in by_episode] for name in SPLITS}
     train = sorted([*split["train"], *by_episode])

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefscope.datasets.task import MainError
+from beliefscope.datasets.text import percent
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.module_selection import Node, module_change
 from beliefscope.filters.finetuning.settings import FineTune
@@ -51,7 +52,7 @@ def held_out_rows(record: Mapping[str, Any]) -> list[list[str | float | None]]:
 def _difference(before: float | None, after: float | None, key: str) -> str | None:
     if before is None or after is None:
         return None
-    return f"{after - before:+.2f}" if key in ("nll", "nees") or not before else f"{100 * (after / before - 1):+.0f} %"
+    return f"{after - before:+.2f}" if key in ("nll", "nees") or not before else percent(after / before - 1, "+.0f")
 
 
 def module_table(
@@ -68,7 +69,7 @@ def module_table(
         if node.depth <= depth:
             label = "  " * node.depth + (node.name.rpartition(".")[2] or "(filter)")
             size = module_change(node.name, changes)
-            sizes = [size["gradient"] or None, f"{100 * size['change']:.2g} %" if size["change"] else None]
+            sizes = [size["gradient"] or None, percent(size["change"], ".2g") if size["change"] else None]
             count = node.parameters or None
             rows.append([label, node.kind, count, node.state, *(sizes if changes else []), node.description])
     return columns, rows

@@ -13,6 +13,7 @@ from typing import Any
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import percent
 from beliefscope.filters.finetuning.slices import Slice, fault_slices, standard_slices
 
 ERROR = "error"
@@ -41,9 +42,9 @@ class Criterion:
     def __post_init__(self) -> None:
         """Raises BadInput for a share out of its range."""
         if not 0.0 < self.by < 1.0:
-            raise BadInput(f"by={_percent(self.by)} of a success criterion is not above 0 % and below 100 %")
+            raise BadInput(f"by={percent(self.by, '.6g')} of a success criterion is not above 0 % and below 100 %")
         if not 0.0 <= self.others < math.inf:
-            raise BadInput(f"others={_percent(self.others)} of a success criterion is not a percentage of at least 0 %")
+            raise BadInput(f"others={percent(self.others, '.6g')} of a success criterion is not 0 % or more")
 
     @classmethod
     def parse(cls, text: str) -> Criterion:
@@ -64,7 +65,7 @@ class Criterion:
     def __str__(self) -> str:
         """The inverse of ``parse``."""
         measure = "" if self.measure == ERROR else f":measure={self.measure}"
-        return f"{self.slice}{measure}:by={_percent(self.by)}:others={_percent(self.others)}"
+        return f"{self.slice}{measure}:by={100.0 * self.by:.6g}%:others={100.0 * self.others:.6g}%"
 
     def check(self, task: Task, models: Sequence[str], trained: Iterable[Slice]) -> None:
         """Raises BadInput if the slice is neither standard nor trained on, or if the task lacks the measure."""
@@ -84,8 +85,8 @@ class Criterion:
         name = BELIEF.get(self.measure, f"{measures(task)[self.measure]} error")
         slice_ = self.slice.replace("_", " ")
         return (
-            f"The {name} in slice \u201c{slice_}\u201d falls by at least {_percent(self.by, ' ')}, and in no other "
-            f"slice rises by more than {_percent(self.others, ' ')}."
+            f"The {name} in slice \u201c{slice_}\u201d falls by at least {percent(self.by, '.6g')}, and in no other "
+            f"slice rises by more than {percent(self.others, '.6g')}."
         )
 
 
@@ -103,10 +104,6 @@ def measures(task: Task) -> dict[str, str]:
 
 def _is_main(task: Task, index: int) -> bool:
     return task.main_error.indices == (index,)
-
-
-def _percent(share: float, space: str = "") -> str:
-    return f"{100.0 * share:.6g}{space}%"
 
 
 def _share(value: str, part: str, text: str) -> float:

@@ -16,6 +16,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import with_unit
+from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress
 from beliefscope.filters.external.load import ExternalFilter
@@ -334,7 +335,7 @@ def _summary(verb: str, changes: Sequence[Difference], errors: Sequence[Differen
         return f"{verb}: {_description(changes[0])}{f' and {len(changes) - 1} more' if len(changes) > 1 else ''}"
     possible = [d for d in errors if max(sign * d.low, sign * d.high) >= math.log1p(LEVEL)]
     if not possible:
-        return f"{verb}: nothing by more than {100 * LEVEL:.0f} %"
+        return f"{verb}: nothing by more than {percent(LEVEL)}"
     largest = max(possible, key=lambda d: sign * d.effect)
     return f"{verb}: nothing significant" + (
         f"; largest change {_description(largest)}" if sign * largest.effect > 0.0 else ""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.text import plural
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics.measures import (
@@ -122,7 +123,7 @@ class Counterfactual(Diagnostic):
         if not delay:
             return f"{text}, recovered immediately after the intervention"
         seconds = "" if self.time is None else f" ({self.time[self.recovery] - self.time[self.to]:.2f} s)"
-        return f"{text}, recovered {delay} steps{seconds} after the intervention"
+        return f"{text}, recovered {plural(delay, 'step')}{seconds} after the intervention"
 
     def _at(self, step: int) -> str:
         """A step, and its time where the data have timestamps."""

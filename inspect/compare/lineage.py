@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.inspect.diagnostics.views import as_json
 
@@ -236,7 +237,7 @@ def export(lineage: Lineage, hash: str, folder: Path, version: str) -> list[Path
         ],
     }
     last, count = line[-1], len(line) - 1
-    ancestors = f" with its {count} ancestor{'s' * (count > 1)}" if count else ""
+    ancestors = f" with its {plural(count, 'ancestor')}" if count else ""
     about = {"task": last.task, "name": last.name, "hash": hash, "file": files[hash]}
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import percent
 from beliefscope.filters.finetuning.success import ERROR, Criterion
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison
 from beliefscope.inspect.compare.effects import Difference
@@ -127,7 +128,7 @@ def _description(row: SliceChange) -> str:
     interval = ""
     if not math.isnan(row.low):
         interval = f", 95 % interval {round(100 * row.low):+d} to {round(100 * row.high):+d} %"
-    return f"{_title(row.slice)} {100 * row.change:+.1f} % ({values}{interval})"
+    return f"{_title(row.slice)} {percent(row.change, '+.1f')} ({values}{interval})"
 
 
 def _title(slice_name: str) -> str:

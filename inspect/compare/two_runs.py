@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
+from beliefscope.datasets.text import plural
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
@@ -95,15 +96,13 @@ class Comparison(Diagnostic):
         main = self.task.main_error
         first, second = map(float, self.position[0])
         change = second / first - 1.0 if first else math.inf
-        text = (
-            f"RMSE over {self.steps[0]} steps: {self.names[0]} {main.text(first)}, {self.names[1]} {main.text(second)}"
-        )
-        parts = [f"{text} ({_change(change)}){self._other_components()}."]
+        errors = f"{self.names[0]} {main.text(first)}, {self.names[1]} {main.text(second)}"
+        parts = [f"RMSE over {plural(self.steps[0], 'step')}: {errors} ({_change(change)}){self._other_components()}."]
         if abs(change) >= LEVEL and (phase := self._dominant_phase()) is not None:
             before, after = map(float, self.position[phase])
             parts.append(
                 f"Largest contribution in phase {self.phases[phase]}: {main.factor * before:.2f} -> {main.text(after)} "
-                f"over {self.steps[phase]} steps."
+                f"over {plural(self.steps[phase], 'step')}."
             )
         parts.append(self._consistency())
         farthest = int(self.distance.argmax())
@@ -218,7 +217,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
     runs = (this, other)
     if this.data_hash != other.data_hash or len(this) != len(other):
         raise BadInput(
-            f"the runs are over different episodes: {this.data_hash[:12]} with {len(this)} steps, "
+            f"the runs are over different episodes: {this.data_hash[:12]} with {plural(len(this), 'step')}, "
             f"{other.data_hash[:12]} with {len(other)}"
         )
     task = this.task

@@ -10,6 +10,7 @@ from fnmatch import translate
 from functools import cache
 from typing import Any, Literal
 
+from beliefscope.datasets.text import percent
 from beliefscope.inspect.diagnostics.views import Table, html_result
 
 
@@ -253,7 +254,7 @@ def _share(recovery: Recovery | None) -> str:
         return ""
     if recovery.error < 0.0:  # most undos of sensors remove them
         return "none"
-    share = f"{100 * recovery.error:z.0f} %"
+    share = percent(recovery.error)
     if not math.isnan(recovery.low):  # a single episode has no interval
         share += f" ({100 * recovery.low:z.0f} to {100 * recovery.high:z.0f})"
     return f"{share} of {recovery.measure}"

@@ -10,6 +10,7 @@ from itertools import compress
 import numpy as np
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_in
@@ -39,8 +40,7 @@ def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None
     """
     if healthy < MIN_HEALTHY:
         raise BadInput(
-            f"a healthy record of {healthy} episode{'s' * (healthy != 1)} is too small; "
-            f"measure it from at least {MIN_HEALTHY}"
+            f"a healthy record of {plural(healthy, 'episode')} is too small; measure it from at least {MIN_HEALTHY}"
         )
     smallest = 1 / (healthy + 1) if count == 1 else 0.0
     if alarm_rate is not None and alarm_rate < smallest:

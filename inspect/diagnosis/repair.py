@@ -18,6 +18,7 @@ from torch import Tensor
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import MainError, display_name
+from beliefscope.datasets.text import plural
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
@@ -85,9 +86,8 @@ class Repair:
         failure = f"The error of {self.main.text(self.error)} in steps {first} to {last}"
         if self.candidate is None:
             return f"{failure} is not repaired by any sensor: check the dynamics and the weights."
-        unit = "step" if self.candidate.steps == 1 else "steps"
         effect = f"becomes {self.main.text(self.repaired)} (bound {self.main.text(self.bound)})"
-        return f"{failure} {effect} by {self.candidate}, {self.candidate.steps} {unit}."
+        return f"{failure} {effect} by {self.candidate}, {plural(self.candidate.steps, 'step')}."
 
     def to_json(self) -> dict[str, Any]:
         """JSON values; ``repair`` is null if there is none."""

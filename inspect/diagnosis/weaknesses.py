@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.defaults import default_settings, reason
@@ -52,7 +53,7 @@ def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, epi
         evidence = next(iter(cause["evidence"]), None) or {"text": "", "episode": None, "step": None}
         text = f"Probability {cause['probability']:.2f}: {evidence['text']}"
         if (recovered := cause["recovered"]) and recovered["error"] is not None:
-            text += f"; undoing it removes {100 * recovered['error']:z.0f} % of the {recovered['measure']} error"
+            text += f"; undoing it removes {percent(recovered['error'], 'z.0f')} of the {recovered['measure']} error"
         title = diagnosis["headline"] if cause is diagnosis["causes"][0] else cause["title"]
         at = episode if evidence["episode"] is None else evidence["episode"]
         yield Weakness("diagnosis", title, f"{text}.", at, evidence["step"], settings)
@@ -76,7 +77,7 @@ def failing(scores: Sequence[Mapping[str, Any]], filter_: Filter) -> Iterator[We
         if not phase["over_represented"] or settings is None or event is None:
             continue
         evidence = (
-            f"{100 * phase['share']:.0f} % of the steps and {100 * phase['event_share']:.0f} % of {score['total']} "
+            f"{percent(phase['share'])} of the steps and {percent(phase['event_share'])} of {score['total']} "
             f"events, {phase['lift']:.1f} times as many as expected (p = {phase['p_value']:.2g})."
         )
         title = f"Large errors in phase \u201c{phase['name']}\u201d"

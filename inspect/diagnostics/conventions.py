@@ -12,6 +12,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.control_faults import has_position
 from beliefscope.datasets.faults.injection import Faults, apply_to
 from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
@@ -100,7 +101,7 @@ class Conventions(Diagnostic):
     def verdict(self) -> str:
         count = len(self.changes)
         if not self.relevant_removals:
-            limit = f"{100.0 * RELEVANT:.0f} %"
+            limit = percent(RELEVANT)
             text = f"None of {count} changes of signs, scales, axes and delays lowers an error by {limit} or more."
         else:
             i, j = self.relevant_removals[0]
@@ -114,7 +115,7 @@ class Conventions(Diagnostic):
     def _effect(self, i: int, j: int) -> str:
         low, high = self.low[i, j], min(self.high[i, j], 1.0)
         interval = "" if np.isnan(low) else f" ({100 * low:.0f} to {100 * high:.0f})"
-        return f"the {self.errors[j]} error falls by {100 * self.share[i, j]:.0f} %{interval}"
+        return f"the {self.errors[j]} error falls by {percent(self.share[i, j])}{interval}"
 
     def tables(self) -> list[Table]:
         has_intervals = self.trajectories >= MIN_TRAJECTORIES

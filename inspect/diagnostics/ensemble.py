@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Line, Plot, Table
@@ -94,15 +95,15 @@ class Ensemble(Diagnostic):
 
     @property
     def verdict(self) -> str:
-        outside = np.mean([c.outside for c in self.components])
+        outside = float(np.mean([c.outside for c in self.components]))
         text = (
             f"The ensemble of {self.members} is {self.status}: its error is {self.ratio:.2g} times its spread. "
-            f"The true state is outside of all members in {100.0 * outside:.1f} % of steps "
+            f"The true state is outside of all members in {percent(outside, '.1f')} of steps "
             f"({200.0 / (self.members + 1):.1f} % if reliable)."
         )
         worst = max(self.components, key=lambda c: c.collapsed)
         if worst.collapsed:
-            text += f" It collapses in {100.0 * worst.collapsed:.1f} % of steps ({display_name(worst.component)})."
+            text += f" It collapses in {percent(worst.collapsed, '.1f')} of steps ({display_name(worst.component)})."
         best = max(self.components, key=lambda c: c.correlation)
         predictive = best.correlation > 0.3
         text += " Its spread " + ("predicts" if predictive else "does not predict") + " which steps have large errors"
@@ -121,7 +122,7 @@ class Ensemble(Diagnostic):
             *("component", "unit", "spread", "RMSE", "RMSE/spread", "spread-error correlation"),
             *("outside (% of steps)", "collapsed (% of steps)"),
         )
-        return [Table(f"Spread and skill, {self.members} members", columns, rows)]
+        return [Table(f"Spread and skill, {plural(self.members, 'member')}", columns, rows)]
 
     def plots(self) -> list[Plot]:
         bins = len(self.components[0].ranks)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.datasets.task import Task, display_name, with_unit
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
@@ -84,14 +85,14 @@ class Errors(Diagnostic):
             worst = max(others, key=lambda group: group.position)
             steps = worst.steps / total.steps
             text += f"; largest in {worst.name}: {self._text(worst.position)}"
-            text += f" ({100.0 * worst.share:.0f} % of the squared error in {100.0 * steps:.0f} % of the steps)"
+            text += f" ({percent(worst.share)} of the squared error in {percent(steps)} of the steps)"
         parts = [f"{text}."]
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
-            noun, verb = ("outage", "has") if outage.count == 1 else ("outages", "have")
-            text = f"{outage.count} {noun} of {display_name(outage.modality)}, up to {outage.longest:.3g} s, {verb} "
-            text += f"{100.0 * outage.share:.0f} % of the squared error in {100.0 * outage.steps:.0f} % of the steps"
+            outages, verb = plural(outage.count, "outage"), "has" if outage.count == 1 else "have"
+            text = f"{outages} of {display_name(outage.modality)}, up to {outage.longest:.3g} s, {verb} "
+            text += f"{percent(outage.share)} of the squared error in {percent(outage.steps)} of the steps"
             if (long := outage.dominant) is not None and long.steps < outage.steps:
-                text += f"; those over {long.low:g} s have {100.0 * long.share:.0f} % in {100.0 * long.steps:.0f} %"
+                text += f"; those over {long.low:g} s have {percent(long.share)} in {percent(long.steps)}"
                 text += f", with an error of {self._text(math.sqrt(long.square))}"
             if not math.isnan(outage.recovery):
                 text += f"; recovery takes {outage.recovery:.3g} s" if outage.recovery else "; recovery is immediate"

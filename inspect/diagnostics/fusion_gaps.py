@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.datasets.task import display_name
+from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Array, Value
@@ -222,7 +223,7 @@ def _weights(traces: Sequence[Trace], of_sensors: bool) -> Reason:
         high=high,
         contributes=low > 1.0 and value > MIN_EXCESS,
         headline=f"wrong weights: mean weight of {display_name(name)} {means[k]:.2f}, best {share[k]:.2f}; the best "
-        f"constant weights would reduce the error of the weighted mean by {100.0 * (1.0 - 1.0 / value):.0f} %",
+        f"constant weights would reduce the error of the weighted mean by {percent(1.0 - 1.0 / value)}",
     )
 
 

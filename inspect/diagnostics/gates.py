@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from beliefscope.datasets.task import display_name
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
@@ -64,7 +65,7 @@ class ModalityInnovations:
         if self.accepted <= 1.0 - ALWAYS:
             return "always rejects"
         if self.longest >= LOCKED:
-            return f"rejects {self.longest} measurements in succession"
+            return f"rejects {plural(self.longest, 'measurement')} in succession"
         if self.accepted == 1.0:
             return "never acts" if self.missed > EXCESS * TAIL * self.measurements else "never needed"
         return "acts"
@@ -106,7 +107,8 @@ class Innovations(Diagnostic):
             elif not entry.gate and entry.extreme > EXCESS * TAIL * entry.measurements:
                 gate = f"{entry.extreme} of {entry.measurements} exceed the 99.9 % quantile, and there is no gate"
             elif entry.gate:
-                share = f"{100.0 * (1.0 - entry.accepted):.1f} % of {entry.measurements} measurements rejected"
+                rejected = percent(1.0 - entry.accepted, ".1f")
+                share = f"{rejected} of {plural(entry.measurements, 'measurement')} rejected"
                 gate = f"{gate}, {share}" if gate else "no measurement had to be rejected"
             sentences.append("; ".join(filter(None, [size, gate])) + ".")
         return " ".join(sentences)

@@ -16,6 +16,7 @@ import numpy as np
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile, profile_document
 from beliefscope.inspect.diagnostics.statistic_kinds import (
@@ -316,5 +317,5 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
         count = document.get("episodes") if isinstance(document, dict) else None
         if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
             return None
-        lacking = f"a healthy record of {count} episode{'s' * (count != 1)}, fewer than the {MIN_HEALTHY} needed"
+        lacking = f"a healthy record of {plural(count, 'episode')}, fewer than the {MIN_HEALTHY} needed"
     return f"this filter has {lacking}"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from beliefscope.datasets.task import Task, with_unit
+from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
@@ -115,7 +116,7 @@ class MapSurvey(Diagnostic):
         if shape == "ring":
             radius, coverage = (float(np.median(a[of_shape, i])) for a in (n.ring_radius, n.ring_coverage))
             unit, factor = self._length
-            return f"{text}, median radius {factor * radius:.1f} {unit}, over {100.0 * coverage:.0f} % of the circle."
+            return f"{text}, median radius {factor * radius:.1f} {unit}, over {percent(coverage)} of the circle."
         if shape != "ridge":
             return f"{text}."
         text += f", median elongation {np.median(n.elongation[of_shape, i]):.1f}"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
@@ -122,11 +123,9 @@ class ParticleHealth(Diagnostic):
     @property
     def verdict(self) -> str:
         total, worst, count = self.phases[0], self.worst, self.particles
-        frequency = (
-            f"below {100.0 * DEGENERATE:.0f} % of {count} particles in {100.0 * total.degenerate:.1f} % of steps"
-        )
+        frequency = f"below {percent(DEGENERATE)} of {count} particles in {percent(total.degenerate, '.1f')} of steps"
         if not total.degenerate:
-            frequency = f"never below {100.0 * DEGENERATE:.0f} % of {count} particles"
+            frequency = f"never below {percent(DEGENERATE)} of {count} particles"
         conditions = [phase for phase in ("contact", "blackout") if getattr(worst, phase)[0]]
         where = f"step {self.worst_step} of episode {self.worst_episode}" + (
             f", in {' and '.join(conditions)}" if conditions else ""
@@ -135,19 +134,19 @@ class ParticleHealth(Diagnostic):
         parts += [
             f"The effective sample size is {frequency}, with a median of {total.effective:.0f}.",
             f"Minimum at {where}: effective sample size {worst.effective[0]:.1f}, largest weight "
-            f"{worst.largest[0]:.2f}, {worst.ancestors[0]} particles with offspring.",
+            f"{worst.largest[0]:.2f}, {plural(worst.ancestors[0], 'particle')} with offspring.",
         ]
         phases = [entry for entry in self.phases[1:] if entry.degenerate > 1.5 * total.degenerate > 0.0]
         if phases:
             most = max(phases, key=lambda entry: entry.degenerate)
-            parts.append(f"Degeneracy is most frequent in {most.phase}: {100.0 * most.degenerate:.1f} % of steps.")
+            parts.append(f"Degeneracy is most frequent in {most.phase}: {percent(most.degenerate, '.1f')} of steps.")
         parts.append(
-            f"The true state is outside of all predicted particles in {100.0 * total.outside:.1f} % of steps."
+            f"The true state is outside of all predicted particles in {percent(total.outside, '.1f')} of steps."
             if total.outside
             else "The true state is always covered by the predicted particles."
         )
         if total.several_modes:
-            parts.append(f"The posterior is multimodal in {100.0 * total.several_modes:.1f} % of steps.")
+            parts.append(f"The posterior is multimodal in {percent(total.several_modes, '.1f')} of steps.")
         return " ".join(parts)
 
     def tables(self) -> list[Table]:
@@ -172,7 +171,7 @@ class ParticleHealth(Diagnostic):
             "steps",
             "ESS (median)",
             "ESS (minimum)",
-            f"ESS below {100.0 * DEGENERATE:.0f} % (% of steps)",
+            f"ESS below {percent(DEGENERATE)} (% of steps)",
             "largest weight (median)",
             "with offspring (median)",
             "resampled (% of steps)",
@@ -180,7 +179,7 @@ class ParticleHealth(Diagnostic):
             "true state outside (% of steps)",
             *(f"evidence of {modality} (nats)" for modality in self.modalities),
         )
-        tables = [Table(f"Particle health, {self.particles} particles", columns, tuple(rows))]
+        tables = [Table(f"Particle health, {plural(self.particles, 'particle')}", columns, tuple(rows))]
         return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:

@@ -11,6 +11,7 @@ import torch
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.calls import is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
@@ -108,13 +109,13 @@ class Saliency(Diagnostic):
             return " ".join([*sentences, self._occlusion_sentence()])
         incomplete = [attribution for attribution in self.attributions if attribution.gap >= TOLERANCE]
         sentences += [
-            f"Relative to {attribution.baseline}, the integrated gradients miss {100.0 * attribution.gap:.1f} % of the "
-            f"change after {attribution.points} points and are only approximate."
+            f"Relative to {attribution.baseline}, the integrated gradients miss {percent(attribution.gap, '.1f')} of "
+            f"the change after {attribution.points} points and are only approximate."
             for attribution in incomplete
         ]
         if not incomplete:
             worst = max(attribution.gap for attribution in self.attributions)
-            sentences.append(f"Integrated gradients are complete within {max(100.0 * worst, 0.01):.2f} %.")
+            sentences.append(f"Integrated gradients are complete within {percent(max(worst, 1e-4), '.2f')}.")
         return " ".join(sentences)
 
     def _occlusion_sentence(self) -> str:

@@ -14,6 +14,7 @@ from beliefscope.datasets.episode import Episode, step_text
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import display_name, with_unit
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine
 from beliefscope.inspect.diagnostics.base import Diagnostic
@@ -149,14 +150,14 @@ class Failures(Diagnostic):
     @property
     def verdict(self) -> str:
         """Number of events, the worst event, and over-represented phases."""
-        scope = f"in {self.episodes} episode{'s' * (self.episodes != 1)}, {self.steps} steps, by {self.title}"
+        scope = f"in {plural(self.episodes, 'episode')}, {plural(self.steps, 'step')}, by {self.title}"
         if not self.events:
             return f"No events {scope}."
         worst = self.events[0]
         where = f"{step_text(worst.step, worst.time)} of episode {worst.episode} ({worst.phase})"
-        count = f"{len(self.events)} event{'s' * (len(self.events) != 1)} {scope}, above {self.format(self.threshold)}"
+        count = f"{plural(len(self.events), 'event')} {scope}, above {self.format(self.threshold)}"
         phases = "; ".join(
-            f"{p.name}, {_percent(p.share)} of steps and {_percent(p.event_share)} of events ({p.lift:.1f} x)"
+            f"{p.name}, {percent(p.share)} of steps and {percent(p.event_share)} of events ({p.lift:.1f} x)"
             for p in self.over_represented
         )
         sentences = [f"{count}; worst: {self.format(worst.score)} at {where}."]
@@ -393,7 +394,3 @@ def _mean(values: Array) -> float:
 def _quantiles(values: Array) -> Array:
     finite = values[np.isfinite(values)]
     return np.quantile(finite, PROBABILITIES) if len(finite) else np.full(len(PROBABILITIES), np.nan)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"

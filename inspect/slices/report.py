@@ -13,6 +13,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import with_unit
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
@@ -100,14 +101,15 @@ class ErrorSlices(Diagnostic):
     @property
     def summary(self) -> str:
         """``3 slices with a larger position error in 60 episodes, 12000 steps and 31 covariates.``"""
-        scope = f"{self.episodes} episodes, {self.steps} steps and {len(self.covariates)} covariates"
-        count = len(self.slices) or "No"
-        return f"{count} slice{'s' * (len(self.slices) > 1)} with a larger {self.title} in {scope}."
+        sizes = (self.episodes, "episode"), (self.steps, "step"), (len(self.covariates), "covariate")
+        episodes, steps, covariates = (plural(count, noun) for count, noun in sizes)
+        slices = plural(len(self.slices), "slice") if self.slices else "No slice"
+        return f"{slices} with a larger {self.title} in {episodes}, {steps} and {covariates}."
 
     def sentence(self, slice_: ErrorSlice) -> str:
         """``Position error is 2.3 times as large (1.8 to 2.9) where friction > 2.1: 14 of 60 episodes, ...``"""
         interval = f" ({slice_.low:.2g} to {slice_.high:.2g})" if np.isfinite(slice_.low) else ""
-        size = f"{len(slice_.episodes)} of {self.episodes} episodes, {100 * slice_.share:.0f} % of steps"
+        size = f"{len(slice_.episodes)} of {self.episodes} episodes, {percent(slice_.share)} of steps"
         title = self.title[0].upper() + self.title[1:]
         return f"{title} is {slice_.ratio:.2g} times as large{interval} where {slice_.where}: {size}."
 
@@ -199,7 +201,7 @@ def slices_of(
 def check_episodes(count: int) -> None:
     """Raise BadInput if a search in this number of episodes is unlikely to find a slice."""
     if count < MIN_SEARCHED:
-        raise BadInput(f"{count} episode{'s' * (count != 1)}; a search for slices needs at least {MIN_SEARCHED}")
+        raise BadInput(f"{plural(count, 'episode')}; a search for slices needs at least {MIN_SEARCHED}")
 
 
 def describe_slices(survey: Survey, episodes: Sequence[EpisodeCovariates], by: str) -> dict[str, Any]:

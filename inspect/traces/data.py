@@ -17,6 +17,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.notebook_html import html_paragraph, html_table
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import plural
 from beliefscope.filters.models.resampling import effective_sample_size
 
 Array = NDArray[np.float32]
@@ -107,7 +108,7 @@ class Trace:
     def __repr__(self) -> str:
         """One line; the arrays have millions of values."""
         faults = f", {self.faults}" if self.faults else ""
-        run = f"{self.filter} over {len(self)} steps of {self.task.name} episode {self.episode_index}"
+        run = f"{self.filter} over {plural(len(self), 'step')} of {self.task.name} episode {self.episode_index}"
         return f"<Trace: {run}, seed {self.seed}{faults}>"
 
     def _repr_html_(self) -> str:

@@ -15,6 +15,7 @@ from beliefscope.datasets.episode import Episode, hold, time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.task_json import check_definition
+from beliefscope.datasets.text import plural
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
@@ -67,13 +68,13 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "te
     arrays: dict[str, NDArray[Any]] = {"state": states, "control": controls, "contact": contact, **sensors, **values}
     for name, array in arrays.items():
         if len(array) != len(states):
-            raise BadInput(f"{name} has {len(array)} rows and the state {len(states)}")
+            raise BadInput(f"{name} has {plural(len(array), 'row')} and the state {len(states)}")
     rows = _episodes(columns, mapping, len(states))
     if max(map(len, rows.values())) < 2:
         step = f" of {mapping.dt:g} s" if mapping.dt else ""
         raise BadInput(f"{source} has one step{step} per episode, expected two or more")
     if split == "auto" and len(rows) < 10:
-        raise BadInput(f"{source} has {len(rows)} episodes, and --split auto needs 10: give train, val or test")
+        raise BadInput(f"{source} has {plural(len(rows), 'episode')}; --split auto needs 10: give train, val or test")
     dt, times = _times(columns, mapping, rows)
     declared = {name: covariate for name, (covariate, _) in covariates.items()}
     present = {name: _present(columns, mapping, name, array) for name, array in sensors.items()}
@@ -125,7 +126,7 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
     estimate = _estimate(columns, mapping)
     for name, array in estimate.items():
         if len(array) != rows:
-            raise BadInput(f"{display_name(name)} has {len(array)} rows and the state {rows}")
+            raise BadInput(f"{display_name(name)} has {plural(len(array), 'row')} and the state {rows}")
         if len(unknown := at[~np.isfinite(array[at]).reshape(len(at), -1).all(axis=1)]):
             raise BadInput(f"{display_name(name)} has no finite value in row {unknown[0]}, episode {index}")
     values = {name: torch.from_numpy(array[at]) for name, array in estimate.items()}

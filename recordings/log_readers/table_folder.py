@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.readers.hdf5_guard import probe
+from beliefscope.datasets.text import plural
 from beliefscope.recordings.log_readers import hdf5_file, tables
 from beliefscope.recordings.log_readers.arrays import Wanted, check_downloaded, check_size
 
@@ -70,7 +71,7 @@ def _table(file: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     for name, values in columns.items():
         if len(values) != count:
             first = next(iter(columns))
-            raise BadInput(f"{file.name} has {len(values)} rows of {name!r} and {count} of {first!r}, expected as many")
+            raise BadInput(f"{file.name} has {plural(len(values), 'row')} of {name!r}, but {count} of {first!r}")
     return columns
 
 

@@ -14,6 +14,7 @@ from latex2mathml.converter import convert
 from markupsafe import Markup, escape
 
 from beliefscope import __version__
+from beliefscope.datasets.text import plural
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.statistics import measures
@@ -98,7 +99,7 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
         "Filter": f"{first.filter} ({first.kind if first.kind == 'external' else first.kind.upper()})",
         "Task": first.task.name,
         "Modalities": ", ".join(first.modalities) or "not distinguished",
-        "Episodes": f"{episodes} ({steps} steps in total, {first.episode.dt:g} s each)",
+        "Episodes": f"{episodes} ({plural(steps, 'step')} in total, {first.episode.dt:g} s each)",
         "Sensor faults": "; ".join(dict.fromkeys(str(trace.faults) or "none" for trace in report.traces)),
     }
     if first.particle_count is not None:
@@ -107,8 +108,8 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     table = next(item.table for item in summary.items if item.table is not None)
     column = table.columns.index(first.task.main_error.label)
     errors = "; ".join(f"{row[0]} {_number(row[column])} {main.unit}".rstrip() for row in reversed(table.rows))
-    counted = sum(int(measures.counted(trace).sum()) for trace in report.traces)
-    return facts | {f"{main.title} RMSE": f"{errors} over {counted} counted steps"}
+    scored = sum(int(measures.counted(trace).sum()) for trace in report.traces)
+    return facts | {f"{main.title} RMSE": f"{errors} over {plural(scored, 'counted step')}"}
 
 
 def _provenance(report: Report) -> dict[str, str]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.point_clouds import point_sensors, points_of
 from beliefscope.datasets.task import Component, Outline, Task, with_unit
+from beliefscope.datasets.text import plural
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label
 from beliefscope.inspect.trace import Trace
@@ -303,7 +304,7 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     contours_of = " and ".join(c.label for c in mapped)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
-    length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
+    length = plural(steps, "step") if steps >= 0 else "a live run, in steps"
     start = "It starts at the true state" if has_truth(trace) else "The true state is unknown"
     faults = f"\nSensor faults: `{trace.faults}`.\n" if trace.faults else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}

@@ -230,7 +230,7 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
         (attribute("/", "definition", "{"), "attribute 'definition' is not the JSON of a task: Expecting property"),
         (attribute("/", "definition", "{}"), "incomplete definition of a task: KeyError: 'name'"),
         (lambda f: [f.__delitem__(k) for k in list(f)], "has no episode"),
-        (without("trajectory0"), r"has 1 episodes, but no group 'trajectory0'"),
+        (without("trajectory0"), r"has 1 episode, but no group 'trajectory0'"),
         (replaced("trajectory1", np.zeros(3)), "no group 'trajectory1'"),
         (without("trajectory1/states"), r"trajectory1 has no 'states'\. It has: contact, controls"),
         (without("trajectory1/observations/force"), "trajectory1 has no 'observations/force'"),

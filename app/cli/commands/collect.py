@@ -1,6 +1,7 @@
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
+from beliefscope.datasets.text import percent, plural
 
 
 def collect(
@@ -66,7 +67,8 @@ def collect(
             "authors": paper,
             "data_hash": data.hash,
         }
-    contact = f"{ours['contact_fraction']:.0%}".replace("%", " %")
-    summary = f"{count} episode{'s' * (count != 1)} of {length} steps, {contact} in contact"
+    contact = ours["contact_fraction"]
+    assert isinstance(contact, float)
+    summary = f"{plural(count, 'episode')} of {length} steps, {percent(contact)} in contact"
     table = format_table("Statistics over all steps", *comparison_table(ours, paper))
     return console.Result(document, f"{summary}\n\n{table}", output)

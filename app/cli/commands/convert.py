@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console, options as opt
+from beliefscope.datasets.text import plural
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
@@ -44,4 +45,4 @@ def convert(
             "left_out": list(episodes.skipped),
             "data_hash": episodes.hash,
         }
-    return console.Result(document, f"{document['episodes']} episodes of {target.name}", output)
+    return console.Result(document, f"{plural(len(episodes), 'episode')} of {target.name}", output)

@@ -1,4 +1,5 @@
 from beliefscope.app.cli import console, options as opt
+from beliefscope.datasets.text import plural
 
 
 def evaluate(
@@ -78,6 +79,6 @@ def evaluate(
         "start_offset": dict(offset.lengths),
         **metrics,
     }
-    title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episode{'s' * (len(held_out) != 1)}"
+    title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {plural(len(held_out), 'episode')}"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
     return console.Result(document, "\n\n".join(map(str, accuracy_tables(title, metrics))))

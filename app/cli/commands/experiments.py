@@ -3,6 +3,7 @@ from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import plural
 
 
 def experiments(
@@ -36,7 +37,7 @@ def experiments(
     if output is not None:
         write_rows(rows, output)
     top_rows = rows.slice(0, top)
-    more = f"\n{len(rows) - top} more rows: --top {len(rows)}" if len(rows) > top else ""
+    more = f"\n{plural(len(rows) - top, 'more row')}: --top {len(rows)}" if len(rows) > top else ""
     document = {"rows": top_rows.to_pylist(), "count": len(rows)}
     if sql is not None:
         return console.Result(document, console.arrow("Results", top_rows) + more, output)

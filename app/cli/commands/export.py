@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.text import plural
 
 if TYPE_CHECKING:
     from beliefscope.inspect.trace import Trace
@@ -84,4 +85,4 @@ def _folder(sources: list[Path], folder: Path, task: str, filter_: str) -> conso
     traces = [_page(source, page, task, filter_) for source, page in zip(sources, pages, strict=True)]
     index = folder / "index.html"
     write_index(list(zip(pages, traces, strict=True)), index)
-    return console.Result({"pages": names}, f"{len(names)} pages", index)
+    return console.Result({"pages": names}, plural(len(names), "page"), index)

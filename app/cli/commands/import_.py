@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.text import plural
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
@@ -83,7 +84,7 @@ def import_(
     episodes = read_log(columns, mapping, source.name, split or "test")
     if output.suffix != ".h5":
         if not 0 <= episode < len(episodes):
-            raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
+            raise BadInput(f"episode {episode} does not exist: {source.name} has {plural(len(episodes), 'episode')}")
         result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
         ranges = {"dt": episodes[episode].dt, "ranges": component_ranges([episodes[episode]])}
         return replace(result, document={**result.document, **ranges}, text=f"{result.text}, {_values(ranges)}")
@@ -101,11 +102,11 @@ def _data_set(episodes: list[Episode], output: Path) -> console.Result:
     steps = sum(len(e) for e in episodes)
     ranges = {"dt": episodes[0].dt, "ranges": component_ranges(episodes)}
     document = {"task": episodes[0].task.name, "episodes": len(episodes), "steps": steps} | ranges
-    count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
     splits = {name: sum(episode.split == name for episode in episodes) for name in SPLITS}
     document["splits"] = splits
-    count += " (" + ", ".join(f"{number} {name}" for name, number in splits.items() if number) + ")"
-    return console.Result(document, f"{count} of {episodes[0].task.name}, {steps} steps, {_values(ranges)}", output)
+    parts = ", ".join(f"{number} {name}" for name, number in splits.items() if number)
+    text = f"{plural(len(episodes), 'episode')} ({parts}) of {episodes[0].task.name}, {plural(steps, 'step')}"
+    return console.Result(document, f"{text}, {_values(ranges)}", output)
 
 
 def _values(document: dict[str, Any]) -> str:

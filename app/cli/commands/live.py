@@ -5,6 +5,7 @@ from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import plural
 
 
 def live(
@@ -63,6 +64,6 @@ def live(
     }
     if not recorder.steps:
         return console.Result(document, "stopped before the first step; no file was written")
-    summary = f"{recorder.steps} steps at {document['hz']:.1f} Hz, {timing.late} of them late"
+    summary = f"{plural(recorder.steps, 'step')} at {document['hz']:.1f} Hz, {timing.late} of them late"
     summary += ", stopped early" if timing.stopped else ""
     return console.Result(document, summary, recorder.path)

@@ -1,6 +1,7 @@
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
+from beliefscope.datasets.text import plural
 
 
 def sweep(
@@ -63,7 +64,7 @@ def sweep(
     used = {cell.checkpoint for cell in cells}
     if idle := [path.name for path in inputs.checkpoints if path not in used]:
         console.note(f"Warning: no data of their tasks, or copies of other checkpoints: {', '.join(idle)}")
-    console.note(f"{len(cells)} cells; if interrupted, the same command resumes")
+    console.note(f"{plural(len(cells), 'cell')}; if interrupted, the same command resumes")
     with console.bars() as update:
         table = run_sweep(
             cells,

@@ -261,7 +261,7 @@ BAD: list[tuple[Edit, str]] = [
     (lambda content: content["object_pose"][3].pop(), r"'object_pose' is not a list of rows of 4 numbers"),
     (lambda content: content.update(tip_pose="none"), r"'tip_pose' is not a list of rows of 4 numbers"),
     (lambda content: content.update(tip_pose=[]), r"'tip_pose' is not a list of rows of 4 numbers"),
-    (lambda content: content.update(tip_pose=content["tip_pose"][:1]), r"'tip_pose' has 1 rows of different times"),
+    (lambda content: content.update(tip_pose=content["tip_pose"][:1]), r"'tip_pose' has 1 row of different times"),
     (silent, r"'tip_pose' has a gap of 0\.60 s after 100\.08 s, expected at most 0\.5 s"),
     (
         later("tip_pose", 5.0),

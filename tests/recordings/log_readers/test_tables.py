@@ -322,7 +322,7 @@ def test_csv_files_of_a_folder(tmp_path: Path) -> None:
     ("rows", "message"),
     [
         ({"t": [0.0, 0.1]}, r"run_2\.npz has no column 'x', which other files of runs have"),
-        ({"t": [0.0, 0.1], "x": [1.0]}, r"run_2\.npz has 1 rows of 'x' and 2 of 't', expected as many"),
+        ({"t": [0.0, 0.1], "x": [1.0]}, r"run_2\.npz has 1 row of 'x', but 2 of 't'"),
         ({"t": [0.0], "x": [["1"]]}, r"column 'x' has rows of shape \(1,\) in run_2\.npz and \(\) in run_1\.npz"),
         ({"t": [0.0], "x": ["a"]}, r"column 'x' has text in run_2\.npz and numbers in run_1\.npz"),
     ],

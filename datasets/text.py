@@ -1,0 +1,11 @@
+"""Numbers in sentences."""
+
+
+def plural(count: int, noun: str) -> str:
+    """A number with its noun: ``1 episode``, ``3 episodes``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def percent(share: float, form: str = ".0f") -> str:
+    """A share in percent: ``38 %``. form: format of the number."""
+    return f"{100.0 * share:{form}} %"
