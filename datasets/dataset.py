@@ -47,7 +47,7 @@ class Dataset(ABC):
     Attributes:
         path: source file or folder. task: task of the episodes.
         summaries: one ``EpisodeSummary`` per episode.
-        skipped: one line per unusable trajectory, if skipping was requested.
+        skipped: one line per unusable episode, if skipping was requested.
     """
 
     path: Path

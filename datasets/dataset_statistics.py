@@ -42,7 +42,7 @@ class ReferenceData:
     """Published data of a task.
 
     Attributes:
-        episodes: number of trajectories. steps: length of the longest one.
+        episodes: number of episodes. steps: length of the longest one.
         statistics: values used for standardization in the published code. Forces and torques have sensor axes.
     """
 

@@ -1,4 +1,4 @@
-"""A recorded trajectory as NumPy arrays in SI units."""
+"""A recorded episode as NumPy arrays in SI units."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _single(array: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Episode:
-    """A trajectory of T steps. The first axis of every array is time.
+    """An episode of T steps. The first axis of every array is time.
 
     Attributes:
         task: definition of the state, the sensors and the control.

@@ -71,7 +71,7 @@ def open_dataset(
         path: HDF5 file written by ``write_dataset``; file or folder (searched recursively) of the MIT Push dataset;
             file or folder of the HDF5 files of the paper's authors.
         task: which of the ``push-real`` tasks to use for MIT Push files.
-        skip_bad: skip unusable trajectories and list them in ``Dataset.skipped``.
+        skip_bad: skip unusable episodes and list them in ``Dataset.skipped``.
         given: user-defined tasks, as for ``stored_task``; ``task`` is one of them.
 
     Raises:

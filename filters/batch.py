@@ -21,13 +21,13 @@ MIN_STD = 1e-6
 
 @dataclass(frozen=True)
 class Batch:
-    """T steps of N trajectories in SI units; images are uint8 until they are encoded.
+    """T steps of N episodes in SI units; images are uint8 until they are encoded.
 
     Attributes:
         observations: modality -> (T, N, H, W) uint8, (T, N, d) float32, or (T, N) int64: indices of images in
             the encoders' tables (``Steps.with_image_indices``), -1 for a blacked-out one.
         controls: (T, N, c). states: (T, N, n). contact: (T, N) bool.
-        previous: (N, n) true state one step before the first (of step 0 if the trajectory starts there).
+        previous: (N, n) true state one step before the first (of step 0 if the episode starts there).
         start: (N, n) mean of the first belief; None: ``previous``.
         present: (T, N, number of the task's modalities) bool, whether any sensor of a modality has a reading
             (``Task.masks``); None: all have one.
@@ -296,7 +296,7 @@ def position_channels(task: Task, modality: str) -> list[list[int]]:
 
 
 def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Generator) -> Batch:
-    """The batch with each trajectory shifted on the map, object and end effector together, by a normal offset.
+    """The batch with each episode shifted on the map, object and end effector together, by a normal offset.
 
     This augments positions for models without images: forces do not change, and images are not adapted.
 

@@ -50,7 +50,7 @@ Member = TypeVar("Member", bound=tuple[Any, ...])
 """Number and episode, and perhaps more."""
 
 Run = tuple[Tensor, Tensor]
-"""Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU; of one trajectory without N."""
+"""Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU; of one episode without N."""
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ def _stay(task: Task, mean: Tensor, states: Tensor) -> Run:
 
 
 def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:
-    """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each trajectory."""
+    """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each episode."""
     # An estimate that counts turns has no larger errors.
     angles = Angles(task.angles)
     trajectories = [(angles.wrapped(e), c) for e, c in trajectories]
@@ -363,9 +363,9 @@ def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
 
 
 def nees_bounds(n: int, trajectories: int) -> tuple[float, float]:
-    """95 % interval of NEES / n of a consistent filter, averaged over independent trajectories at one step.
+    """95 % interval of NEES / n of a consistent filter, averaged over independent episodes at one step.
 
-    The sum is chi-square distributed with n * trajectories degrees of freedom. Bar-Shalom, Li and Kirubarajan,
+    The sum is chi-square distributed with n * episodes degrees of freedom. Bar-Shalom, Li and Kirubarajan,
     Estimation with Applications to Tracking and Navigation, 5.4.2.
     """
     degrees = n * trajectories

@@ -26,7 +26,7 @@ RUN_PARAMETERS = ("faults", "data", "episodes")
 
 
 class DiagnosticResult(ResultViews):
-    """Result of a diagnostic over one or more trajectories."""
+    """Result of a diagnostic over one or more episodes."""
 
     trajectories: int
 

@@ -1,7 +1,7 @@
 """Reader of the MIT Push dataset (Yu et al., "More than a Million Ways to Be Pushed", IROS 2016).
 
 A file is one push with ``object_pose``, ``tip_pose`` and ``ft_wrench``, each with its own timestamps. Pushes are
-resampled to one rate, stitched into trajectories and rendered by a camera.
+resampled to one rate, stitched into episodes and rendered by a camera.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from beliefscope.datasets.text import plural
 Array = NDArray[np.float64]
 
 KEYS = ("object_pose", "tip_pose", "ft_wrench")
-SECONDS = 2.5  # length of a trajectory: 45 steps at 18 Hz, as in the paper
+SECONDS = 2.5  # length of an episode: 45 steps at 18 Hz, as in the paper
 FIELD_SECONDS = 8.0  # the same for tasks with ingredients, whose outages last 1 to 3 s
-MIN_TRAIN, MIN_HELD_OUT = 200, 50  # trajectories of a split, independent of the number of pushes
+MIN_TRAIN, MIN_HELD_OUT = 200, 50  # episodes of a split, independent of the number of pushes
 AREA = 0.125  # half side length of the square around CENTRE that contains the block's centre, m
 MAX_GAP = 0.5  # s without a sample that is interpolated linearly
 MAX_TIME, MAX_VALUE = 1e10, 1e6  # s since 1970; m, rad, N or N m
@@ -244,10 +244,10 @@ def _check_jumps(place: str, stream: Array, max_distance: float, max_turn: float
 
 
 def stitch(pushes: Iterator[Push], steps: int, rng: Generator) -> Push:
-    """Concatenate pushes to a trajectory of ``steps`` steps at a random pose on the table.
+    """Concatenate pushes to an episode of ``steps`` steps at a random pose on the table.
 
     Each push starts at the final block pose of the previous one, with tip and forces rotated accordingly; the tip jumps
-    between pushes. The trajectory is rotated and moved at random: the block starts with a yaw of -90 to 90 degrees and
+    between pushes. The episode is rotated and moved at random: the block starts with a yaw of -90 to 90 degrees and
     stays within ``AREA`` of the centre. This assumes uniform friction of the table.
     """
     trajectory = next(pushes)
@@ -255,7 +255,7 @@ def stitch(pushes: Iterator[Push], steps: int, rng: Generator) -> Push:
         trajectory = trajectory.append(next(pushes))
     trajectory = trajectory.first(steps).moved(np.array([0.0, 0.0, rng.uniform(-np.pi / 2, np.pi / 2)]))
     low, high = trajectory.poses[:, :2].min(0), trajectory.poses[:, :2].max(0)
-    # A trajectory wider than the area is centred.
+    # An episode wider than the area is centred.
     margin = np.maximum(AREA - (high - low) / 2, 0.0)
     position = np.array(CENTRE) + rng.uniform(-margin, margin) - (low + high) / 2
     return trajectory.moved(np.array([*position, trajectory.poses[0, 2]]))
@@ -264,8 +264,8 @@ def stitch(pushes: Iterator[Push], steps: int, rng: Generator) -> Push:
 class MitPushDataset(Dataset):
     """Files of the MIT Push dataset as episodes of a ``push-real`` task.
 
-    The split is the name of the file's folder, by default ``test``. Each split, shape and surface has 200 trajectories
-    (50 outside ``train``), or as many as are needed to use every push. Trajectories depend on the files and the seed.
+    The split is the name of the file's folder, by default ``test``. Each split, shape and surface has 200 episodes
+    (50 outside ``train``), or as many as are needed to use every push. Episodes depend on the files and the seed.
     Images are rendered on first access.
     """
 
@@ -351,7 +351,7 @@ def _rng(seed: int, split: str, number: int) -> Generator:
 
 
 def _trajectories(pushes: Sequence[Push], split: str, steps: int, rng: Generator) -> Iterator[Push]:
-    """Stitch trajectories from shuffled pushes. All pushes are used before they are shuffled again."""
+    """Stitch episodes from shuffled pushes. All pushes are used before they are shuffled again."""
     used = 0
 
     def shuffled() -> Iterator[Push]:

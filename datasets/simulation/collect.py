@@ -35,7 +35,7 @@ def collect(
     split: str | None = None,
     without: Collection[str] = (),
 ) -> None:
-    """Simulate ``episodes`` trajectories of ``steps`` steps into the HDF5 file ``path``.
+    """Simulate ``episodes`` episodes of ``steps`` steps into the HDF5 file ``path``.
 
     Episode i depends only on the seed and on i, so the data do not depend on the number of workers. Finished episodes
     are stored in the folder ``<path>.partial``: an interrupted call resumes with the missing ones. The file is written

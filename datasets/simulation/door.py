@@ -167,7 +167,7 @@ def _replay(episode: Episode) -> mujoco.MjModel:
 
 
 def policy_name(index: int) -> str:
-    """Policy of a trajectory: alternates with a swap every ten, so that every split contains both policies."""
+    """Policy of an episode: alternates with a swap every ten, so that every split contains both policies."""
     return ("pull", "push")[(index + index // 10) % 2]
 
 
@@ -179,7 +179,7 @@ def draw_door(rng: Generator, policy: str) -> DoorPhysics:
 
 
 def simulate_door(seed: int, index: int, steps: int) -> Episode:
-    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
+    """Simulate episode ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
     return first_free_start(lambda rng: _simulate(rng, seed, index, steps), seed, index)
 
 

@@ -49,7 +49,7 @@ class Nudges:
 
 
 def simulate_door_field(seed: int, index: int, steps: int, without: Collection[str] = ()) -> Episode:
-    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic.
+    """Simulate episode ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic.
 
     Args:
         without: names of ingredients to switch off. The draws of the others do not change.

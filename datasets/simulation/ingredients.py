@@ -34,7 +34,7 @@ Draws = Mapping[str, Draw]
 
 
 def draw(task: Task, seed: int, index: int, without: Collection[str] = ()) -> Draws:
-    """The ingredients of trajectory ``index`` of the collection with ``seed``, except those in ``without``.
+    """The ingredients of episode ``index`` of the collection with ``seed``, except those in ``without``.
 
     Every ingredient has a generator of its own, so switching one off leaves the draws of the others unchanged.
     """

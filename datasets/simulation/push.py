@@ -229,7 +229,7 @@ def push_model(
 
 
 def simulate_push(seed: int, index: int, steps: int) -> Episode:
-    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
+    """Simulate episode ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
     return first_free_start(lambda rng: _simulate(rng, seed, index, steps), seed, index)
 
 

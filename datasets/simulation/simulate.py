@@ -110,7 +110,7 @@ def first_free_start(simulate_with: Callable[[Generator], Episode], seed: int, i
 
 
 def episode_rng(seed: int, index: int, draw: int = 0) -> Generator:
-    """Random numbers of trajectory ``index`` of the collection with ``seed``; ``draw``: number of jammed starts."""
+    """Random numbers of episode ``index`` of the collection with ``seed``; ``draw``: number of jammed starts."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index, draw) if draw else (index,)))
 
 
@@ -124,7 +124,7 @@ def simulate(
     steps: int,
     provenance: Mapping[str, Any],
 ) -> Episode:
-    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s.
+    """Simulate episode ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s.
 
     Args:
         states: (T, nq) joint positions -> (T, n) true states.
@@ -165,7 +165,7 @@ def simulate(
 
 
 def split_of(index: int) -> str:
-    """Of every ten trajectories, number 8 is for validation and number 9 for testing."""
+    """Of every ten episodes, number 8 is for validation and number 9 for testing."""
     return {8: "val", 9: "test"}.get(index % 10, "train")
 
 

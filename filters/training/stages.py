@@ -297,7 +297,7 @@ class Trainer:
                 return losses.with_readings(filter_, name, batch, error.square()).mean()
             return losses.likelihood(self.filter, module, batch, self.noise)
 
-        # Without weight decay, a model without images memorises the training trajectories.
+        # Without weight decay, a model without images memorises the training episodes.
         decay = 0.0 if uses_images else 0.01
         parameters = self.without_image_encoders(module.parameters())
         with self.cached_images():

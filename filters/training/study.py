@@ -132,7 +132,7 @@ def study_cells(
     Args:
         tasks: names or ``FILE.py:NAME``; empty for all with training data. filters: names to train; empty for
             all of each task. Checkpoint files and build functions are evaluated only, with the tasks that they fit.
-        files: data of tasks without a sample dataset, or in its place. note: receives each skipped trajectory.
+        files: data of tasks without a sample dataset, or in its place. note: receives each skipped episode.
 
     Raises BadInput for unknown names and unusable data.
     """

@@ -40,9 +40,6 @@ CAUSES: tuple[Cause, ...] = (
 SENSORS = {"image": "image", "force": "force", "torque": "torque", "contact": "contact", "effector": HAND}
 """Component of a cause -> observation key of its sensor."""
 
-MODALITIES = {"image": "image"}
-"""Component -> modality that the catalog writes for its sensor; ``haptics`` for all others."""
-
 
 def causes_of(task: Task) -> tuple[Cause, ...]:
     """All causes, and those in sensors that only this task has."""
@@ -63,7 +60,7 @@ def causes_in(checkpoint: Checkpoint) -> tuple[Cause, ...]:
 def _of_modality(cause: Cause, modalities: Mapping[str, str]) -> Cause:
     """A cause in a sensor, with the modality that has the sensor in a task. modalities: by observation key."""
     component = cause.name.partition(".")[0]
-    written = MODALITIES.get(component, "haptics")
+    written = "image" if component == "image" else "haptics"  # the modality that the catalog writes
     modality = modalities.get(SENSORS.get(component, ""), written)
     if modality == written:
         return cause

@@ -58,7 +58,7 @@ class Entry:
         title: display name.
         question: question that the diagnostic answers.
         run: (traces, checkpoint) -> result. The traces are of one filter; with several, results have bounds and
-            intervals over trajectories. ``options`` are passed by name.
+            intervals over episodes. ``options`` are passed by name.
         why_not: (trace, checkpoint or None) -> one-line reason why the diagnostic does not apply, or None.
         needs: ``trace`` only, or the ``checkpoint`` too.
         slow: takes more than two seconds; computed on request only.

@@ -231,7 +231,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 
 def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> Consistency:
-    """Evaluate the consistency of one filter over one or more trajectories."""
+    """Evaluate the consistency of one filter over one or more episodes."""
     first = traces[0]
     steps_of = [_step_measures(trace) for trace in traces]
     pooled = {name: np.concatenate([steps[name] for steps in steps_of]) for name in steps_of[0]}
@@ -327,7 +327,7 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
 def _summarise(
     layer: str, phase: str, owner: NDArray[np.int64], steps: dict[str, Array], cells: int
 ) -> LayerConsistency:
-    """``owner``: (S,) index of each step's trajectory. ``cells``: number of layers and phases, for ``adjusted``."""
+    """``owner``: (S,) index of each step's episode. ``cells``: number of layers and phases, for ``adjusted``."""
     error, level = steps["error"], steps["level"]
     curve = calibration_curve(level)
     _, index, counts = np.unique(owner, return_inverse=True, return_counts=True)

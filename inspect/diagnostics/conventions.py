@@ -62,8 +62,8 @@ class Conventions(Diagnostic):
         changes: of the inputs.
         errors: Q names; the main error first.
         share, low, high: (C, Q) share of the RMS error over the counted steps that a change removes, negative if it
-            adds some, with intervals over trajectories which hold the level of 95 % for all changes and errors
-            together; NaN below ``MIN_TRAJECTORIES`` trajectories.
+            adds some, with intervals over episodes which hold the level of 95 % for all changes and errors
+            together; NaN below ``MIN_TRAJECTORIES`` episodes.
         omitted: (C, Q) as ``share``, for the runs without the modality of the change; for the controls, for the first
             estimate at all steps.
     """

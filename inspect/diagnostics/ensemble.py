@@ -158,7 +158,7 @@ def has_equal_weights(trace: Trace) -> bool:
 
 
 def ensemble(traces: Sequence[Trace]) -> Ensemble:
-    """Evaluate the ensembles of one filter over one or more trajectories."""
+    """Evaluate the ensembles of one filter over one or more episodes."""
     first, parts = traces[0], [_steps(trace) for trace in traces]
     where = np.concatenate([measures.counted(trace) for trace in traces])
     error, spread, rank = (np.concatenate(columns)[where] for columns in zip(*parts, strict=True))

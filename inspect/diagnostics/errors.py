@@ -195,7 +195,7 @@ def _known_steps(trace: Trace) -> Mask:
 
 
 def errors_of(traces: Sequence[Trace]) -> Errors:
-    """Evaluate the errors of one estimator over one or more trajectories."""
+    """Evaluate the errors of one estimator over one or more episodes."""
     first, single = traces[0], len(traces) == 1
     error = [measures.errors(trace)[:, -1] for trace in traces]
     distance = [first.task.main_error.norm(e) for e in error]

@@ -38,14 +38,14 @@ class PhaseEfficiency:
 
     Attributes:
         phase: phase name.
-        trajectories, steps: number of trajectories and steps in the phase.
+        trajectories, steps: number of episodes and steps in the phase.
         fused: (1 + n,) of the filter.
         standalone: (K, 1 + n) of the standalone filters.
         best: (1 + n,) of the best linear combination of the standalone estimates.
         independent: (1 + n,) of the best combination if the standalone errors were not correlated.
         correlation: (1 + n,) of the standalone errors about zero, mean over pairs of modalities.
         efficiency: (1 + n,) ``best / fused``.
-        low, high: (1 + n,) 95 % intervals of ``efficiency`` over trajectories; NaN for too few of them.
+        low, high: (1 + n,) 95 % intervals of ``efficiency`` over episodes; NaN for too few of them.
     """
 
     phase: str

@@ -43,7 +43,7 @@ class Reason:
 
     Attributes:
         quantity: what ``value`` is. ideal: its value without a gap.
-        low, high: 95 % interval over trajectories; NaN for too few of them.
+        low, high: 95 % interval over episodes; NaN for too few of them.
         contributes: whether the interval excludes ``ideal`` and the difference is relevant.
         headline: the finding as a clause.
     """

@@ -40,7 +40,7 @@ class ModalityInnovations:
     Attributes:
         measurements: number of counted steps with a measurement. channels: largest number of channels.
         nis: mean of NIS / m, of the accepted measurements if there are any.
-        low, high: its 95 % interval over trajectories; NaN for too few.
+        low, high: its 95 % interval over episodes; NaN for too few.
         extreme: number of innovations beyond the ``TAIL`` quantile of a consistent filter.
         accepted: share of accepted measurements; NaN without a gate. missed: number of accepted extreme innovations.
         longest: largest number of rejections in succession.
@@ -164,7 +164,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 
 def innovations_of(traces: Sequence[Trace]) -> Innovations:
-    """Evaluate the innovations and gates of one filter over one or more trajectories."""
+    """Evaluate the innovations and gates of one filter over one or more episodes."""
     first = traces[0]
     keep = len(first) if len(traces) == 1 else 0
     rejected = np.zeros(len(first), dtype=bool) if first.accepted is None else (first.accepted == 0.0).any(1)

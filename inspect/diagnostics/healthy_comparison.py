@@ -1,7 +1,7 @@
-"""Comparison of trajectories with a healthy profile by a permutation test over all statistics at once.
+"""Comparison of episodes with a healthy profile by a permutation test over all statistics at once.
 
-If the trajectories are healthy, they are exchangeable with those of the profile, whatever their distribution. So the
-probability of an alarm is at most ``SIGNIFICANCE`` for any number of trajectories, tails and dependent statistics.
+If the episodes are healthy, they are exchangeable with those of the profile, whatever their distribution. So the
+probability of an alarm is at most ``SIGNIFICANCE`` for any number of episodes, tails and dependent statistics.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
 from beliefscope.inspect.diagnostics.views import Table
 
 SIGNIFICANCE = 0.01
-"""Probability of an alarm of one diagnostic for healthy trajectories."""
+"""Probability of an alarm of one diagnostic for healthy episodes."""
 
 SINGLE_SIGNIFICANCE = 0.02
-"""The same for one trajectory, whose p-value is at least 1 / (1 + number of healthy trajectories)."""
+"""The same for one episode, whose p-value is at least 1 / (1 + number of healthy episodes)."""
 
 PERMUTATIONS = 1999
-"""Number of random divisions into tested and healthy trajectories."""
+"""Number of random divisions into tested and healthy episodes."""
 
 TAIL = 0.99
 """Quantile of a statistic's t-values over healthy samples to which its critical value is proportional."""
@@ -58,21 +58,21 @@ SMALLEST_REST = 0.005
 """Smallest share of remaining readings that is distinguished from none."""
 
 MIN_HEALTHY = 10
-"""Minimum number of healthy trajectories with a value of a statistic."""
+"""Minimum number of healthy episodes with a value of a statistic."""
 
 MIN_EFFECT = 0.5
-"""Minimum difference of an alarm, in standard deviations between healthy trajectories."""
+"""Minimum difference of an alarm, in standard deviations between healthy episodes."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """A statistic of the tested trajectories compared with its healthy values.
+    """A statistic of the tested episodes compared with its healthy values.
 
     Attributes:
         statistic: ``KIND/SUBJECT/PHASE``.
-        value, healthy: means over the tested and over the healthy trajectories.
-        low, high: 95 % range of means over as many healthy trajectories as were tested.
-        p_value: probability of a deviation of this size in any statistic, if the trajectories are healthy.
+        value, healthy: means over the tested and over the healthy episodes.
+        low, high: 95 % range of means over as many healthy episodes as were tested.
+        p_value: probability of a deviation of this size in any statistic, if the episodes are healthy.
         alarm: whether it is significant and at least ``MIN_EFFECT``.
         t: difference of the means over its standard error; of ``with_critical_values``, relative to its critical value.
         unit, factor: for display, and the factor from the unit of the values.
@@ -112,7 +112,7 @@ class Comparison:
     """Result of ``compare``, largest deviation first.
 
     Attributes:
-        trajectories, healthy_trajectories: number of tested trajectories, and of those in the profile.
+        trajectories, healthy_trajectories: number of tested episodes, and of those in the profile.
         data: of the profile.
         deviations: by statistic.
         p_value: probability of a deviation of this size in any statistic, each relative to a high quantile of its own
@@ -165,9 +165,9 @@ class Comparison:
 def compare(
     profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]], seed: int = 0, task: Task | None = None
 ) -> Comparison:
-    """Compare trajectory statistics with those of a profile; statistics that only one of them has are omitted.
+    """Compare episode statistics with those of a profile; statistics that only one of them has are omitted.
 
-    Max-T test of Westfall and Young: in a division of all trajectories into n and the others, each statistic has a
+    Max-T test of Westfall and Young: in a division of all episodes into n and the others, each statistic has a
     t-value, the difference of the means over its standard error, with the spread of the others. ``p_value`` is the
     share of divisions whose largest absolute t is at least that of the statistic.
 
@@ -190,7 +190,7 @@ def compare(
     # Rounding must not distinguish a division from itself.
     largest = np.abs(t).max(1) * (1.0 + 1e-9)
     at_least = (largest[1:, None] >= np.abs(t[0])).sum(0)
-    # All divisions with one tested trajectory are enumerated, including the actual one.
+    # All divisions with one tested episode are enumerated, including the actual one.
     p_value = at_least / len(values) if count == 1 else (1.0 + at_least) / len(divisions)
     alarm = (p_value <= (SINGLE_SIGNIFICANCE if count == 1 else SIGNIFICANCE)) & (np.abs(effect[0]) >= MIN_EFFECT)
     low, high = _ranges(values[count:], count, seed)
@@ -207,9 +207,9 @@ def compare(
 
 
 def _own_scale(distribution: Array, t: Array, single: bool) -> Array:
-    """High quantile of absolute t-values of each statistic: (S,), or (B, S) for the t-values (B, S) of one trajectory.
+    """High quantile of absolute t-values of each statistic: (S,), or (B, S) for the t-values (B, S) of one episode.
 
-    The scale of one trajectory is the largest of the other ones in the distribution (D, S), because it would hide
+    The scale of one episode is the largest of the other ones in the distribution (D, S), because it would hide
     itself among few others.
     """
     size = np.abs(distribution)
@@ -262,7 +262,7 @@ def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np
 
 @lru_cache(maxsize=16)
 def _divisions(total: int, count: int, seed: int) -> np.ndarray:
-    """(B, total) masks of ``count`` tested of ``total`` trajectories: random, or all of them if one is tested."""
+    """(B, total) masks of ``count`` tested of ``total`` episodes: random, or all of them if one is tested."""
     if count == 1:
         return np.eye(total, dtype=bool)
     order = np.random.default_rng(seed).random((PERMUTATIONS, total)).argsort(axis=1)
@@ -292,12 +292,12 @@ def _t_values(values: Array, divisions: np.ndarray, floor: Array, rising: np.nda
 
 @lru_cache(maxsize=16)
 def _draws(total: int, count: int, seed: int) -> Array:
-    """(2000, total): how often each of ``total`` trajectories is among ``count`` drawn with replacement."""
+    """(2000, total): how often each of ``total`` episodes is among ``count`` drawn with replacement."""
     return np.random.default_rng(seed).multinomial(count, np.full(total, 1.0 / total), 2000).astype(np.float64)
 
 
 def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
-    """(S,) 95 % range of the mean of ``count`` trajectories drawn from the healthy ones (E, S)."""
+    """(S,) 95 % range of the mean of ``count`` episodes drawn from the healthy ones (E, S)."""
     drawn = _draws(len(healthy), count, seed)
     finite = np.isfinite(healthy)
     size = drawn @ finite.astype(np.float64)

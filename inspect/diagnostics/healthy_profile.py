@@ -1,4 +1,4 @@
-"""Healthy profile: trajectory statistics of a checkpoint on clean held-out episodes, which its later runs should match.
+"""Healthy profile: episode statistics of a checkpoint on clean held-out episodes, which its later runs should match.
 
 New checkpoints have it in their header; pretrained ones have a file beside them, which keeps their hash. What is the
 same for all pretrained filters of a task, such as statistics of its sensors, is in a file of the task.
@@ -32,18 +32,18 @@ SENSORS_SUFFIX = ".sensors.json"
 """Of the file of a task: ``statistics`` and ``reference`` of the profiles of all its pretrained filters."""
 
 DIGITS = 3
-"""Significant digits of stored values, whose rounding is small against the differences between trajectories."""
+"""Significant digits of stored values, whose rounding is small against the differences between episodes."""
 
 
 @dataclass(frozen=True)
 class HealthyProfile:
-    """Values of E clean held-out trajectories.
+    """Values of E clean held-out episodes.
 
     Attributes:
         data: where the episodes come from: a command or the name of a data set.
         episodes: E.
         particles: number of particles, or None.
-        statistics: ``KIND/SUBJECT/PHASE`` -> (E,) values by trajectory, SI units; NaN where there is none, such as
+        statistics: ``KIND/SUBJECT/PHASE`` -> (E,) values by episode, SI units; NaN where there is none, such as
             in a phase of too few steps.
         reference: healthy images; None in profiles of format 1 and for tasks without images.
         readings: models of the vector sensors of unknown physics; none in profiles of earlier versions.

@@ -23,9 +23,9 @@ class LayerConsistency:
     Attributes:
         layer: ``fused``, or the modality of a single-modality update.
         phase: phase name.
-        trajectories, steps: number of trajectories and steps in the phase.
+        trajectories, steps: number of episodes and steps in the phase.
         nees: mean of ``e^T S^-1 e / n``.
-        interval: 95 % interval of ``nees`` over trajectories; NaN for too few of them.
+        interval: 95 % interval of ``nees`` over episodes; NaN for too few of them.
         adjusted: the same, simultaneous over all layers and phases (Bonferroni).
         nis: mean of the normalised innovation squared over n; NaN without innovations.
         coverage95: share of steps with the true state in the 95 % region.

@@ -27,7 +27,7 @@ NOUNS = {"flat": "flat", "round": "a round peak", "ridge": "a ridge", "ring": "a
 """Shape -> description."""
 
 MIN_TRAJECTORIES, RESAMPLES = 5, 2000
-"""Minimum number of trajectories for an interval; bootstrap samples."""
+"""Minimum number of episodes for an interval; bootstrap samples."""
 
 VALUES_AT_ONCE = 10_000_000
 
@@ -126,7 +126,7 @@ class MapSurvey(Diagnostic):
         return f"{text}; its long axis is {self._deviation(i, has_direction)} off the direction that the task expects."
 
     def _deviation(self, layer: int, mask: Mask) -> str:
-        """Median deviation over steps, with a 95 % interval over trajectories if there are enough."""
+        """Median deviation over steps, with a 95 % interval over episodes if there are enough."""
         median, low, high = median_interval(np.degrees(self.numbers.deviation[mask, layer]), self.trajectory[mask])
         if np.isnan(low):
             return f"{median:.1f}°"
@@ -200,14 +200,14 @@ def _median(values: NDArray[np.float64]) -> float:
 
 
 def median_interval(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Median of S values with its 95 % interval, by bootstrap over the trajectories (S,) that they belong to.
+    """Median of S values with its 95 % interval, by bootstrap over the episodes (S,) that they belong to.
 
     Expanded percentile interval (Hesterberg, "What Teachers Should Know About the Bootstrap", 2015): the level is that
     of Student's t with R - 1 degrees of freedom at ``sqrt(R / (R - 1))`` standard deviations, since the percentiles
-    are too narrow for few trajectories R.
+    are too narrow for few episodes R.
 
     Returns:
-        Median, low and high; the last two are NaN below ``MIN_TRAJECTORIES`` trajectories.
+        Median, low and high; the last two are NaN below ``MIN_TRAJECTORIES`` episodes.
     """
     order = np.argsort(values)
     ordered, (names, member) = values[order], np.unique(trajectory[order], return_inverse=True)

@@ -215,7 +215,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 
 def particle_health(traces: Sequence[Trace], healthy: Comparison | None = None) -> ParticleHealth:
-    """Evaluate the particle health of one filter over one or more trajectories."""
+    """Evaluate the particle health of one filter over one or more episodes."""
     first = traces[0]
     assert first.particles is not None
     measured = [measure_steps(trace) for trace in traces]

@@ -44,10 +44,10 @@ class PhaseValues:
 
     Attributes:
         phase: phase name.
-        trajectories, steps: number of trajectories and steps in the phase.
+        trajectories, steps: number of episodes and steps in the phase.
         rmse: (2^K, 1 + n) m, rad: RMSE of the position and of each component, by subset.
         shapley: (K, 1 + n) m, rad: Shapley values of the RMSE; negative if a modality lowers it.
-        low, high: 95 % intervals over trajectories; NaN below ``MIN_TRAJECTORIES`` trajectories.
+        low, high: 95 % intervals over episodes; NaN below ``MIN_TRAJECTORIES`` episodes.
     """
 
     phase: str
@@ -281,7 +281,7 @@ def shapley(
     offset: float = 0.0,
     progress: Callable[[float], None] | None = None,
 ) -> Shapley:
-    """Compute the Shapley values of the modalities of one filter over one or more trajectories.
+    """Compute the Shapley values of the modalities of one filter over one or more episodes.
 
     For ``offset`` see ``run_subsets``. Raises BadInput if it is negative or not finite.
     """

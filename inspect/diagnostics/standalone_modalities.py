@@ -30,12 +30,12 @@ class PhaseErrors:
 
     Attributes:
         phase: phase name.
-        trajectories, steps: number of trajectories and steps in the phase.
+        trajectories, steps: number of episodes and steps in the phase.
         fused: (1 + n,) of the filter.
         updates: (K, 1 + n) of the single-modality updates; NaN for a modality without one.
         standalone: (K, 1 + n) of the standalone filters.
         ratio: (K,) position RMSE of the filter over that of each standalone filter: below 1, fusion is better.
-        low, high: (K,) 95 % intervals of ``ratio`` over trajectories; NaN for too few of them.
+        low, high: (K,) 95 % intervals of ``ratio`` over episodes; NaN for too few of them.
     """
 
     phase: str

@@ -95,7 +95,7 @@ KINDS = {
     "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
-standard deviation between trajectories, below which differences are irrelevant. A name may have a place ``{of}`` for
+standard deviation between episodes, below which differences are irrelevant. A name may have a place ``{of}`` for
 the statistic's subject, or ``{axis}`` for its axis only, if they are not at its end."""
 
 UNITS = {"force": "N", "torque": "N m", "image": "gray levels"}

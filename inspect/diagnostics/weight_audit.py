@@ -54,11 +54,11 @@ class PhaseWeights:
 
     Attributes:
         phase: phase name.
-        trajectories, steps: number of trajectories and steps in the phase.
+        trajectories, steps: number of episodes and steps in the phase.
         beta, effective_weights, oracle: (K, W) mean weights; beta is None without a weight model.
         fused, hindsight: (1 + n,) m, rad: RMSE of the position and of each component, of the filter and with the
             oracle's weights.
-        constant: (1 + n,) RMSE with the best constant weights by phase; NaN for one trajectory.
+        constant: (1 + n,) RMSE with the best constant weights by phase; NaN for one episode.
         unimodal: (K, 1 + n) RMSE of the single-modality updates, which are not standalone (``inspect/standalone.py``).
     """
 
@@ -95,7 +95,7 @@ class WeightAudit(Diagnostic):
             a scalar weight.
         contact, blackout: (T,) masks.
         excess: relative excess of the position error over that with the best constant weights by phase, and its 95 %
-            interval over trajectories; NaN for too few of them.
+            interval over episodes; NaN for too few of them.
         healthy: comparison with the filter's healthy record, if it has one.
     """
 
@@ -277,7 +277,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 
 def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightAudit:
-    """Audit the weights of one filter over one or more trajectories."""
+    """Audit the weights of one filter over one or more episodes."""
     first = traces[0]
     step_values = add_constant([weight_steps(trace) for trace in traces], traces)
     pooled = {name: np.concatenate([steps[name] for steps in step_values]) for name in step_values[0]}

@@ -30,7 +30,7 @@ class Correlation:
         modality, component: of the weight; component is None for a scalar weight.
         other: ``contact`` or ``blackout`` (point-biserial), or ``oracle``, the oracle's weight.
         value: NaN if one of the signals is constant.
-        low, high: 95 % interval over trajectories; NaN for too few of them.
+        low, high: 95 % interval over episodes; NaN for too few of them.
     """
 
     weight: str
@@ -102,7 +102,7 @@ def weight_steps(trace: Trace) -> dict[str, Array]:
 
 
 def add_constant(step_values: list[dict[str, Array]], traces: Sequence[Trace]) -> list[dict[str, Array]]:
-    """Add ``constant``, errors (T, 1 + n) with the best constant weights by phase; NaN for one trajectory."""
+    """Add ``constant``, errors (T, 1 + n) with the best constant weights by phase; NaN for one episode."""
     if len(traces) == 1:
         return [steps | {"constant": np.full_like(steps["fused"], np.nan)} for steps in step_values]
     task = traces[0].task
@@ -126,7 +126,7 @@ def add_constant(step_values: list[dict[str, Array]], traces: Sequence[Trace]) -
 
 
 def excess_error(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]]) -> tuple[float, float, float]:
-    """Relative excess of the position RMSE over that with constant weights, with its interval over trajectories."""
+    """Relative excess of the position RMSE over that with constant weights, with its interval over episodes."""
     keep = [measures.counted(trace) for trace in traces]
     squares = [
         [np.square(steps[name][mask, 0]).sum() for name in ("fused", "constant")]

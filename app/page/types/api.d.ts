@@ -295,7 +295,7 @@ export interface components {
         };
         /**
          * DiagnosticResult
-         * @description Result of a diagnostic over one or more trajectories.
+         * @description Result of a diagnostic over one or more episodes.
          */
         DiagnosticResult: {
             /** Verdict */
