@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
-from beliefscope.app.workspace.json_files import RecordCache, read_record, write_record
+from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
@@ -36,12 +36,14 @@ class SavedFilters:
 
     def __init__(self, workspace: Path, tasks: Iterable[Task] = ()) -> None:
         self._workspace = workspace
+        self._path = workspace / FILE
+        self._lists = RecordCache(partial(read_record, RECORDS))
         self._loaded = RecordCache(partial(load_checkpoint, given=tuple(tasks)))
 
     def all(self) -> list[SavedFilter]:
         """Those whose checkpoint exists; none if the list cannot be read."""
-        with suppress(BadInput):
-            return self._read()
+        with suppress(OSError, ValueError):
+            return self._existing(self._lists.get(self._path) or [])
         return []
 
     def of_task(self, task: Task) -> Iterator[tuple[SavedFilter, Checkpoint]]:
@@ -56,25 +58,26 @@ class SavedFilters:
         others = [saved for saved in self._read() if (saved.task, saved.name) != (new.task, new.name)]
         if new.default:
             others = [replace(saved, default=saved.default and saved.task != new.task) for saved in others]
-        write_record([new, *others], self._workspace / FILE)
+        self._lists.put(self._path, [new, *others])
 
     def remove(self, task: str, name: str) -> None:
         """Remove a filter; its checkpoint file is kept. Raises BadInput for an unreadable list."""
         others = [saved for saved in self._read() if (saved.task, saved.name) != (task, name)]
-        write_record(others, self._workspace / FILE)
+        self._lists.put(self._path, others)
 
     def _read(self) -> list[SavedFilter]:
         """Raises BadInput for a list that cannot be read, such as a later version's, so that it is not overwritten."""
-        path = self._workspace / FILE
         try:
-            saved = [self._located(saved) for saved in read_record(RECORDS, path)]
-            return [filter_ for filter_ in saved if Path(filter_.path).is_file()]
+            return self._existing(read_record(RECORDS, self._path))
         except FileNotFoundError:
             return []
         except (OSError, ValueError, TypeError):
             raise BadInput(
-                f"{str(path)!r} is damaged or was written by another version: move it away to start a new list"
+                f"{str(self._path)!r} is damaged or was written by another version: move it away to start a new list"
             ) from None
+
+    def _existing(self, filters: Iterable[SavedFilter]) -> list[SavedFilter]:
+        return [saved for saved in map(self._located, filters) if Path(saved.path).is_file()]
 
     def _located(self, saved: SavedFilter) -> SavedFilter:
         """With the path of the run in this workspace: the stored one may be relative, or of where it was before."""

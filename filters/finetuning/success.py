@@ -42,9 +42,9 @@ class Criterion:
     def __post_init__(self) -> None:
         """Raises BadInput for a share out of its range."""
         if not 0.0 < self.by < 1.0:
-            raise BadInput(f"by={percent(self.by, '.6g')} of a success criterion is not above 0 % and below 100 %")
+            raise BadInput(f"by={100.0 * self.by:.6g}% of a success criterion is not above 0 % and below 100 %")
         if not 0.0 <= self.others < math.inf:
-            raise BadInput(f"others={percent(self.others, '.6g')} of a success criterion is not 0 % or more")
+            raise BadInput(f"others={100.0 * self.others:.6g}% of a success criterion is not 0 % or more")
 
     @classmethod
     def parse(cls, text: str) -> Criterion:
