@@ -8,9 +8,9 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from beliefscope.app.api.models import FilterName, Number, Reply
-from beliefscope.app.api.studies import catalog_names
+from beliefscope.app.api.studies import add_filter, catalog_names
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.runs.result_filters import result_filter_name, sweep_folders
+from beliefscope.app.runs.result_filters import sweep_folders
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.diagnostics.views import as_json
@@ -155,10 +155,7 @@ def routes(store: TraceStore) -> APIRouter:
         row = next(iter(tables(sweep).query(query, [checkpoint]).to_pylist()), None)
         if row is None:
             raise NotFound(f"Sweep {sweep!r} has no checkpoint with hash {checkpoint[:12]}.")
-        names = catalog_names(store)
-        name = names.get((row["task"], checkpoint)) or result_filter_name(row["name"], checkpoint)
-        store.checkpoint(row["task"], name)  # adds it
-        return FilterName(filter=name)
+        return add_filter(store, row["task"], row["name"], checkpoint)
 
     return router
 

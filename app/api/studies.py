@@ -109,9 +109,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         hash_ = None if study is None else study.read().checkpoints.get(cell)
         if hash_ is None:
             raise NotFound(f"Study {name!r} has no checkpoint {cell!r}.")
-        catalog_name = catalog_names(store).get((task, hash_)) or result_filter_name(cell, hash_)
-        store.checkpoint(task, catalog_name)  # adds it
-        return FilterName(filter=catalog_name)
+        return add_filter(store, task, cell, hash_)
 
     return router
 
@@ -196,6 +194,13 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
 
 def _key(study: Study, results: Results) -> object:
     return str(study.folder.resolve()), results.preset, sorted(results.cells)
+
+
+def add_filter(store: TraceStore, task: str, name: str, hash_: str) -> FilterName:
+    """Add a checkpoint to the catalog, if it is not there. name: in its sweep, or its cell in its study."""
+    catalog_name = catalog_names(store).get((task, hash_)) or result_filter_name(name, hash_)
+    store.checkpoint(task, catalog_name)  # adds it
+    return FilterName(filter=catalog_name)
 
 
 def catalog_names(store: TraceStore) -> CatalogNames:

@@ -1,12 +1,10 @@
 """Jobs that diagnose a filter over episodes, find the smallest repair of a run, and measure a healthy record."""
 
 from collections.abc import Mapping
-from contextlib import closing
 from typing import Any
 
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
@@ -18,7 +16,7 @@ from beliefscope.inspect.healthy import profile_of, sensor_record
 
 def run(arguments: Mapping[str, Any], report: Report) -> Any:
     """Compute the diagnosis; no traces are stored."""
-    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+    with store_of_job(arguments) as store:
         data = store.dataset(arguments["task"], arguments["data"])[1]
         faults, seed = Faults.parse(arguments["faults"]), store.settings.seed
         report(0.0, "reading the episodes")
@@ -35,7 +33,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> Any:
 def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
     """Find the smallest repair of the largest failure of a run; its stored trace is reused."""
     selection = Selection.from_json(arguments["selection"])
-    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+    with store_of_job(arguments) as store:
         report(0.0, "running the filter")
         run = store.request(selection)
         bound = healthy_bound(required_profile(run.checkpoint).statistics)
@@ -53,7 +51,7 @@ def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
 
 def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
     """Measure the healthy record of a filter over clean episodes, and keep it in the workspace."""
-    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+    with store_of_job(arguments) as store:
         checkpoint = store.checkpoint(arguments["task"], arguments["filter"])
         data = store.dataset(arguments["task"], arguments["data"])[1]
         report(0.0, "measuring the sensors")

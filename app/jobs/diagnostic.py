@@ -1,12 +1,10 @@
 """Job that computes a diagnostic over one or more episodes."""
 
 from collections.abc import Mapping
-from contextlib import closing
 from typing import Any
 
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import Trace
@@ -20,7 +18,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     selections = [Selection.from_json(values) for values in arguments["selections"]]
     count = len(selections)
     traces: list[Trace] = []
-    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+    with store_of_job(arguments) as store:
         for i, selection in enumerate(selections):
             traced = store.request(selection)
             while not traced.ready(POLL_INTERVAL):

@@ -1,12 +1,10 @@
 """Job that runs a filter over a data set, ranks its failure events by every score and searches for slices."""
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
 from typing import Any
 
 from beliefscope.app.protocol.permalinks import permalink
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
@@ -25,7 +23,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         at = min(int(share * len(episodes)), len(episodes) - 1)
         report(0.95 * share, f"running the filter over episode {episodes[at]}, {at + 1} of {len(episodes)}")
 
-    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+    with store_of_job(arguments) as store:
         traces = trace_all(
             store.checkpoint(arguments["task"], arguments["filter"]),
             store.dataset(arguments["task"], arguments["data"])[1],

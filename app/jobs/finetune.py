@@ -2,12 +2,10 @@
 
 import json
 from collections.abc import Mapping
-from contextlib import closing
 from typing import Any
 
 from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.io.atomic_write import write_atomically
@@ -30,12 +28,12 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Fine-tune, resuming if interrupted; write checkpoint and result into the run's folder."""
     from beliefscope.recordings.rerun_log.training_curves import log_curves  # imports Rerun
 
-    settings = Settings.from_json(arguments["settings"])
     tuning = FineTune.from_json(arguments["tuning"])
-    folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
-    path = folder / "finetuned.safetensors"
     # Threads of torch that wait for a core which the page uses cost more time than they save.
-    with closing(TraceStore(settings)) as store, one_thread():
+    with store_of_job(arguments) as store, one_thread():
+        settings = store.settings
+        folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
+        path = folder / "finetuned.safetensors"
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         is_sample = data_name not in settings.data

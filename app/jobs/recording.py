@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.recordings import RecordingFolder
@@ -21,10 +20,7 @@ from beliefscope.recordings.probe import RecordingInfo
 def record(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Record a run with likelihood maps; a stored trace is reused."""
     path = Path(arguments["path"])
-    with (
-        closing(TraceStore(Settings.from_json(arguments["settings"]))) as store,
-        closing(RecordingFolder(path.parent)) as files,
-    ):
+    with store_of_job(arguments) as store, closing(RecordingFolder(path.parent)) as files:
         report(0.0, "running the filter")
         run = store.request(Selection.from_json(arguments["selection"]))
         write(files, run, path, arguments["maps"], report, arguments["quantity"])

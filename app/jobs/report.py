@@ -1,14 +1,12 @@
 """Job that writes the report of a run."""
 
 from collections.abc import Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.filters.checkpoint import PRETRAINED
 from beliefscope.inspect.maps.map_engine import missing_quantities
@@ -22,7 +20,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     options = arguments["options"]
     events, slow, title, quantity = (options[name] for name in ("events", "slow", "title", "quantity"))
-    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+    with store_of_job(arguments) as store:
         selection = Selection.from_json(arguments["selection"])
         report(0.0, "running the filter")
         traced = store.request(selection)

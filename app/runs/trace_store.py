@@ -5,9 +5,9 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -351,6 +351,11 @@ class TraceStore:
 
     def _trace_file(self, selection: Selection) -> Path:
         return self.settings.workspace / "traces" / f"{selection.file_stem}-{self.key(selection)[:16]}.trace"
+
+
+def store_of_job(arguments: Mapping[str, Any]) -> closing[TraceStore]:
+    """The store in the process of a job, with the settings of the server; closed at the end of a block."""
+    return closing(TraceStore(Settings.from_json(arguments["settings"])))
 
 
 def _run_in_worker(worker: TraceWorker, request: RunRequest, progress: Callable[[float], None]) -> Trace:

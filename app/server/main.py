@@ -133,23 +133,18 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     return app
 
 
-def _print_url(url: str) -> None:
-    print(f"Beliefscope is running at {url} (press Ctrl-C to stop)", flush=True)
-
-
 def serve(
     settings: Settings,
     host: str = "127.0.0.1",
     port: int = 8000,
-    on_start: Callable[[str], None] = _print_url,
+    on_start: Callable[[str], None] = lambda url: None,
     access: Access = OPEN,
 ) -> None:
     """Serve on one port until SIGINT, SIGTERM or SIGHUP.
 
     Args:
         host, port: address to listen on; port 0 selects a free one.
-        on_start: called with the URL of the page, including the token, once the server accepts connections; prints
-            it by default.
+        on_start: called with the printed URL of the page, including the token, once the server accepts connections.
         access: see ``create_app``; a token is required if others can reach the host.
 
     Raises BadInput if the address is not available or not allowed, or if a file cannot be used.
@@ -174,6 +169,7 @@ def serve(
                 "read_only": access.read_only,
             }
             log.info("started", extra={"event": event})
+            print(f"Beliefscope is at {access.link(url)} (press Ctrl-C to stop)", flush=True)
             on_start(access.link(url))
 
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; sent when the terminal closes

@@ -219,14 +219,14 @@ def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) ->
     from beliefscope.inspect.compare.success import judge
 
     assert settings.success is not None
-    with console.bars() as update:
+    with console.progress("Comparing") as advance:
         comparison = compare_checkpoints(
             base,
             load_checkpoint(output, (base.task,)),
             data,
             slices=settings.compared_slices(base.filter),
             seed=settings.seed,
-            progress=lambda share: update("Comparing", share, ""),
+            progress=advance,
         )
     return judge(settings.success, comparison, base.task)
 

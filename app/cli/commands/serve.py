@@ -93,7 +93,7 @@ def serve(
 def serve_page(
     settings: Settings, port: int, open_page: bool, host: str = "127.0.0.1", access: Access | None = None
 ) -> None:
-    """Serve until a signal; prints the address once the server listens, and opens it in a browser if requested."""
+    """Serve until a signal; opens the printed address in a browser if requested."""
     from beliefscope.app.server.auth import LOOPBACK, OPEN
     from beliefscope.app.server.main import serve as serve_until_signal
 
@@ -103,7 +103,6 @@ def serve_page(
         def listening(url: str) -> None:
             if host not in LOOPBACK:
                 console.note("warning: anyone with the link can use this server, and the connection is not encrypted")
-            print(f"Beliefscope is at {url} (press Ctrl-C to stop)", flush=True)
             if open_page:
                 open_in_browser(url)
 
