@@ -76,7 +76,7 @@ class SavedFilters:
                 f"{str(self._path)!r} is damaged or was written by another version: move it away to start a new list"
             ) from None
 
-    def _existing(self, filters: Iterable[SavedFilter]) -> list[SavedFilter]:
+    def _existing(self, filters: list[SavedFilter]) -> list[SavedFilter]:
         return [saved for saved in map(self._located, filters) if Path(saved.path).is_file()]
 
     def _located(self, saved: SavedFilter) -> SavedFilter:
