@@ -37,6 +37,15 @@ export function create(tag, properties = {}, ...children) {
 }
 
 /**
+ * Replaces the options of a select.
+ * @param {HTMLSelectElement} select
+ * @param {string[][]} options [value, text]
+ */
+export function setOptions(select, options) {
+  select.replaceChildren(...options.map(([value, text]) => new Option(text, value)));
+}
+
+/**
  * Lets a popover open below a button, with the same right edge.
  * @param {HTMLElement} popover
  * @param {HTMLElement} button

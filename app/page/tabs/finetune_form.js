@@ -1,28 +1,21 @@
 /** Form for a fine-tuning: a weakness, the modules and data to train, and the criterion of success. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneOffer, FineTuneRunInfo, FineTuneSettings, SliceInfo, Weakness } from '../types/server.js' */
+/** @import { Catalog, FineTuneOffer, FineTuneRunInfo, FineTuneSettings, Weakness } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { CLEAN_WEIGHT } from '../core/constants.js';
-import { create, element, html } from '../core/dom.js';
-import { displayName, typeset } from '../core/units.js';
-import { checkSelection } from '../data/api.js';
-import { faultPicker } from '../widgets/fault_dialog.js';
+import { create, element, html, setOptions } from '../core/dom.js';
+import { displayName } from '../core/units.js';
 import { ModuleDiagram } from './module_diagram.js';
+import { SliceFields } from './slice_fields.js';
+import { WeaknessList } from './weakness_list.js';
 
 /** @typedef {Omit<FineTuneSettings, 'mix'> & {mix?: object[]}} FineTuneRequest */
 /** @typedef {'clean_weight' | 'steps' | 'length' | 'rate' | 'l2_sp' | 'seed'} NumberName */
 
-const CLEAN = 'clean'; // name of the slice of clean data
 const BELIEF = new Set(['nll', 'nees']); // measures that are not errors
-const CUSTOM = 'custom'; // value of a preset or a slice without a name
-/** @type {[string, string][]} */
-const PHASES = [
-  ['', 'all steps'],
-  ['yes', 'contact'],
-  ['no', 'free motion'],
-];
+const CUSTOM = 'custom'; // value of a preset without a name
 /** @type {{name: NumberName, text: string, step: number | 'any', title: string}[]} */
 const NUMBERS = [
   {
@@ -81,15 +74,11 @@ const BODY = `
 
 export class FinetuneForm {
   #form;
-  #catalog;
-  #store;
+  #weaknesses;
   #diagram;
-  #showFaults;
+  #slice;
   /** @type {FineTuneOffer | null} */
   #offer = null;
-  #faults = '';
-  /** @type {Weakness[]} */
-  #weaknesses = [];
   /** Settings of the selected weakness, or the defaults. @type {FineTuneSettings | null} */
   #suggested = null;
   #hasOwnCriterion = false; // whether the slice of the criterion was chosen by the user
@@ -103,8 +92,6 @@ export class FinetuneForm {
    */
   constructor(form, catalog, store, faultDialog, submit) {
     this.#form = form;
-    this.#catalog = catalog;
-    this.#store = store;
     const body = document.createElement('template');
     body.innerHTML = BODY;
     form.prepend(body.content);
@@ -113,27 +100,11 @@ export class FinetuneForm {
       this.#showCount();
     });
     html('.numbers', form).append(...NUMBERS.map(numberField));
-    fill(this.#select('contact'), PHASES);
-    const useCustomSlice = () => {
-      this.#select('slice').value = CUSTOM;
-      this.#weightClean();
-    };
-    this.#showFaults = faultPicker(this.#select('faults'), faultDialog, {
-      none: 'as recorded',
-      selected: () => this.#faults,
-      choose: (faults) => {
-        this.#faults = faults;
-        useCustomSlice();
-      },
-      check: (faults) => checkSelection({ ...store.state, faults, against: '' }),
-    });
-    for (const name of ['contact', 'only'])
-      this.#select(name).addEventListener('change', useCustomSlice);
+    this.#weaknesses = new WeaknessList(html('.weakness', form), store, (settings) =>
+      this.#suggest(settings),
+    );
+    this.#slice = new SliceFields(form, catalog, store, faultDialog, () => this.#weightClean());
     this.#select('preset').addEventListener('change', () => this.#applyPreset());
-    this.#select('slice').addEventListener('change', () => {
-      this.#applySlice();
-      this.#weightClean();
-    });
     this.#select('criterion').addEventListener('change', () => (this.#hasOwnCriterion = true));
     form.addEventListener('submit', (event) => {
       event.preventDefault();
@@ -164,70 +135,25 @@ export class FinetuneForm {
    */
   show(offer, weaknesses) {
     this.#offer = offer;
-    this.#weaknesses = weaknesses;
     const { modules, presets, measures, simulated } = offer;
     this.#diagram.show(modules, presets.find(({ name }) => name === 'all')?.trains ?? []);
-    fill(this.#select('preset'), [
-      ...presets.map(({ name }) => pair(name, presetName(displayName(name)))),
+    setOptions(this.#select('preset'), [
+      ...presets.map(({ name }) => [name, presetName(displayName(name))]),
       [CUSTOM, 'custom'],
     ]);
-    const single = offer.slices.filter(({ only }) => only.length);
-    fill(this.#select('only'), [
-      ['', 'all'],
-      ...single.map(({ only }) => pair(only.join('+'), `only ${only.join(' + ')}`)),
-    ]);
-    fill(this.#select('slice'), [
-      ...this.#slices.map(({ name }) => pair(name, displayName(name))),
-      ['', 'clean data only'],
-      [CUSTOM, 'custom'],
-    ]);
-    html('.phase', this.#form).hidden = offer.slices.every(({ contact }) => contact === null);
-    fill(
+    this.#slice.show(
+      offer,
+      weaknesses.flatMap(({ slices }) => slices),
+    );
+    setOptions(
       this.#select('measure'),
-      measures.map(({ name, title }) => pair(name, BELIEF.has(name) ? title : `${title} error`)),
+      measures.map(({ name, title }) => [name, BELIEF.has(name) ? title : `${title} error`]),
     );
     html('.simulated', this.#form).textContent = simulated
       ? `${simulated} training episodes are simulated first, once: the sample set has test episodes only.`
       : '';
-    html('.weakness .list', this.#form).replaceChildren(
-      ...weaknesses.map((weakness, i) => this.#weakness(weakness, i)),
-    );
-    html('.weakness .none', this.#form).hidden = weaknesses.length > 0;
+    this.#weaknesses.show(weaknesses);
     this.#suggest(weaknesses[0]?.settings ?? offer.settings);
-  }
-
-  /** Data slices of the filter and of its weaknesses. */
-  get #slices() {
-    const all = [
-      ...this.#weaknesses.flatMap(({ slices }) => slices),
-      ...(this.#offer?.slices ?? []),
-    ];
-    return all.filter((slice, i) => all.findIndex(({ name }) => name === slice.name) === i);
-  }
-
-  /**
-   * @param {Weakness} weakness
-   * @param {number} i
-   */
-  #weakness({ title, evidence, episode, step, settings }, i) {
-    const input = create('input', { type: 'radio', name: 'weakness', checked: !i });
-    input.addEventListener('change', () => this.#suggest(settings));
-    const item = create(
-      'div',
-      { className: 'item' },
-      create('label', {}, input, create('strong', { textContent: title })),
-      create('p', { textContent: typeset(evidence) }),
-    );
-    if (episode !== null) {
-      const textContent = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;
-      const link = create('button', { type: 'button', className: 'text quiet', textContent });
-      link.title = 'Show this step';
-      link.addEventListener('click', () =>
-        this.#store.set({ episode, step: step ?? 0, tab: 'diagnosis', playing: false }),
-      );
-      item.append(link);
-    }
-    return item;
   }
 
   /**
@@ -238,12 +164,12 @@ export class FinetuneForm {
     this.#suggested = settings;
     this.#hasOwnCriterion = false;
     this.#select('preset').value = settings.train[0] ?? 'all';
-    this.#select('slice').value = settings.mix[0]?.slice.name ?? '';
     for (const { name } of NUMBERS) this.#input(name).value = String(settings[name]);
     this.#applyPreset();
-    this.#applySlice();
+    this.#slice.choose(settings.mix[0]?.slice.name ?? '');
+    this.#offerCriterion();
     const [slice, ...parts] = (settings.success ?? '').split(':');
-    const given = new Map(parts.map((part) => pair(...twoParts(part))));
+    const given = new Map(parts.map(twoParts));
     this.#select('measure').value = given.get('measure') ?? 'error';
     if (slice) this.#select('criterion').value = slice;
   }
@@ -274,45 +200,17 @@ export class FinetuneForm {
       `${trained} of ${total} parameters; the others are frozen`;
   }
 
-  /** The selected slice; undefined for a custom one, and for clean data. */
-  get #slice() {
-    const name = this.#select('slice').value;
-    return this.#slices.find((item) => item.name === name);
-  }
-
-  /** Shows the definition of the selected slice, and makes it that of the criterion. */
-  #applySlice() {
-    this.#offerCriterion();
-    if (this.#select('slice').value === CUSTOM) return;
-    const slice = this.#slice;
-    const { task } = this.#store.state;
-    this.#faults = slice?.text.match(/faults=(.*?)(?=$|:contact=|:only=)/)?.[1] ?? '';
-    this.#showFaults(this.#catalog.tasks.find(({ name }) => name === task)?.fault_presets ?? []);
-    const contact = slice?.contact ?? null;
-    this.#select('contact').value = contact === null ? '' : contact ? 'yes' : 'no';
-    this.#select('only').value = slice?.only.join('+') ?? '';
-  }
-
   /** Offers the trained slice and the standard ones for the criterion. */
   #offerCriterion() {
     const select = this.#select('criterion');
-    const trained = this.#trainedSlice;
+    const trained = this.#slice.name;
     const names = [...new Set([trained, ...(this.#offer?.criterion_slices ?? [])])];
     const chosen = select.value;
-    fill(
+    setOptions(
       select,
-      names.map((name) => pair(name, displayName(name))),
+      names.map((name) => [name, displayName(name)]),
     );
     select.value = this.#hasOwnCriterion && names.includes(chosen) ? chosen : trained;
-  }
-
-  /** Name of the slice to train on. */
-  get #trainedSlice() {
-    const slice = this.#slice?.name;
-    if (slice) return slice;
-    const [contact, only] = [this.#select('contact').value, this.#select('only').value];
-    if (this.#select('slice').value !== CUSTOM || !(this.#faults || contact || only)) return CLEAN;
-    return customSlice(this.#faults, contact, only).split(':')[0];
   }
 
   /** Sets the weight of clean data to that of the suggested slice, or to that of any other one. */
@@ -321,7 +219,7 @@ export class FinetuneForm {
       mix: [],
       clean_weight: CLEAN_WEIGHT,
     };
-    const isSuggested = mix[0]?.slice.name === this.#select('slice').value;
+    const isSuggested = mix[0]?.slice.name === this.#slice.name;
     this.#input('clean_weight').value = String(isSuggested ? weight : CLEAN_WEIGHT);
     this.#offerCriterion();
   }
@@ -347,11 +245,8 @@ export class FinetuneForm {
     const [measure, criterion] = [this.#select('measure').value, this.#select('criterion').value];
     const limits = `by=${this.#input('by').value}%:others=${this.#input('others').value}%`;
     settings.success = `${criterion}:measure=${measure}:${limits}`;
-    const [contact, only] = [this.#select('contact').value, this.#select('only').value];
-    const slice = this.#slice;
-    if (slice) settings.mix = [{ slice: definition(slice), share: 1 }];
-    else if (this.#select('slice').value === CUSTOM && (this.#faults || contact || only))
-      settings.mix = [{ slice: customSlice(this.#faults, contact, only), share: 1 }];
+    const slice = this.#slice.definition;
+    if (slice) settings.mix = [{ slice, share: 1 }];
     return settings;
   }
 }
@@ -366,22 +261,6 @@ export const presetName = (name) => name.replace(/-only$/, ' only');
 export const trainingData = ({ settings }) =>
   settings.mix.map(({ slice }) => displayName(slice.name)).join(' and ') || 'clean data';
 
-/** @param {SliceInfo} slice */
-const definition = ({ name, faults, contact, only }) => ({ name, faults, contact, only });
-
-/**
- * Returns the text of a slice, named after its definition.
- * @param {string} faults
- * @param {string} contact
- * @param {string} only
- */
-function customSlice(faults, contact, only) {
-  const phase = PHASES.find(([value]) => contact && value === contact)?.[1];
-  const parts = [faults.replace(/[:=]/g, ' ') || 'no faults', phase, only && `${only} only`];
-  const values = [`faults=${faults}`, contact && `contact=${contact}`, only && `only=${only}`];
-  return [parts.filter(Boolean).join(', '), ...values].filter(Boolean).join(':');
-}
-
 /** @param {typeof NUMBERS[number]} field */
 function numberField({ name, text, step, title }) {
   const input = create('input', { type: 'number', name, step: String(step), min: '0' });
@@ -389,23 +268,8 @@ function numberField({ name, text, step, title }) {
 }
 
 /**
- * @param {string} value
- * @param {string} text
- * @returns {[value: string, text: string]}
- */
-const pair = (value, text) => [value, text];
-
-/**
  * Splits `key=value`.
  * @param {string} text
  * @returns {[key: string, value: string]}
  */
 const twoParts = (text) => [text.split('=')[0], text.split('=')[1] ?? ''];
-
-/**
- * @param {HTMLSelectElement} select
- * @param {[value: string, text: string][]} options
- */
-function fill(select, options) {
-  select.replaceChildren(...options.map(([value, text]) => new Option(text, value)));
-}
