@@ -123,6 +123,13 @@ export const probabilityText = (probability) =>
   Number(probability.toFixed(2)) <= LARGEST ? probability.toFixed(2) : `above ${LARGEST}`;
 
 /**
+ * Returns a number with its noun: `1 episode`, `3 episodes`.
+ * @param {number} count
+ * @param {string} noun
+ */
+export const plural = (count, noun) => `${count} ${noun}${count === 1 ? '' : 's'}`;
+
+/**
  * Formats a share from 0 to 1 in percent.
  * @param {number | null | undefined} share
  */

@@ -9,7 +9,7 @@
 
 import { SHOWN } from '../core/constants.js';
 import { create, html } from '../core/dom.js';
-import { displayName, percent, sentence } from '../core/units.js';
+import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
 import { jobSummary } from '../widgets/jobs.js';
@@ -325,7 +325,7 @@ function aboutOf({
   statistics,
   unmeasured,
 }) {
-  const text = `${episodes} ${episodes === 1 ? 'episode' : 'episodes'} compared with ${healthy} healthy ones`;
+  const text = `${plural(episodes, 'episode')} compared with ${plural(healthy, 'healthy one')}`;
   const numbers = Object.entries(statistics).map(
     ([name, count]) => `${displayName(name)} ${count}`,
   );

@@ -19,7 +19,8 @@ export function causeItem(cause, open, actions) {
   const { probability, recovered, evidence, steps } = cause;
   const bar = create('meter', { min: 0, max: 1, value: probability });
   bar.setAttribute('aria-label', `Probability of ${cause.title}`);
-  const where = [`${plural('episode', cause.episodes)} ${cause.episodes.join(', ')}`];
+  const noun = cause.episodes.length === 1 ? 'episode' : 'episodes';
+  const where = [`${noun} ${cause.episodes.join(', ')}`];
   if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
   /** @type {HTMLElement[]} */
   const lines = [
@@ -94,9 +95,3 @@ function nextAction(text) {
  */
 export const withCode = (text) =>
   text.split('`').map((part, i) => (i % 2 ? create('code', { textContent: part }) : part));
-
-/**
- * @param {string} noun
- * @param {readonly unknown[]} list
- */
-const plural = (noun, list) => (list.length === 1 ? noun : `${noun}s`);

@@ -6,7 +6,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { element, html, messageOf } from '../core/dom.js';
-import { sentence } from '../core/units.js';
+import { plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelError, setPanelState } from '../widgets/panel_state.js';
@@ -254,7 +254,7 @@ export class Experiments {
     about.classList.toggle('wrong', matched.problem !== '');
     about.textContent =
       matched.problem ||
-      `${matched.rows.length} of ${this.#rows.length} results of ${checkpoints} ${checkpoints === 1 ? 'checkpoint' : 'checkpoints'} match${more}.${areGroups ? '' : cut}`;
+      `${matched.rows.length} of ${this.#rows.length} results of ${plural(checkpoints, 'checkpoint')} match${more}.${areGroups ? '' : cut}`;
     this.#report([...this.#problems, ...this.#unknownChoices(columns)].join(' '));
     this.#groupMenu.show(this.#rows, state.groups, areGroups);
     this.#matching = rows;

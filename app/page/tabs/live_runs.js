@@ -5,7 +5,7 @@
 /** @import { Catalog, ListedLiveRun, LiveList } from '../types/server.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { displayName } from '../core/units.js';
+import { displayName, plural } from '../core/units.js';
 import * as api from '../data/api.js';
 import { liveStatus } from '../data/live_stream.js';
 
@@ -316,7 +316,7 @@ function isReadable(run) {
 function statusLine(run) {
   if (run.message || !isReadable(run)) return run.message;
   const { state, steps, expected, available } = run;
-  const count = expected ? `${steps} of ${expected} steps` : `${steps} steps`;
+  const count = expected ? `${steps} of ${plural(expected, 'step')}` : plural(steps, 'step');
   const missing = available ? '' : ' · checkpoint not on this server (--filter)';
   return `${state === 'running' ? 'running' : 'ended'}, ${count}${missing}`;
 }

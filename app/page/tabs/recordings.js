@@ -9,7 +9,7 @@
 /** @import { TrashedFile } from './trash.js' */
 
 import { element, html, messageOf } from '../core/dom.js';
-import { formatBytes, sentence } from '../core/units.js';
+import { formatBytes, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { acceptDrops } from '../widgets/file_drop.js';
 import { FileTable } from '../widgets/file_table.js';
@@ -193,7 +193,7 @@ export class Recordings {
     this.#recordings.show(matches);
     this.#reports.show(reports.reports.filter((file) => this.#matches(file)));
     html('section.reports', this.#host).hidden = !reports.reports.length;
-    const total = `${all.length} recording${all.length === 1 ? '' : 's'}`;
+    const total = plural(all.length, 'recording');
     const count = matches.length < all.length ? `${matches.length} of ${total}` : total;
     const used = reports.reports.reduce((sum, { bytes }) => sum + bytes, recordings.bytes);
     html('.summary', this.#host).textContent =

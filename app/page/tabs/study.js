@@ -10,7 +10,7 @@
 
 import { element, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
-import { fixed, sentence } from '../core/units.js';
+import { fixed, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { BarChart } from '../widgets/bar_chart.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
@@ -359,7 +359,7 @@ function summary({ preset }, results, { quantity, start, filters }) {
   const opened = filters.flatMap(({ checkpoint }) => (checkpoint ? [checkpoint.seed] : []));
   const missing = filters.filter(({ checkpoint }) => !checkpoint).map(({ name }) => name);
   const seeds = Math.max(...filters.flatMap(({ rows }) => rows.map((row) => row.seeds)));
-  const training = `${seeds} seed${seeds === 1 ? '' : 's'} per filter, trained on ${results.data || 'unknown data'} (preset ${preset})`;
+  const training = `${plural(seeds, 'seed')} per filter, trained on ${results.data || 'unknown data'} (preset ${preset})`;
   const evaluation = (start && results.offset_data) || 'its test episodes';
   const text = `${quantity.description}, runs that start ${startLabel(start)}: ${training} and evaluated on ${evaluation}.`;
   if (!opened.length) return `${text} The weights are not available here.`;

@@ -3,7 +3,7 @@
 /** @import { DeletedFile } from '../types/server.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { formatBytes } from '../core/units.js';
+import { formatBytes, plural } from '../core/units.js';
 import { formatDate, smallNote } from './recording_columns.js';
 
 /** @typedef {{id: string, name: string, kind: 'recordings' | 'reports'}} TrashedFile */
@@ -59,8 +59,7 @@ export class Trash {
   show(files) {
     this.#host.hidden = !files.length;
     const size = formatBytes(files.reduce((sum, { bytes }) => sum + bytes, 0));
-    const count = `${files.length} file${files.length === 1 ? '' : 's'}`;
-    html('summary', this.#host).textContent = `Trash: ${count}, ${size}`;
+    html('summary', this.#host).textContent = `Trash: ${plural(files.length, 'file')}, ${size}`;
     this.#emptyButton.textContent = `Empty the trash (${size})`;
     html('ul', this.#host).replaceChildren(...files.map((file) => this.#item(file)));
   }

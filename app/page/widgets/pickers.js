@@ -7,7 +7,7 @@
 import { create, element } from '../core/dom.js';
 import { isComplete } from '../core/episodes.js';
 import { SPEEDS } from '../core/state.js';
-import { percent } from '../core/units.js';
+import { percent, plural } from '../core/units.js';
 import { checkSelection, episodes } from '../data/api.js';
 import { liveRunState } from '../tabs/live_runs.js';
 import { faultPicker } from './fault_dialog.js';
@@ -176,7 +176,7 @@ export function firstRun(task, state) {
 /** @param {EpisodeSummary} episode */
 export function episodeLabel({ index, policy, split, steps, contact_fraction, label }) {
   if (label) return label;
-  const parts = [index, policy, split, `${steps} steps`];
+  const parts = [index, policy, split, plural(steps, 'step')];
   if (contact_fraction !== null) parts.push(`contact ${percent(contact_fraction)}`);
   return parts.filter((part) => part !== '').join(' · ');
 }
