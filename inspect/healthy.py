@@ -16,7 +16,7 @@ from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
 from beliefscope.inspect.diagnosis.reading_checks import modelled_keys
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
-from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, pretrained_reference
 from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 from beliefscope.inspect.traces.batch import Progress, trace_all
@@ -113,13 +113,14 @@ def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> 
 
 
 def measure_profile(
-    filter_: Filter, name: str, episodes: Sequence[Episode], data: str, reference: Reference | None = None
+    filter_: Filter, name: str, episodes: Sequence[Episode], data: str, is_sample: bool = False
 ) -> dict[str, Any] | None:
     """JSON of the healthy profile of a trained filter over the held-out of the episodes; None if there are none.
 
-    data: where the episodes come from. reference: as for ``sensor_record``.
+    data: where the episodes come from. is_sample: whether they have the images of the pretrained filters' camera.
     """
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
-    return profile_of(Checkpoint(filter_, name, "", {}), held_out, data, sensor_record(held_out, reference)).to_json()
+    sensors = sensor_record(held_out, pretrained_reference(filter_.task) if is_sample else None)
+    return profile_of(Checkpoint(filter_, name, "", {}), held_out, data, sensors).to_json()

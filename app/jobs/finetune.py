@@ -19,7 +19,6 @@ from beliefscope.filters.finetuning.training_data import simulated_episodes, tra
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
 from beliefscope.inspect.compare.progress_log import ProgressLog, ProgressShares
 from beliefscope.inspect.compare.success import judge
-from beliefscope.inspect.diagnostics.healthy_profile import pretrained_reference
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import measure_profile
 
@@ -67,8 +66,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
         report(share("profile", 0.0), "measuring the healthy record")
-        images = pretrained_reference(base.task) if is_sample else None  # of the same camera
-        profile = measure_profile(result.filter, base.name, episodes, f"held-out episodes of {data_name}", images)
+        source = f"held-out episodes of {data_name}"
+        profile = measure_profile(result.filter, base.name, episodes, source, is_sample)
         save_checkpoint(result.filter, base.name, result.record, path, profile)
         finetuned = load_checkpoint(path)
         comparison = compare_checkpoints(

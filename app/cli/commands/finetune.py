@@ -117,7 +117,6 @@ def finetune(
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.finetuning.finetune import finetune as tune
     from beliefscope.filters.open_filter import open_filter
-    from beliefscope.inspect.diagnostics.healthy_profile import pretrained_reference
     from beliefscope.inspect.healthy import measure_profile
 
     opt.check_folder(log, "--log")
@@ -141,8 +140,7 @@ def finetune(
         with _progress(base, partial, log, rerun) as callbacks:
             tuned = tune(base, members, callbacks=callbacks, **source)
         assert tuned is not None, "runs without a stop callback always complete"
-        images = pretrained_reference(base.task) if data is None else None  # of the same camera
-        profile = measure_profile(tuned.filter, base.name, members, command, images)
+        profile = measure_profile(tuned.filter, base.name, members, command, is_sample=data is None)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
