@@ -65,7 +65,7 @@ def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
         return max(-1.0, 1.0 - 2.0 * unequal) if len(shift) > 1 else 0.0
     if target == "mirrored":
         distance = np.abs(value + healthy) / np.maximum(np.abs(shift), 1e-9)
-        # Those that hardly deviate may have no part in it.
+        # Statistics that hardly deviate may have no part in it.
         informative = np.minimum(1.0, np.abs(healthy) / width) * np.square([d.t for d in deviations])
         fits = np.maximum(1.0 - 2.0 * distance, -1.0)
         return float((informative * fits).sum() / max(informative.sum(), 1e-9))

@@ -1,4 +1,4 @@
-/** The weaknesses of a filter, one of which a fine-tuning addresses. */
+/** The weaknesses of a filter; a fine-tuning addresses one of them. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Weakness } from '../types/server.js' */
