@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -53,9 +53,9 @@ def sensor_record(episodes: Sequence[Episode], reference: Reference | None = Non
     keys = modelled_keys(episodes[0].task) if episodes else []
     groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
     models = fit_reading_models(episodes, keys)
-    noise = {(model.key, model.channels): model.noise for model in models}
+    by_channels = {(model.key, model.channels): model for model in models}
     fold_models = [
-        [replace(m, noise=noise.get((m.key, m.channels), m.noise)) for m in fit_reading_models(group, keys)]
+        [m.with_noise_of(by_channels.get((m.key, m.channels), m)) for m in fit_reading_models(group, keys)]
         for group in groups
     ]
     references = [reference or measure_reference(group) for group in groups]
@@ -86,7 +86,8 @@ def profile_of(
     particles = None
     try:
         for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=progress):
-            rows.append(episode_statistics(trace, checkpoint, sensors.rows[trace.episode_index]))
+            own = sensors.rows[trace.episode_index]
+            rows.append(episode_statistics(trace, checkpoint, own, sensors.readings))
             particles = trace.particle_count
     except BadInput as error:
         if not isinstance(checkpoint, ExternalFilter):  # which run together

@@ -94,7 +94,10 @@ def deviations(case: Case) -> dict[str, float]:
     profile = HealthyProfile.from_json(case.checkpoint.healthy_profile)
     rows = [
         episode_statistics(
-            trace, case.checkpoint, sensor_statistics(trace.episode, profile.reference, profile.readings)
+            trace,
+            case.checkpoint,
+            sensor_statistics(trace.episode, profile.reference, profile.readings),
+            profile.readings,
         )
         for trace in traces_of(case)
     ]

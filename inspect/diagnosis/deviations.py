@@ -87,7 +87,7 @@ class Case:
 def observe(trace: Trace, checkpoint: Checkpoint, profile: HealthyProfile) -> tuple[dict[str, float], dict[str, float]]:
     """All statistics of a run, and those of its sensors only."""
     sensors = sensor_statistics(trace.episode, profile.reference, profile.readings)
-    return episode_statistics(trace, checkpoint, sensors), sensors
+    return episode_statistics(trace, checkpoint, sensors, profile.readings), sensors
 
 
 def examine_again(case: Case, inputs: RunInputs, traces: Sequence[Trace]) -> Case:
@@ -100,7 +100,7 @@ def examine_again(case: Case, inputs: RunInputs, traces: Sequence[Trace]) -> Cas
         if same is None:
             same = sensor_statistics(trace.episode, profile.reference, profile.readings)
         sensors.append(same)
-        rows.append(episode_statistics(trace, inputs.checkpoint, sensors[-1]))
+        rows.append(episode_statistics(trace, inputs.checkpoint, same, profile.readings))
     return compared(inputs, traces, rows, sensors, profile, case.alarm_rate)
 
 

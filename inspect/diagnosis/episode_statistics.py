@@ -13,6 +13,7 @@ from beliefscope.inspect.diagnosis.label_checks import common_part, label_statis
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.trace import Trace
 
 SCATTER = {
@@ -33,16 +34,20 @@ MIN_COMMON = 3
 """Minimum number of episodes with a common part."""
 
 
-def episode_statistics(trace: Trace, checkpoint: Checkpoint, sensors: Mapping[str, float]) -> dict[str, float]:
+def episode_statistics(
+    trace: Trace, checkpoint: Checkpoint, sensors: Mapping[str, float], readings: Sequence[ReadingModel] = ()
+) -> dict[str, float]:
     """``KIND/SUBJECT/PHASE`` -> value, of all diagnostics that apply to the trace, of sensors, labels and modules.
 
-    sensors: statistics of the episode's sensors, which do not depend on the filter (``sensor_statistics``).
+    Args:
+        sensors: statistics of the episode's sensors, which do not depend on the filter (``sensor_statistics``).
+        readings: models of the healthy record.
     """
     values: dict[str, float] = {}
     for entry in DIAGNOSTICS.values():
         if entry.statistics is not None and entry.refusal(trace, None) is None:
             values |= entry.statistics(trace)
-    return {**values, **sensors, **label_statistics(trace), **model_statistics(trace, checkpoint)}
+    return {**values, **sensors, **label_statistics(trace), **model_statistics(trace, checkpoint, readings)}
 
 
 def _distance(values: Array, kind: str) -> Array:

@@ -6,7 +6,7 @@ Measurement models are compared with the true state of their step; the dynamics 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -24,10 +24,12 @@ from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
+from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.signals import lag
 from beliefscope.inspect.trace import Trace
 
@@ -52,18 +54,22 @@ LARGEST = 0.9999
 MIN_PATH = 0.3
 """Minimum path of a component for a slope of the dynamics, in standard deviations of the training data."""
 
+ROUNDING = 1e-12
+"""Largest variance that a prediction adds by rounding, relative to that of the states."""
+
 MIN_STEPS = 10
 """Minimum number of steps of a statistic."""
 
 
-def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
+def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[ReadingModel] = ()) -> dict[str, float]:
     """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules; of an external filter those of its reported values.
 
-    Statistics that do not apply are absent.
+    Statistics that do not apply are absent, such as those of measurement functions without models of the readings.
     """
     has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
     if external:
         values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
+        values |= measurement_model_statistics(trace, readings)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if has_truth:
@@ -242,7 +248,7 @@ def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
     if covariance is not None and trace.has_covariance:
         added = covariance[1:] - trace.estimate_covariance[:-1].astype(np.float64)
         variance = np.median(np.diagonal(added, axis1=-2, axis2=-1)[keep], axis=0)
-        variance = np.where(variance > 0.0, variance, np.nan)
+        variance = np.where(variance > ROUNDING * np.square(states.std(0)), variance, np.nan)
         more |= {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
     return _of_changes(task, residual, change, more, states.std(0))
 

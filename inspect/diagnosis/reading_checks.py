@@ -9,9 +9,9 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, axis_name, commands_hand
+from beliefscope.inspect.statistics.reading_features import FIRST_CHANGES
 from beliefscope.inspect.statistics.reading_model import (
     CONTROL,
-    FIRST_CHANGES,
     ComparedReadings,
     ReadingModel,
     readings_of,

@@ -83,8 +83,8 @@ class HealthyProfile:
             }
             data, images = str(document["data"]), document.get("reference")
             reference = None if images is None else Reference.from_json(images)
-            # Models without limits are of an earlier version, with other features.
-            models = (model for model in document.get("readings", ()) if "limits" in model)
+            # Other models are of an earlier version, with other features.
+            models = (model for model in document.get("readings", ()) if "of_channels" in model)
             readings = tuple(map(ReadingModel.from_json, models))
             steps = document.get("steps")
             lengths = None if steps is None else (int(steps[0]), int(steps[1]))

@@ -78,10 +78,11 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
 def prediction(trace: Trace) -> tuple[Array, Array | None] | None:
     """Mean (T, n) and covariance (T, n, n) of the belief before all updates of a step; None if it is not reported.
 
-    Of a filter that reports the belief before each of several updates, it is the least certain one.
+    Of a filter that reports the belief before each of several updates, it is the least certain one, and of a particle
+    filter that of the particles with their weights before the observation.
     """
     if trace.predicted_mean is None:
-        return None
+        return _predicted_particles(trace)
     mean = trace.predicted_mean.astype(np.float64)
     covariance = None if trace.predicted_covariance is None else trace.predicted_covariance.astype(np.float64)
     if np.allclose(mean, mean[:, :1], rtol=1e-3):
@@ -90,6 +91,18 @@ def prediction(trace: Trace) -> tuple[Array, Array | None] | None:
         return None
     steps, first = np.arange(len(mean)), np.linalg.slogdet(covariance)[1].argmax(1)
     return mean[steps, first], covariance[steps, first]
+
+
+def _predicted_particles(trace: Trace) -> tuple[Array, Array] | None:
+    """Moments of the particles with their prior weights; None without these, or if not all particles are kept."""
+    if trace.particles is None or trace.prior_log_weights is None or trace.all_particles_ess is not None:
+        return None
+    particles, start = trace.particles.astype(np.float64), trace.particles[:, 0].astype(np.float64)
+    weights = np.exp(trace.prior_log_weights.astype(np.float64))
+    from_start = trace.task.difference(particles, start[:, None])  # angles may wrap around
+    mean = np.einsum("tm,tmn->tn", weights, from_start)
+    around = from_start - mean[:, None]
+    return start + mean, np.einsum("tm,tmi,tmj->tij", weights, around, around)
 
 
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -9,12 +10,17 @@ from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER
 
+
+def _dynamics(*kinds: str) -> str:
+    """Patterns of statistics of the dynamics."""
+    return "|".join(f"dynamics {kind}/*" for kind in kinds)
+
+
 DRIFT = Cause(
     "dynamics.drift",
     "Dynamics biased, differently in each episode",
     (Symptom("dynamics scatter/*"),),
-    "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "nis", "offset", "spread"))
-    + f"|process noise/*|{FILTER}",
+    f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|{FILTER}",
     "Check the bias of its inputs that the filter should estimate.",
     prior=0.1,
 )
@@ -23,24 +29,28 @@ DRIFT = Cause(
 
 def external_causes(task: Task) -> tuple[Cause, ...]:
     """Causes that show in the predictions and innovations of an external filter only."""
-    return (DRIFT, *(cause for modality in task.modalities for cause in _of_updates(modality)))
+    return (DRIFT, *(cause for modality, keys in task.modalities.items() for cause in _of_updates(modality, keys)))
 
 
 def in_predictions(cause: Cause) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates."""
     changed = {
-        "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*",
-        "process_noise": "|".join(f"dynamics {kind}/*" for kind in ("bias", "error", "offset", "spread")),
+        "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
+        "process_noise": _dynamics("bias", "error", "offset", "spread"),
+        "measurement": _dynamics("bias", "error", "nis", "offset", "scatter", "spread"),
     }
-    others = f"{DYNAMICS}|process noise/*"
-    consequences = f"{cause.consequences}|{changed.get(cause.component, others)}"
+    others = f"{DYNAMICS}|process noise/*|measurement function/*"
+    consequences = f"{cause.consequences}|{changed.get(cause.name.partition('.')[0], others)}"
     # Predicted changes that are too small, such as those of a shorter time step, add too little noise as well.
+    if cause.name == "dynamics.frozen":  # the spread of predictions depends on the process noise of particles
+        cause = replace(cause, symptoms=(Symptom("dynamics slope/*", -1),))
+        consequences += "|dynamics spread/*"
     is_smaller = cause.name in ("dynamics.frozen", "dynamics.inverted")
     lowers = f"{cause.lowers}|process noise/*" if is_smaller else cause.lowers
     return replace(cause, consequences=consequences, lowers=lowers)
 
 
-def _of_updates(modality: str) -> tuple[Cause, ...]:
+def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
     """Causes in the updates with a modality.
 
     Where modalities are always used together, only the mean of their measurement noise is known, and the innovations
@@ -68,11 +78,18 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
     return (
         *noise,
         Cause(
+            f"measurement.{modality}.function",
+            f"Measurement function of {name} wrong",
+            (Symptom("|".join(f"measurement function/{key}/*|measurement function/{key} */*" for key in keys)),),
+            FILTER,
+            f"Compare h of {name} at the true states with its readings: positions of landmarks, units, signs.",
+        ),
+        Cause(
             f"measurement.{modality}.bias",
             f"Measurement function of {name} biased",
             (Symptom(f"innovation bias/{modality} *", 0),),
             FILTER,
-            f"Compare h of {name} at the true states with its readings: positions of landmarks, offsets, units.",
+            f"Compare h of {name} at the true states with its readings: offsets, positions of landmarks.",
             prior=-0.6,
         ),
         Cause(

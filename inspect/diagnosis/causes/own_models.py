@@ -9,6 +9,7 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import data, fusion, model
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.own_sensors import KNOWN
+from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics.reference_images import HAND
 
@@ -36,7 +37,7 @@ def _models(task: Task) -> tuple[Cause, ...]:
 def _labels(task: Task) -> tuple[Cause, ...]:
     """Delayed labels of tasks without a measured hand: behind all modalities and, if these cause changes, the controls.
 
-    A faulty sensor can make a single modality appear early.
+    A faulty sensor can make a single modality appear early, so each of them counts.
     """
     if HAND in task.observations:
         return ()
@@ -44,7 +45,8 @@ def _labels(task: Task) -> tuple[Cause, ...]:
     (_, dynamics) = delay.symptoms
     lag = Symptom("lag/labels/*|lag/dynamics/*", 1, 2.0, otherwise=(Symptom("reading lag/*", -1),))
     controls = Symptom("reading lag/control/*", -1, optional=True)
-    return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls)),)
+    sensors = [Symptom(f"reading lag/{key}/*", -1, optional=True) for key in modelled_sensors(task)]
+    return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls, *sensors)),)
 
 
 def _controls(task: Task) -> tuple[Cause, ...]:

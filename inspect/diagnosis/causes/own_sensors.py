@@ -209,7 +209,11 @@ def _delays(task: Task) -> tuple[Cause, ...]:
             changed += f"|{_patterns(TORQUE, '*')}"
         alone = HAND not in task.observations and len(task.modalities[modality]) == 1
         otherwise = (Symptom(f"lag/labels {modality}/*", -1),) if alone else ()
-        symptoms = (Symptom(f"contact lag/{key}/*|reading lag/{key}/*", otherwise=otherwise),)
+        # The delay of a modality is exact only if its estimates are: one of the readings is preferred.
+        symptoms = (
+            Symptom(f"contact lag/{key}/*|reading lag/{key}/*", otherwise=otherwise),
+            Symptom(f"reading lag/{key}/*", weight=2.0, optional=True),
+        )
         title = f"Sensor {display_name(key)} delayed"
         result.append(Cause(f"{key}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {key}"))
     return tuple(result)

@@ -1,0 +1,109 @@
+"""Measurement models of an external filter against the healthy record's models of the readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
+from beliefscope.inspect.diagnosis.vector_checks import axis_name
+from beliefscope.inspect.statistics.innovations import prediction
+from beliefscope.inspect.statistics.measures import counted
+from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
+from beliefscope.inspect.statistics.signals import wrapped
+from beliefscope.inspect.trace import Trace
+
+LIKELIHOODS, PARTICLES = 40, 60
+"""Largest numbers of steps and of particles whose likelihoods are compared, evenly spaced."""
+
+
+def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
+    """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of the measurement noise."""
+    return _functions(trace, models) | _likelihoods(trace, models)
+
+
+def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
+    """``measurement function/CHANNEL/all``: root mean square error of h(x) in the noise of the readings, by channel.
+
+    The filter has h(x) = z - nu at a state x from the prediction to the estimate: one update may follow another. The
+    healthy record's model of the sensor expects readings g there, and h(x) may be between those at both ends. Neither
+    the sensor nor the dynamics matter. Of innovations with the channels of the sensors.
+    """
+    predicted = prediction(trace)
+    if trace.innovation is None or predicted is None or trace.task.rotations:
+        return {}
+    ends = [replace(trace.episode, states=x.astype(np.float32)) for x in (predicted[0], trace.estimate_mean)]
+    by_key, keep = {model.key: model for model in models}, counted(trace)
+    values: dict[str, float] = {}
+    for k, modality in enumerate(trace.modalities):
+        start = 0
+        for key in trace.task.modalities.get(modality, ()):
+            shape, model = trace.task.observations[key], by_key.get(key)
+            columns = [] if model is None else [start + i for i in model.channels]
+            start += math.prod(shape)
+            if model is None or max(columns) >= trace.innovation.shape[-1]:
+                continue
+            h = readings_of(trace.episode, key)[:, model.channels] - trace.innovation[:, k, columns]
+            errors = [h - g for end in ends if (g := model.expected(end)) is not None]
+            if len(errors) < len(ends):
+                continue
+            first, last = (np.where(model.is_angle, wrapped(error), error)[keep] for error in errors)
+            outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first) / model.noise
+            for i, channel in enumerate(model.channels):
+                known = outside[np.isfinite(outside[:, i]), i]
+                if len(known) >= MIN_STEPS:
+                    name = f"measurement function/{axis_name(key, channel, shape[0])}/all"
+                    values[name] = float(np.sqrt(np.square(known).mean()))
+    return values
+
+
+def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
+    """``measurement noise/MODALITY/all`` and ``measurement function/CHANNEL/all`` of a particle filter.
+
+    Its log-likelihoods over the particles of a step are ``c + sum_i s_i (b_i e_i - e_i^2 / 2)``, with the errors e of
+    the readings expected at the particles, relative to their noise: s are the inverse ratios of the variances, and b
+    the errors of its measurement function. Medians over the steps, of b without its sign; the noise is the geometric
+    mean of the standard deviations of all channels. Of modalities whose readings follow from the state alone.
+    """
+    likelihood, particles = trace.log_likelihood, trace.particles
+    if likelihood is None or particles is None or trace.task.rotations:
+        return {}
+    by_key, values = {model.key: model for model in models}, {}
+    every = np.s_[:: 1 + particles.shape[1] // PARTICLES]
+    for k, modality in enumerate(trace.modalities):
+        own = [by_key.get(key) for key in trace.task.modalities.get(modality, ())]
+        sensors = [model for model in own if model is not None and model.is_complete(trace.episode)]
+        at = counted(trace) & np.isfinite(likelihood[:, k]).all(-1)
+        at = np.logical_and.reduce([at, *(trace.episode.present(model.key) for model in sensors)])
+        steps = np.flatnonzero(at)[:: 1 + int(at.sum()) // LIKELIHOODS]
+        if not sensors or len(sensors) < len(own) or len(steps) < MIN_STEPS:
+            continue
+        states = particles[steps][:, every]
+        there = Episode(trace.task, states.reshape(-1, states.shape[-1]))
+        errors = []
+        for model in sensors:
+            readings, expected = readings_of(trace.episode, model.key)[steps, None], model.expected(there)
+            assert expected is not None  # is_complete
+            error = readings - expected.reshape(*states.shape[:2], -1)
+            errors.append(np.where(model.is_angle, wrapped(error), error) / model.noise)
+        e = np.concatenate(errors, axis=-1)  # (S, P, A)
+        columns = np.concatenate([e, -0.5 * np.square(e)], axis=-1)
+        columns, y = (
+            v - v.mean(1, keepdims=True) for v in (columns, likelihood[steps, k][:, every, None].astype(float))
+        )
+        scale = np.maximum(np.abs(columns).max(1, keepdims=True), 1e-12)
+        fit = (np.linalg.pinv(columns / scale, rcond=1e-6) @ y / scale.mT)[..., 0]  # (S, 2 A): s b and s
+        count = e.shape[-1]
+        power = np.median(fit[:, count:], axis=0)
+        if not (power > 0.0).all():
+            continue
+        noise = np.concatenate([model.noise for model in sensors]) / np.sqrt(power)
+        values[f"measurement noise/{modality}/all"] = float(np.exp(np.log(noise).mean()))
+        bias = np.median(np.abs(fit[:, :count] / power), axis=0).tolist()
+        names = [axis_name(m.key, i, len(m.channels)) for m in sensors for i in m.channels]
+        values |= {f"measurement function/{name}/all": b for name, b in zip(names, bias, strict=True)}
+    return values

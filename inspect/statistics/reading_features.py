@@ -1,0 +1,111 @@
+"""Features of the labels from which the readings of a sensor are expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Task
+from beliefscope.inspect.statistics.reference_images import CONTACT
+from beliefscope.inspect.statistics.signals import Array
+
+Indices = NDArray[np.intp]
+
+FIRST_CHANGES = 2
+"""First step with all features, which need two earlier ones."""
+
+GRID = 15
+"""Number of places along each axis among which a landmark is searched."""
+
+ZOOMS, ZOOM = 7, 0.35
+"""Number of searches, and size of each relative to the one before; the first is twice as large as the positions."""
+
+SEARCHED = 400
+"""Largest number of positions that the search compares."""
+
+
+def features(episode: Episode) -> tuple[Array, list[Indices]]:
+    """(T, F): the state, its first and second changes by step, all in the body frame, and all of them in contact.
+
+    Angles that wrap have their cosine and sine as well, rotations are their matrices. Changes are zero where they are
+    unknown, at the first two steps. Also returns the groups of features among which the model of a channel chooses, as
+    their indices.
+    """
+    task, states = episode.task, episode.states.astype(np.float64)
+    change, second = np.zeros((2, *states.shape))
+    change[1:] = task.difference(states[1:], states[:-1])
+    second[2:] = change[2:] - change[1:-1]
+    others, frames = _values(task, states)
+    vectors = np.concatenate([others, change, second], axis=1)
+    in_frames = (frames[:, :, None] * vectors[:, None]).reshape(len(states), -1)
+    all_ = np.concatenate([others, frames, change, second, in_frames], axis=1)
+    if CONTACT in task.covariates:
+        contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
+        all_ = np.concatenate([all_, contact, contact * all_], axis=1)
+    index, state = np.arange(all_.shape[1]), others.shape[1] + frames.shape[1]
+    return all_, [index[:state], index[: state + 2 * states.shape[1]], index]
+
+
+def positions(task: Task, states: Array) -> Array:
+    """(T, p): the two components of the map, and a third one in their unit; (T, 0) without two positions."""
+    turning = {*task.angles, *(i for at in task.rotations for i in range(at.start, at.stop))}
+    chosen = [i for i in task.map_indices if i not in turning]
+    units = {task.components[i].unit for i in chosen}
+    chosen += [i for i, c in enumerate(task.components) if c.unit in units and i not in (*chosen, *turning)][:1]
+    return states[:, chosen if len(units) == 1 and len(chosen) > 1 else []]
+
+
+def landmark_features(places: Array, landmark: Array) -> Array:
+    """(..., T, 3) distance of positions (T, p) to landmarks (..., p), and cosine and sine of their direction."""
+    relative = landmark[..., None, :] - places
+    distance = np.linalg.norm(relative, axis=-1, keepdims=True)
+    plane = np.linalg.norm(relative[..., :2], axis=-1, keepdims=True)
+    return np.concatenate([distance, relative[..., :2] / np.maximum(plane, 1e-12)], axis=-1)
+
+
+def find_landmark(places: Array, targets: Array) -> Array:
+    """(p,) the place whose distance from the positions (S, p), or whose direction, predicts the targets best.
+
+    A search on a grid, and on finer ones around the best place.
+
+    Args:
+        targets: (S, 1) readings, or (S, 2) cosine and sine of an angle.
+    """
+    chosen = np.s_[:: 1 + len(places) // SEARCHED]
+    places, targets = places[chosen], targets[chosen]
+    middle, size = places.mean(0), 2.0 * np.ptp(places, axis=0)
+    for _ in range(ZOOMS):
+        axes = [m + s * np.linspace(-0.5, 0.5, GRID) for m, s in zip(middle, size, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(middle))
+        middle = grid[_agreement(landmark_features(places, grid), targets).argmax()]
+        size = ZOOM * size
+    return middle
+
+
+def _agreement(inputs: Array, targets: Array) -> Array:
+    """(G,) squared correlation of readings with distances, or of angles with directions, for inputs (G, S, 3)."""
+    if targets.shape[1] > 1:  # directions may have the opposite sign
+        direction, angle = inputs[..., 1] + 1j * inputs[..., 2], targets[:, 0] + 1j * targets[:, 1]
+        return np.asarray(np.maximum(*(np.abs((angle * d).mean(1)) for d in (direction, direction.conj()))))
+    x, y = inputs[..., 0] - inputs[..., 0].mean(1, keepdims=True), targets[:, 0] - targets.mean()
+    return np.asarray(np.square(x @ y) / np.maximum(np.square(x).sum(1) * np.square(y).sum(), 1e-24))
+
+
+def _values(task: Task, states: Array) -> tuple[Array, Array]:
+    """State components (T, V) that do not jump, and those (T, R) that turn vectors of the world into the body frame.
+
+    Angles that wrap around are among both, unwrapped.
+    """
+    turning = {i for i, c in enumerate(task.components) if c.wraps}
+    rotated = {i for at in task.rotations for i in range(at.start, at.stop)}
+    others = [np.unwrap(x, axis=0) if i in turning else x for i, x in enumerate(states.T) if i not in rotated]
+    functions: tuple[Callable[[Array], Array], ...] = (np.cos, np.sin)
+    frames = [f(states[:, i]) for i in turning for f in functions]
+    if task.rotations:
+        from scipy.spatial.transform import Rotation  # takes most of a second
+
+        frames += [x for at in task.rotations for x in Rotation.from_rotvec(states[:, at]).as_matrix().reshape(-1, 9).T]
+    return np.array(others).T.reshape(len(states), -1), np.array(frames).T.reshape(len(states), -1)
