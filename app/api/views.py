@@ -31,7 +31,7 @@ class ViewRequest(RequestBody):
 
 def routes(views: Views) -> APIRouter:
     router = APIRouter()
-    scene = client_page("/static/scene/viser_frame_throttle.js")
+    scene = client_page()
     scene_tag = hashlib.sha256(scene).hexdigest()[:24]
 
     @router.post("/api/views", status_code=201)

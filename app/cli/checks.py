@@ -137,7 +137,7 @@ def page(_: Place) -> Finding:
     if missing:
         advice = "reinstall beliefscope, rerun-notebook and uplot-python"
         return Finding(f"{', '.join(missing)} missing", "failed", advice)
-    client_page("/static/scene/viser_frame_throttle.js")
+    client_page()
     versions = (f"{name} {importlib.metadata.version(name)}" for name in ("rerun-notebook", "viser", "uplot-python"))
     return Finding(f"all files present: {', '.join(versions)}")
 

@@ -184,7 +184,7 @@ def task_catalogs(
         if name not in TASKS or catalog.user_data or catalog.user_filters
     }
     built_in = {name: catalogs.get(name, TaskCatalog(task, saved)) for name, task in TASKS.items()}
-    return own | {name: catalog for name, catalog in built_in.items() if name not in own}, problems
+    return own | built_in, problems
 
 
 def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, saved: SavedFilters | None, source: str) -> TaskCatalog:

@@ -39,23 +39,20 @@ log = logging.getLogger("beliefscope.app")
 _process_lock = threading.Lock()
 
 
-CLIENT_STYLE = """<style>
+CLIENT_HEAD = """<style>
 [data-floating-window] { display: none !important; }
 body, div:has(> div > div > div > canvas) { background: none !important; }
-</style>"""
+</style><script src="/static/scene/viser_frame_throttle.js"></script>"""
 """Hides viser's control panel, as the page has the controls of the scene, and its background, which is almost black in
-the dark theme: the page's is behind it."""
+the dark theme: the page's is behind it. The script precedes viser's own."""
 
 
-def client_page(script: str) -> bytes:
-    """viser's client page without its control panel and with a script before its own.
-
-    Raises RuntimeError if the page has no head.
-    """
+def client_page() -> bytes:
+    """viser's client page with ``CLIENT_HEAD``. Raises RuntimeError if the page has no head."""
     before, head, after = CLIENT_PAGE.read_bytes().partition(b"<head>")
     if not head:
         raise RuntimeError(f"the client page of viser {viser.__version__} has no <head>")
-    return before + head + f'{CLIENT_STYLE}<script src="{script}"></script>'.encode() + after
+    return before + head + CLIENT_HEAD.encode() + after
 
 
 class _Connection:

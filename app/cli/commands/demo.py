@@ -22,6 +22,6 @@ def demo(
     from beliefscope.app.runs.settings import Settings
     from beliefscope.app.server import logs
 
-    logs.configure("warning", "text", "")
+    logs.configure()
     with tempfile.TemporaryDirectory(prefix="beliefscope-") as workspace:
         serve_page(Settings(Path(workspace)), port=port, open_page=open_page)

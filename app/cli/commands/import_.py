@@ -59,7 +59,6 @@ def import_(
       beliefscope import drive.mcap --map map.toml -o drive.h5
     """
     from beliefscope.datasets.dataset import SPLITS
-    from beliefscope.datasets.dataset_statistics import component_ranges
     from beliefscope.recordings.log_readers.column_map import read_map
     from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
     from beliefscope.recordings.log_readers.guess import guess_map
@@ -86,33 +85,34 @@ def import_(
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {plural(len(episodes), 'episode')}")
         result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
-        ranges = {"dt": episodes[episode].dt, "ranges": component_ranges([episodes[episode]])}
-        return replace(result, document={**result.document, **ranges}, text=f"{result.text}, {_values(ranges)}")
+        values, text = _values([episodes[episode]])
+        return replace(result, document={**result.document, **values}, text=f"{result.text}, {text}")
     return _data_set(episodes, output)
 
 
 def _data_set(episodes: list[Episode], output: Path) -> console.Result:
     from beliefscope.datasets.dataset import SPLITS
-    from beliefscope.datasets.dataset_statistics import component_ranges
     from beliefscope.datasets.store import write_dataset
     from beliefscope.recordings.log_readers.read_log import check_complete
 
     check_complete(episodes)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
-    ranges = {"dt": episodes[0].dt, "ranges": component_ranges(episodes)}
-    document = {"task": episodes[0].task.name, "episodes": len(episodes), "steps": steps} | ranges
+    values, text = _values(episodes)
     splits = {name: sum(episode.split == name for episode in episodes) for name in SPLITS}
-    document["splits"] = splits
+    document = {"task": episodes[0].task.name, "episodes": len(episodes), "steps": steps, **values, "splits": splits}
     parts = ", ".join(f"{number} {name}" for name, number in splits.items() if number)
-    text = f"{plural(len(episodes), 'episode')} ({parts}) of {episodes[0].task.name}, {plural(steps, 'step')}"
-    return console.Result(document, f"{text}, {_values(ranges)}", output)
+    size = f"{plural(len(episodes), 'episode')} ({parts}) of {episodes[0].task.name}, {plural(steps, 'step')}"
+    return console.Result(document, f"{size}, {text}", output)
 
 
-def _values(document: dict[str, Any]) -> str:
-    """Duration of a step and ranges of the components as text."""
-    parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in document["ranges"].items()]
-    return "; ".join([f"{document['dt']:.4g} s each", *parts])
+def _values(episodes: list[Episode]) -> tuple[dict[str, Any], str]:
+    """Duration of a step and ranges of the components, as JSON values and as text."""
+    from beliefscope.datasets.dataset_statistics import component_ranges
+
+    dt, ranges = episodes[0].dt, component_ranges(episodes)
+    parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in ranges.items()]
+    return {"dt": dt, "ranges": ranges}, "; ".join([f"{dt:.4g} s each", *parts])
 
 
 def _written(trace: Trace, output: Path) -> console.Result:
