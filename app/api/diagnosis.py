@@ -5,7 +5,7 @@ Another job measures the healthy record of a filter that has none.
 """
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
@@ -143,7 +143,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def find_cause(selection: RequestedRun, over: Over = "episode") -> JobReply:
         arguments = _arguments(store, selection, over)
         scope = "" if over == "episode" else plural(len(arguments["episodes"]), "held-out episode")
-        title, link = f"Diagnosis of {selection.describe(scope)}", _link(selection, arguments["data"], over)
+        title = f"Diagnosis of {selection.describe(scope)}"
+        link = replace(selection, data=arguments["data"]).link("diagnosis", over=over)
         return JobReply(job=jobs.submit("diagnosis", title, arguments, link=link))
 
     @router.get(
@@ -154,7 +155,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
     def search_repair(selection: RequestedRun) -> JobReply:
-        link = _link(selection, store.dataset(selection.task, selection.data)[0], "episode")
+        named = replace(selection, data=store.dataset(selection.task, selection.data)[0])
+        link = named.link("diagnosis", over="episode")
         title = f"Smallest repair of {selection.describe()}"
         return JobReply(job=jobs.submit("repair", title, _repair_arguments(store, selection), link=link))
 
@@ -182,12 +184,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return JobReply(job=job)
 
     return router
-
-
-def _link(selection: Selection, data: str, over: str) -> str:
-    """The page's address that shows the result."""
-    run = {"task": selection.task, "filter": selection.filter, "data": data, "faults": str(selection.faults)}
-    return page_link(**run, episode=selection.episode, over=over, tab="diagnosis")
 
 
 def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> Any:

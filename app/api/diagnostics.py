@@ -12,7 +12,6 @@ from beliefscope.app.api.models import JobReply, Progress, Reply, ResultViews, f
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
-from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -111,7 +110,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         _check(entry, store.request(selection))
         arguments = _arguments(store, entry, selection, options, episodes)
         scope = f"all {plural(len(arguments['selections']), 'held-out episode')}" if episodes else ""
-        title, link = f"{entry.title} of {selection.describe(scope)}", _link(entry, selection, options, episodes)
+        state = {"over": episodes, "diagnostic": entry.name, "options": urlencode(options)}
+        title, link = f"{entry.title} of {selection.describe(scope)}", selection.link("diagnostics", **state)
         return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
 
     return router
@@ -134,10 +134,3 @@ def _arguments(
         "keys": [store.key(item) for item in selections],
         "record": store.record_version(selection.task, selection.filter),
     }
-
-
-def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:
-    """The page's address that shows the result."""
-    query = {"task": run.task, "filter": run.filter, "data": run.data, "faults": str(run.faults), "over": episodes}
-    parts = {"diagnostic": entry.name, "options": urlencode(options)}
-    return page_link(**query, **parts, episode=run.episode, tab="diagnostics")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 from urllib.parse import parse_qsl
 
+from beliefscope.app.protocol.permalinks import page_link
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.inspect.traces.replay import Intervention
@@ -35,6 +36,11 @@ class Selection:
         """The run in words, for titles. scope: episodes, by default that of the run."""
         run = f"{self.filter}, {self.task}{f', {scope}' if scope else f' episode {self.episode}'}"
         return run + (f", {self.faults}" if self.faults else "")
+
+    def link(self, tab: str, **state: str | None) -> str:
+        """The page's address that shows the run in a tab, with other parts of the page's state."""
+        run = {"task": self.task, "filter": self.filter, "data": self.data, "faults": str(self.faults)}
+        return page_link(**run, episode=self.episode, **state, tab=tab)
 
     @property
     def file_stem(self) -> str:
