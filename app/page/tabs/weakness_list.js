@@ -1,4 +1,4 @@
-/** The weaknesses of a filter; a fine-tuning addresses one of them. */
+/** List of the weaknesses of a filter; a fine-tuning addresses the selected one. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Weakness } from '../types/server.js' */
