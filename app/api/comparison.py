@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import FastAPI, Query
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.models import ResultViews
@@ -20,10 +20,8 @@ class Comparison(ResultViews):
     intervention: str | None
 
 
-def routes(store: TraceStore) -> APIRouter:
-    router = APIRouter()
-
-    @router.get("/api/compare/{task}/{filter}/{episode}", response_model=Comparison, responses=IN_PROGRESS)
+def add_routes(app: FastAPI, store: TraceStore) -> None:
+    @app.get("/api/compare/{task}/{filter}/{episode}", response_model=Comparison, responses=IN_PROGRESS)
     def comparison(selection: RequestedRun, against: Annotated[str, Query(min_length=1)]) -> Response:
         other = selection.comparison(against)
         store.request(other)  # starts it
@@ -35,8 +33,6 @@ def routes(store: TraceStore) -> APIRouter:
             views = compare(run.trace, other_run.trace, intervention).views()
         text = None if intervention is None else str(intervention)
         return JSONResponse({"names": names, "intervention": text, **views})
-
-    return router
 
 
 def _names(run: Selection, other: Selection) -> tuple[str, str]:

@@ -8,7 +8,7 @@ import json
 from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query
+from fastapi import FastAPI, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
@@ -122,10 +122,8 @@ class HealthyRecord(Reply):
     data: str
 
 
-def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
-
-    @router.get(
+def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
+    @app.get(
         "/api/diagnosis/{task}/{filter}/{episode}",
         response_model=Diagnosis,
         responses={202: {"model": DiagnosisJob | Progress}},
@@ -139,7 +137,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             return JSONResponse(first)
         return JSONResponse({"job": job and asdict(job), "preliminary": first}, status_code=202)
 
-    @router.post("/api/diagnosis/{task}/{filter}/{episode}", status_code=202)
+    @app.post("/api/diagnosis/{task}/{filter}/{episode}", status_code=202)
     def find_cause(selection: RequestedRun, over: Over = "episode") -> JobReply:
         arguments = _arguments(store, selection, over)
         scope = "" if over == "episode" else plural(len(arguments["episodes"]), "held-out episode")
@@ -147,22 +145,20 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         link = replace(selection, data=arguments["data"]).link("diagnosis", over=over)
         return JobReply(job=jobs.submit("diagnosis", title, arguments, link=link))
 
-    @router.get(
+    @app.get(
         "/api/repair/{task}/{filter}/{episode}", response_model=SmallestRepair, responses={202: {"model": JobReply}}
     )
     def get_repair(selection: RequestedRun) -> Response:
         return result_or_job(jobs, "repair", _repair_arguments(store, selection))
 
-    @router.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
+    @app.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
     def search_repair(selection: RequestedRun) -> JobReply:
         named = replace(selection, data=store.dataset(selection.task, selection.data)[0])
         link = named.link("diagnosis", over="episode")
         title = f"Smallest repair of {selection.describe()}"
         return JobReply(job=jobs.submit("repair", title, _repair_arguments(store, selection), link=link))
 
-    @router.get(
-        "/api/healthy-record/{task}/{filter}", response_model=HealthyRecord, responses={202: {"model": JobReply}}
-    )
+    @app.get("/api/healthy-record/{task}/{filter}", response_model=HealthyRecord, responses={202: {"model": JobReply}})
     def get_record(task: str, filter: str, data: str = "") -> Response:
         """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
         job = jobs.find("healthy", _record_arguments(store, task, filter, data))
@@ -171,7 +167,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             return JSONResponse({"data": measured})
         return JSONResponse({"job": job and asdict(job)}, status_code=202)
 
-    @router.post("/api/healthy-record/{task}/{filter}", status_code=202)
+    @app.post("/api/healthy-record/{task}/{filter}", status_code=202)
     def measure_record(task: str, filter: str, data: str = "") -> JobReply:
         """Measures the healthy record of a filter, also if it was measured before."""
         arguments = _record_arguments(store, task, filter, data)
@@ -182,8 +178,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         link = page_link(task=task, filter=filter, data=name, tab="diagnosis")
         job = jobs.submit("healthy", title, arguments, link=link, output_exists=False)  # a new job replaces the record
         return JobReply(job=job)
-
-    return router
 
 
 def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> Any:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Depends, HTTPException, Request
+from fastapi import Depends, FastAPI, HTTPException, Request
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.jobs import result_or_job
@@ -66,14 +66,12 @@ Options = Annotated[dict[str, Any], Depends(_options)]
 Episodes = Literal["held-out"] | None
 
 
-def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
-
-    @router.get("/api/diagnostics", response_model=list[DiagnosticInfo])
+def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
+    @app.get("/api/diagnostics", response_model=list[DiagnosticInfo])
     def list_diagnostics() -> list[dict[str, Any]]:
         return [entry.to_json() for entry in DIAGNOSTICS.values()]
 
-    @router.get(
+    @app.get(
         "/api/diagnostics/{task}/{filter}/{episode}",
         response_model=list[TraceDiagnosticInfo],
         responses=IN_PROGRESS,
@@ -85,7 +83,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             [entry.to_json() | {"why_not": entry.refusal(run.trace, run.checkpoint)} for entry in entries]
         )
 
-    @router.get(
+    @app.get(
         "/api/diagnostics/{name}/{task}/{filter}/{episode}",
         response_model=DiagnosticResult,
         responses={202: {"model": JobReply | Progress}},
@@ -103,7 +101,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             return Response(result, media_type="application/json")
         return result_or_job(jobs, "diagnostic", _arguments(store, entry, selection, options, episodes))
 
-    @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
+    @app.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
     def compute(
         entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
     ) -> JobReply:
@@ -113,8 +111,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         state = {"over": episodes, "diagnostic": entry.name, "options": urlencode(options)}
         title, link = f"{entry.title} of {selection.describe(scope)}", selection.link("diagnostics", **state)
         return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
-
-    return router
 
 
 def _check(entry: Entry, run: TracedRun) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fastapi import APIRouter
+from fastapi import FastAPI
 from fastapi.responses import Response
 
 from beliefscope.app.api.models import FilterName, Number, Reply
@@ -99,9 +99,7 @@ class EpisodeResults(Reply):
     opened_seed: int
 
 
-def routes(store: TraceStore) -> APIRouter:
-    router = APIRouter()
-
+def add_routes(app: FastAPI, store: TraceStore) -> None:
     def tables(name: str) -> Tables:
         from beliefscope.recordings.sweep_table import Experiments as Tables  # pyarrow and DuckDB are slow to import
 
@@ -110,7 +108,7 @@ def routes(store: TraceStore) -> APIRouter:
             raise NotFound(f"Sweep {name!r} does not exist.")
         return Tables([folder])
 
-    @router.get("/api/experiments")
+    @app.get("/api/experiments")
     def list_sweeps() -> SweepList:
         entries, problems = [], []
         for name in sweep_folders(store.settings):
@@ -120,7 +118,7 @@ def routes(store: TraceStore) -> APIRouter:
                 problems.append(str(error))
         return SweepList(sweeps=entries, problems=problems)
 
-    @router.get("/api/experiments/{sweep}")
+    @app.get("/api/experiments/{sweep}")
     def results(sweep: str, phase: str = "all") -> Experiments:
         rows = tables(sweep).overview(phase)
         names = catalog_names(store)
@@ -136,28 +134,26 @@ def routes(store: TraceStore) -> APIRouter:
         ]
         return Experiments(rows=sent, count=len(rows))
 
-    @router.get("/api/experiments/{sweep}/episodes")
+    @app.get("/api/experiments/{sweep}/episodes")
     def episodes(sweep: str, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> EpisodeResults:
         rows = tables(sweep).episodes(checkpoint, data, faults, phase).slice(0, LARGEST).to_pylist()
         results = [EpisodeResult(**as_json(row)) for row in rows]
         return EpisodeResults(episodes=results, opened_seed=store.settings.seed)
 
-    @router.get("/api/experiments/{sweep}/results.csv")
+    @app.get("/api/experiments/{sweep}/results.csv")
     def results_as_csv(sweep: str, phase: str = "all") -> Response:
         from beliefscope.recordings.sweep_table import as_csv
 
         name = {"Content-Disposition": f'attachment; filename="results-{phase.replace(" ", "-")}.csv"'}
         return Response(as_csv(tables(sweep).overview(phase)), media_type="text/csv", headers=name)
 
-    @router.post("/api/experiments/{sweep}/{checkpoint}")
+    @app.post("/api/experiments/{sweep}/{checkpoint}")
     def open_checkpoint(sweep: str, checkpoint: str) -> FilterName:
         query = "SELECT task, name FROM checkpoints WHERE checkpoint = ?"
         row = next(iter(tables(sweep).query(query, [checkpoint]).to_pylist()), None)
         if row is None:
             raise NotFound(f"Sweep {sweep!r} has no checkpoint with hash {checkpoint[:12]}.")
         return add_filter(store, row["task"], row["name"], checkpoint)
-
-    return router
 
 
 def _info(name: str, tables: Tables) -> SweepInfo:

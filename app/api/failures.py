@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends
+from fastapi import Depends, FastAPI
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
@@ -118,10 +118,8 @@ RequestedSurvey = Annotated[SurveyRequest, Depends()]
 """The survey selected by path and query."""
 
 
-def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
-
-    @router.get(
+def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
+    @app.get(
         "/api/failures/{task}/{filter}",
         response_model=Failures,
         response_model_exclude_unset=True,
@@ -132,7 +130,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             return _live_failures(store, request)
         return result_or_job(jobs, "failures", _arguments(store, request))
 
-    @router.post("/api/failures/{task}/{filter}", status_code=202)
+    @app.post("/api/failures/{task}/{filter}", status_code=202)
     def find_failures(request: RequestedSurvey) -> JobReply:
         arguments = _arguments(store, request)
         count, faults = len(arguments["episodes"]), arguments["faults"]
@@ -141,8 +139,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         state = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults")}
         link = page_link(**state, tab="failures")
         return JobReply(job=jobs.submit("failures", title, arguments, link=link))
-
-    return router
 
 
 def found_failures(store: TraceStore, jobs: Jobs, selection: Selection) -> Path | None:

@@ -5,7 +5,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Body, HTTPException
+from fastapi import Body, FastAPI, HTTPException
 from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
@@ -135,20 +135,19 @@ class FineTuneDetails(FineTuneRunInfo):
     result: FineTuneResult | None
 
 
-def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
+def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     runs = FineTuneRuns(store.settings.workspace)
 
-    @router.get("/api/finetune/{task}/{filter}", response_model=FineTuneOffer)
+    @app.get("/api/finetune/{task}/{filter}", response_model=FineTuneOffer)
     def get_options(task: str, filter: str, data: str = "") -> JSONResponse:
         listed = [summary(run) for run in runs.list_runs() if run.task == task]
         return JSONResponse(jsonable_encoder(_options(store, task, filter, data) | {"runs": listed}))
 
-    @router.get("/api/weaknesses/{task}/{filter}/{episode}", responses={202: {"model": Progress}})
+    @app.get("/api/weaknesses/{task}/{filter}/{episode}", responses={202: {"model": Progress}})
     def get_weaknesses(selection: RequestedRun) -> list[Weakness]:
         return weaknesses_of(store, jobs, selection)
 
-    @router.post("/api/finetune/{task}/{filter}", status_code=202)
+    @app.post("/api/finetune/{task}/{filter}", status_code=202)
     def start(task: str, filter: str, settings: Annotated[dict[str, Any], Body()], data: str = "") -> FineTuneRunInfo:
         checkpoint = store.checkpoint(task, filter)
         tuning = FineTune.from_json(settings)
@@ -166,11 +165,11 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         jobs.submit("finetune", title, arguments | {"tuning": run.settings}, id, link)
         return info(run)
 
-    @router.get("/api/tuned/{run}", response_model=FineTuneDetails)
+    @app.get("/api/tuned/{run}", response_model=FineTuneDetails)
     def get_run(run: str) -> JSONResponse:
         return JSONResponse(details(runs.get(run)))
 
-    @router.post("/api/tuned/{run}/{action}")
+    @app.post("/api/tuned/{run}/{action}")
     def decide(run: str, action: Action) -> FineTuneRunInfo:
         record = runs.get(run)
         if (name := finetuned_name(record)) is None:
@@ -213,8 +212,6 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             finetuned=name,
             saved_as=None if name not in saved else "default" if saved[name].default else "saved",
         )
-
-    return router
 
 
 def _options(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fastapi import APIRouter
+from fastapi import FastAPI
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.jobs.queue import Job, Jobs
@@ -19,30 +19,26 @@ class JobWithLog(Job):
     log: str = ""
 
 
-def routes(jobs: Jobs) -> APIRouter:
-    router = APIRouter()
-
-    @router.get("/api/jobs")
+def add_routes(app: FastAPI, jobs: Jobs) -> None:
+    @app.get("/api/jobs")
     def list_jobs() -> list[Job]:
         return jobs.all()
 
-    @router.get("/api/jobs/{id}")
+    @app.get("/api/jobs/{id}")
     def get_job(id: str) -> JobWithLog:
         return JobWithLog(**asdict(jobs[id]), log=jobs.log(id))
 
-    @router.delete("/api/jobs/{id}")
+    @app.delete("/api/jobs/{id}")
     def cancel_job(id: str) -> Job:
         return jobs.cancel(id)
 
-    @router.get("/api/jobs/{id}/result")
+    @app.get("/api/jobs/{id}/result")
     def job_result(id: str) -> FileResponse:
         job = jobs[id]
         path = jobs.finished_result(job)
         if path is None:
             raise NotFound(f"Job {id!r} has no result: it is {job.state}{job.error and f', {job.error}'}.")
         return FileResponse(path, media_type="application/json")
-
-    return router
 
 
 def arguments_over_episodes(

@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from fastapi import APIRouter
+from fastapi import FastAPI
 from fastapi.responses import Response
 
 from beliefscope import __version__
@@ -45,16 +45,14 @@ class Lineage(Reply):
     members: list[LineageMember]
 
 
-def routes(store: TraceStore) -> APIRouter:
-    router = APIRouter()
-
-    @router.get("/api/lineage/{task}")
+def add_routes(app: FastAPI, store: TraceStore) -> None:
+    @app.get("/api/lineage/{task}")
     def lineage(task: str) -> Lineage:
         names = {checkpoint.hash: name for name, checkpoint in store.filters(task).items()}
         members = _lineage(store, task).members.values()
         return Lineage(members=[_member(member, names, store) for member in members if member.task == task])
 
-    @router.get("/api/lineage/{task}/{hash}.zip", response_class=Response)
+    @app.get("/api/lineage/{task}/{hash}.zip", response_class=Response)
     def archive(task: str, hash: str) -> Response:
         lineage = _lineage(store, task)
         if hash not in lineage.members:
@@ -66,8 +64,6 @@ def routes(store: TraceStore) -> APIRouter:
                 archive.write(path, f"{name}/{path.name}")
         headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
         return Response(content.getvalue(), media_type="application/zip", headers=headers)
-
-    return router
 
 
 def _lineage(store: TraceStore, task: str) -> Checkpoints:

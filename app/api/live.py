@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
@@ -68,11 +68,10 @@ def block(run: LiveRun, first: int) -> bytes:
     return padded + buffer + (b"" if images is None else images.tobytes())
 
 
-def routes(store: TraceStore) -> APIRouter:
-    router = APIRouter()
+def add_routes(app: FastAPI, store: TraceStore) -> None:
     runs = store.live
 
-    @router.get("/api/live", response_model=LiveList)
+    @app.get("/api/live", response_model=LiveList)
     def list_runs() -> dict[str, Any]:
         entries: list[dict[str, Any]] = []
         tasks: dict[str, Task] = {}
@@ -89,7 +88,7 @@ def routes(store: TraceStore) -> APIRouter:
                 entries.append({"name": name, "state": "damaged", "message": str(error)})
         return {"runs": entries, "tasks": [store.describe_task(tasks[name]) for name in sorted(tasks)]}
 
-    @router.websocket("/api/live/{name}")
+    @app.websocket("/api/live/{name}")
     async def follow(websocket: WebSocket, name: str) -> None:
         await websocket.accept()
         try:
@@ -103,7 +102,7 @@ def routes(store: TraceStore) -> APIRouter:
         except (WebSocketDisconnect, KeyError):  # KeyError: a binary message
             return
 
-    @router.get("/api/live/{name}.rrd", response_class=Response)
+    @app.get("/api/live/{name}.rrd", response_class=Response)
     async def recording(name: str) -> StreamingResponse:
         run = await asyncio.to_thread(runs.__getitem__, name)
         end = time.monotonic() + TIMEOUT  # the recording is created shortly after the run
@@ -112,8 +111,6 @@ def routes(store: TraceStore) -> APIRouter:
         if path is None:
             raise NotFound(f"Live run {name!r} has no recording.")
         return StreamingResponse(_follow_file(run, path), media_type="application/octet-stream")
-
-    return router
 
 
 async def _next_block(runs: LiveRuns, name: str, request: StepsRequest) -> bytes:

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from urllib.parse import quote
 
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import ConfigDict, NonNegativeInt, with_config
 from starlette.requests import ClientDisconnect
@@ -107,11 +107,10 @@ class NewName(RequestBody):
     name: str
 
 
-def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
+def add_routes(app: FastAPI, store: TraceStore, files: RecordingFolder, jobs: Jobs) -> None:
     matcher = RunMatcher(store)
 
-    @router.get("/api/recordings")
+    @app.get("/api/recordings")
     def list_recordings() -> RecordingList:
         recordings = files.list_recordings()
         free = free_space(files.folder)
@@ -123,7 +122,7 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
             largest=max(0, min(MAX_UPLOAD, free - RESERVED_SPACE)),
         )
 
-    @router.post("/api/recordings", status_code=201)
+    @app.post("/api/recordings", status_code=201)
     def write_recording(body: RecordingRequest, request: Request, response: Response) -> WrittenRecording | JobReply:
         start = time.perf_counter()
         selection = Selection(body.task, body.filter, body.episode, Faults.parse(body.faults), body.data)
@@ -154,7 +153,7 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         seconds = None if existed else time.perf_counter() - start
         return WrittenRecording(name=path.name, url=_url(path.name), bytes=path.stat().st_size, seconds=seconds)
 
-    @router.post("/api/recordings/{name}.rrd/run", status_code=202)
+    @app.post("/api/recordings/{name}.rrd/run", status_code=202)
     def open_run(name: str) -> JobReply:
         recording = files.get(name)
         info = recording.info
@@ -171,21 +170,20 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         arguments, title = {"recording": str(files.path(name)), "run": str(output)}, f"The run in {recording.name}"
         return JobReply(job=jobs.submit("reading", title, arguments, link=link, output_exists=output.is_file()))
 
-    _add_file_routes(router, files, matcher)
-    return router
+    _add_file_routes(app, files, matcher)
 
 
-def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatcher) -> None:
+def _add_file_routes(app: FastAPI, files: RecordingFolder, matcher: RunMatcher) -> None:
     """Routes that do not need the runs."""
 
-    @router.get("/api/recordings/{name}.rrd", response_class=Response)
+    @app.get("/api/recordings/{name}.rrd", response_class=Response)
     def download(name: str) -> FileResponse:
         path = files.path(name)
         with path.open("rb"):  # reports missing permissions before the response starts
             pass
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
-    @router.put("/api/recordings/{name}.rrd", status_code=201)
+    @app.put("/api/recordings/{name}.rrd", status_code=201)
     async def upload(name: str, request: Request) -> RecordingEntry:
         await asyncio.to_thread(files.path_for_new, name)
         limit = max(0, min(MAX_UPLOAD, await asyncio.to_thread(free_space, files.folder) - RESERVED_SPACE))
@@ -199,19 +197,19 @@ def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatc
         finally:
             part.unlink(missing_ok=True)
 
-    @router.patch("/api/recordings/{name}.rrd")
+    @app.patch("/api/recordings/{name}.rrd")
     def rename(name: str, body: NewName) -> RecordingEntry:
         return matcher.entry(files.rename(name, body.name))
 
-    @router.delete("/api/recordings/{name}.rrd")
+    @app.delete("/api/recordings/{name}.rrd")
     def delete(name: str) -> DeletedId:
         return DeletedId(deleted=files.delete(name))
 
-    @router.post("/api/recordings/deleted/{id}")
+    @app.post("/api/recordings/deleted/{id}")
     def restore(id: str) -> RecordingEntry:
         return matcher.entry(files.restore(id))
 
-    @router.delete("/api/recordings/deleted")
+    @app.delete("/api/recordings/deleted")
     def empty_trash() -> Freed:
         return Freed(freed=files.trash.empty())
 

@@ -3,7 +3,7 @@
 import hashlib
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Request
+from fastapi import Body, FastAPI, Request
 from fastapi.responses import FileResponse, Response
 from pydantic import Field, NonNegativeInt
 
@@ -52,15 +52,14 @@ class ReportRequest(RequestBody):
     quantity: Quantity = "likelihood"
 
 
-def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
+def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     reports = ReportFolder(store.settings.workspace / "reports")
 
-    @router.get("/api/reports")
+    @app.get("/api/reports")
     def list_reports() -> ReportList:
         return ReportList(reports=reports.list_reports(), deleted=reports.trash.list_deleted())
 
-    @router.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
+    @app.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def write_report(
         selection: RequestedRun, request: Request, options: Annotated[ReportRequest | None, Body()] = None
     ) -> JobReply:
@@ -82,7 +81,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         title, link = f"Report of {selection.describe()}", f"api/reports/{name}.html"
         return JobReply(job=jobs.submit("report", title, arguments, link=link, output_exists=folder.is_dir()))
 
-    @router.get("/api/reports/{name}.html", response_class=Response)
+    @app.get("/api/reports/{name}.html", response_class=Response)
     def page(name: str, inline: bool = False) -> FileResponse:
         path = reports.page(name)
         disposition = "inline" if inline else "attachment"
@@ -92,21 +91,19 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         response.headers["content-security-policy"] = PAGE_POLICY
         return response
 
-    @router.get("/api/reports/{name}.pdf", response_class=Response)
+    @app.get("/api/reports/{name}.pdf", response_class=Response)
     def pdf(name: str) -> FileResponse:
         path = reports.page(name, "report.pdf")
         return FileResponse(path, media_type="application/pdf", filename=f"{name}.pdf")
 
-    @router.delete("/api/reports/{name}.html")
+    @app.delete("/api/reports/{name}.html")
     def delete(name: str) -> DeletedId:
         return DeletedId(deleted=reports.trash.put(reports.page(name).parent))
 
-    @router.post("/api/reports/deleted/{id}")
+    @app.post("/api/reports/deleted/{id}")
     def restore(id: str) -> Name:
         return Name(name=reports.trash.restore(id).name)
 
-    @router.delete("/api/reports/deleted")
+    @app.delete("/api/reports/deleted")
     def empty_trash() -> Freed:
         return Freed(freed=reports.trash.empty())
-
-    return router

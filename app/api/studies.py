@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 from urllib.parse import quote
 
-from fastapi import APIRouter
+from fastapi import FastAPI
 from pydantic import ConfigDict
 
 from beliefscope.app.api.models import FilterName, JobReply, Reply
@@ -74,13 +74,11 @@ class StudyList(Reply):
     problems: list[str]
 
 
-def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    router = APIRouter()
-
+def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     def studies() -> dict[str, Study]:
         return {study.name: study for study in all_studies(store.settings.studies, store.settings.workspace)}
 
-    @router.get("/api/studies")
+    @app.get("/api/studies")
     def list_studies() -> StudyList:
         names = catalog_names(store)
         entries, problems = [], []
@@ -91,7 +89,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
                 problems.append(str(error))
         return StudyList(studies=entries, problems=problems)
 
-    @router.post("/api/studies/{name}/cells", status_code=202)
+    @app.post("/api/studies/{name}/cells", status_code=202)
     def run_cells(name: str) -> JobReply:
         study = studies().get(name)
         if study is None:
@@ -103,15 +101,13 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         title, link = f"Cells of study {name}", f"?tab=study&study={quote(name)}"
         return JobReply(job=jobs.submit("study", title, arguments, key, link, output_exists=False))
 
-    @router.post("/api/studies/{name}/{task}/{filter}/{seed}")
+    @app.post("/api/studies/{name}/{task}/{filter}/{seed}")
     def open_checkpoint(name: str, task: str, filter: str, seed: int) -> FilterName:
         study, cell = studies().get(name), f"{task}/{filter}/seed{seed}"
         hash_ = None if study is None else study.read().checkpoints.get(cell)
         if hash_ is None:
             raise NotFound(f"Study {name!r} has no checkpoint {cell!r}.")
         return add_filter(store, task, cell, hash_)
-
-    return router
 
 
 def _info(study: Study, results: Results, names: CatalogNames, store: TraceStore, jobs: Jobs) -> StudyInfo:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import Depends, FastAPI, Query, Request
 from fastapi.responses import Response
 
 from beliefscope import __version__
@@ -118,20 +118,19 @@ RequestedRunOrComparison = Annotated[Selection, Depends(_comparison)]
 """The run selected by path and query, or its comparison run if the query has ``against``."""
 
 
-def routes(store: TraceStore, views: Views) -> APIRouter:
-    """Create the router. Handlers that block are plain functions, which FastAPI runs in threads."""
-    router = APIRouter()
+def add_routes(app: FastAPI, store: TraceStore, views: Views) -> None:
+    """Add the routes. Handlers that block are plain functions, which FastAPI runs in threads."""
 
-    @router.get("/healthz")
+    @app.get("/healthz")
     async def health() -> Health:
         return Health(status="ok", version=__version__, late=round(views.overdue(), 1))
 
-    @router.get("/api/catalog", response_model=Catalog)
+    @app.get("/api/catalog", response_model=Catalog)
     def catalog(request: Request, task: str = "", filter: Annotated[tuple[str, ...], Query()] = ()) -> dict[str, Any]:
         server = {"version": __version__, "read_only": request.app.state.read_only, "faults": fault_catalog()}
         return {**server, **store.catalog(task, filter)}
 
-    @router.get("/api/episodes/{task}", response_model=EpisodeList)
+    @app.get("/api/episodes/{task}", response_model=EpisodeList)
     def episodes(
         task: str,
         data: str = "",
@@ -142,7 +141,7 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         count, page = episode_list.find(store.dataset(task, data)[1], query, first, limit)
         return {"count": count, "episodes": page}
 
-    @router.get(
+    @app.get(
         "/api/trace/{task}/{filter}/{episode}",
         response_model=TraceHeader,
         response_model_exclude_unset=True,
@@ -151,12 +150,12 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
     def trace_header(selection: RequestedRunOrComparison) -> Any:
         return finished_run(store, selection).header | {"filter": selection.filter}
 
-    @router.get("/api/trace/{task}/{filter}/{episode}/columns", response_class=Response, responses=IN_PROGRESS)
+    @app.get("/api/trace/{task}/{filter}/{episode}/columns", response_class=Response, responses=IN_PROGRESS)
     def trace_columns(selection: RequestedRunOrComparison, request: Request) -> Response:
         run = finished_run(store, selection)
         return _immutable(request, run, "columns", lambda: run.columns[1])
 
-    @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
+    @app.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
     def trace_images(selection: RequestedRunOrComparison, request: Request, sensor: str = "") -> Response:
         run = finished_run(store, selection)
         names = [displayed.name for displayed in displayed_sensors(run.trace)]
@@ -165,8 +164,6 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
             raise NotFound(f"Sensor {name!r} has no images. Available: {', '.join(names) or 'none'}.")
         pixels = sensor_pixels(run.trace, name)
         return _immutable(request, run, f"images {name}", pixels.tobytes)
-
-    return router
 
 
 def finished_run(store: TraceStore, selection: Selection) -> TracedRun:

@@ -3,7 +3,7 @@
 import hashlib
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Request, WebSocket
+from fastapi import Body, FastAPI, Request, WebSocket
 from fastapi.responses import Response
 
 from beliefscope.app.api.models import Reply, RequestBody
@@ -29,32 +29,29 @@ class ViewRequest(RequestBody):
     dark: bool = False
 
 
-def routes(views: Views) -> APIRouter:
-    router = APIRouter()
+def add_routes(app: FastAPI, views: Views) -> None:
     scene = client_page()
     scene_tag = hashlib.sha256(scene).hexdigest()[:24]
 
-    @router.post("/api/views", status_code=201)
+    @app.post("/api/views", status_code=201)
     async def open_view(options: Annotated[ViewRequest | None, Body()] = None) -> ViewAddresses:
         name = (await views.open(options is not None and options.dark)).name
         return ViewAddresses(view=name, scene=f"/scene/{name}/", socket=f"/api/views/{name}")
 
-    @router.websocket("/api/views/{name}")
+    @app.websocket("/api/views/{name}")
     async def view_socket(websocket: WebSocket, name: str) -> None:
         if view := await _find_view(views, websocket, name):
             await view.serve(websocket)
 
-    @router.get("/scene/{name}/")
+    @app.get("/scene/{name}/")
     async def scene_page(name: str, request: Request) -> Response:
         views[name]  # raises NotFound
         return tagged(request, scene_tag, lambda: scene, "text/html; charset=utf-8")
 
-    @router.websocket("/scene/{name}")
+    @app.websocket("/scene/{name}")
     async def scene_socket(websocket: WebSocket, name: str) -> None:
         if view := await _find_view(views, websocket, name):
             await view.scene.viser.connect(websocket)
-
-    return router
 
 
 async def _find_view(views: Views, websocket: WebSocket, name: str) -> View | None:

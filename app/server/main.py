@@ -109,23 +109,20 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     )
     app.state.store, app.state.views, app.state.jobs = store, views, jobs
     app.state.read_only = access.read_only
-    for router in (
-        traces.routes(store, views),
-        api_views.routes(views),
-        api_jobs.routes(jobs),
-        diagnosis.routes(store, jobs),
-        diagnostics.routes(store, jobs),
-        comparison.routes(store),
-        failures.routes(store, jobs),
-        finetune.routes(store, jobs),
-        recordings.routes(store, files, jobs),
-        reports.routes(store, jobs),
-        live.routes(store),
-        studies.routes(store, jobs),
-        experiments.routes(store),
-        lineage.routes(store),
-    ):
-        app.include_router(router)
+    traces.add_routes(app, store, views)
+    api_views.add_routes(app, views)
+    api_jobs.add_routes(app, jobs)
+    diagnosis.add_routes(app, store, jobs)
+    diagnostics.add_routes(app, store, jobs)
+    comparison.add_routes(app, store)
+    failures.add_routes(app, store, jobs)
+    finetune.add_routes(app, store, jobs)
+    recordings.add_routes(app, store, files, jobs)
+    reports.add_routes(app, store, jobs)
+    live.add_routes(app, store)
+    studies.add_routes(app, store, jobs)
+    experiments.add_routes(app, store)
+    lineage.add_routes(app, store)
     _add_files(app, viewer)
     app.add_middleware(Guard, hosts=settings.hosts, access=access)
     for error in ERRORS:

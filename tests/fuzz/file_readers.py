@@ -26,7 +26,7 @@ from reader import Corrupt, Reader, check_serializable, corrupt_with
 from starlette.testclient import TestClient
 from valid_files import PAPER_LAYOUTS, episodes, write_episodes, write_paper_file, write_push
 
-from beliefscope.app.api.finetune import routes as finetune_routes
+from beliefscope.app.api.finetune import add_routes
 from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
@@ -224,7 +224,7 @@ def corrupt_finetune(path: Path, rng: Random) -> None:
 def finetune_server() -> tuple[Path, TestClient]:
     """An empty workspace and a server of its fine-tuning routes."""
     folder, application = Path(tempfile.mkdtemp(prefix="workspace-")), FastAPI()
-    application.include_router(finetune_routes(TraceStore(Settings(folder)), Jobs(folder / "jobs")))
+    add_routes(application, TraceStore(Settings(folder)), Jobs(folder / "jobs"))
     return folder, TestClient(application)
 
 

@@ -17,7 +17,7 @@ from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 from starlette.testclient import TestClient
 
-from beliefscope.app.api.jobs import routes
+from beliefscope.app.api.jobs import add_routes
 from beliefscope.app.jobs.queue import KINDS, Job, Jobs
 from beliefscope.app.protocol.errors import NotFound, QueueFull
 from beliefscope.datasets.errors import BadInput
@@ -243,7 +243,7 @@ def test_job_ends_with_its_server(open_jobs: OpenJobs, tmp_path: Path) -> None:
 def test_routes(open_jobs: OpenJobs, tmp_path: Path) -> None:
     jobs = open_jobs()
     app = FastAPI()
-    app.include_router(routes(jobs))
+    add_routes(app, jobs)
     app.add_exception_handler(NotFound, lambda _, error: JSONResponse({"error": str(error)}, 404))
     with TestClient(app) as client:
         assert client.get("/api/jobs").json() == []
