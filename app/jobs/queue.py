@@ -22,7 +22,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
+from pydantic import AliasChoices, ConfigDict, Field, with_config
 
 from beliefscope import __version__
 from beliefscope.app.jobs.remaining_time import RemainingTime
@@ -94,9 +94,6 @@ class Job:
     def active(self) -> bool:
         """Whether the job waits or runs."""
         return self.state in ACTIVE
-
-
-RECORD = TypeAdapter(Job)
 
 
 class Jobs:
@@ -351,7 +348,7 @@ def _read_jobs(folder: Path) -> list[Job]:
     for path in folder.glob("*/job.json"):
         # Skips files that are damaged or of another version.
         with suppress(OSError, ValueError, TypeError, LookupError, AttributeError):
-            job = read_record(RECORD, path)
+            job = read_record(Job, path)
             if job.id == path.parent.name and not (job.active and _is_other_process(job.server)):
                 jobs.append(job)
                 if job.kind == "failures" and (result := file_within(folder, f"{job.id}/result.json")):

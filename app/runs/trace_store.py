@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
-from pydantic import TypeAdapter
-
 from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
 from beliefscope.app.runs.examples import EXAMPLES, Example, available
@@ -45,9 +43,6 @@ BYTES_IN_MEMORY = 256 << 20  # of the most recent traces; one is kept whatever i
 MAX_WAITING = 64  # runs in the queue
 MAX_KEYS = 4096  # selections with a cached key, a few hundred bytes each
 
-RECORD = TypeAdapter(dict[str, Any])
-"""JSON of ``beliefscope.inspect.diagnostics.healthy_profile``, measured by a job for a filter that has none."""
-
 
 class TraceStore:
     """Traces, filters and data sets of a server. Methods may be called from any thread, and may block."""
@@ -57,7 +52,8 @@ class TraceStore:
         self.settings = settings
         self.live = LiveRuns(settings.workspace / "live", settings.definitions)
         self.saved = SavedFilters(settings.workspace, settings.definitions)
-        self._records = RecordCache(partial(read_record, RECORD))
+        # JSON of healthy profiles, measured by jobs for filters that have none.
+        self._records = RecordCache(partial(read_record, dict[str, Any]))
         self._worker = worker
         self._lock = threading.RLock()
         self._key = lru_cache(MAX_KEYS)(self._compute_key)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AliasChoices, Field, TypeAdapter
+from pydantic import AliasChoices, Field
 
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.workspace.json_files import content, read_record, write_record
@@ -31,9 +31,6 @@ class FineTuneRun:
     submitted: Annotated[float, Field(validation_alias=AliasChoices("submitted", "asked"))]
 
 
-RECORD = TypeAdapter(FineTuneRun)
-
-
 class FineTuneRuns:
     """The fine-tuning runs of a workspace."""
 
@@ -55,7 +52,7 @@ class FineTuneRuns:
         runs = []
         for path in self._folder.glob("*/run.json"):
             with suppress(OSError, ValueError):
-                run = read_record(RECORD, path)
+                run = read_record(FineTuneRun, path)
                 if run.run == path.parent.name:
                     settings = FineTune.from_json(run.settings).to_json()  # renames settings of earlier versions
                     runs.append(FineTuneRun(**vars(run) | {"settings": settings}))

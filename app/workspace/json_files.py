@@ -5,6 +5,7 @@ import os
 import stat
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -16,6 +17,8 @@ from beliefscope.datasets.io.strict_json import read_json
 T = TypeVar("T")
 
 MAX_BYTES = 64 << 20  # of a record
+
+_adapter: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
 
 
 def is_text(name: str) -> bool:
@@ -32,17 +35,18 @@ def content(path: Path) -> bytes:
         return file.read()
 
 
-def read_record(adapter: TypeAdapter[T], path: Path) -> T:
-    """Read and validate a JSON file. Raises OSError, or ValueError for invalid content."""
+def read_record(kind: type[T], path: Path) -> T:
+    """Read a JSON file, validated as ``kind``. Raises OSError, or ValueError for invalid content."""
     data = content(path)
     read_json(data)  # rejects NaN and infinities, which pydantic accepts
-    return adapter.validate_json(data, strict=True)
+    record: T = _adapter(kind).validate_json(data, strict=True)
+    return record
 
 
 def write_record(record: Any, path: Path) -> None:
     """Write a dataclass or model, or a list of them, as JSON; creates the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, TypeAdapter(type(record)).dump_json(record))
+    write_atomically(path, _adapter(type(record)).dump_json(record))
 
 
 class RecordCache(Generic[T]):

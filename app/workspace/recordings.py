@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
-from pydantic import AliasChoices, Field, TypeAdapter
+from pydantic import AliasChoices, Field
 
 from beliefscope.app.protocol.errors import NameTaken, NotFound
 from beliefscope.app.workspace.json_files import RecordCache, read_record
@@ -63,7 +63,7 @@ class RecordingFolder:
         self.folder = folder
         self.trash = Trash(folder)
         self._lock = threading.RLock()
-        self._records = RecordCache(partial(read_record, TypeAdapter(Record)))
+        self._records = RecordCache(partial(read_record, Record))
         self._probe = RecordingProbe()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reading recordings")
         self.writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writing recordings")

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from pydantic import TypeAdapter
-
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.datasets.errors import BadInput
@@ -28,16 +26,13 @@ class SavedFilter:
     default: bool
 
 
-RECORDS = TypeAdapter(list[SavedFilter])
-
-
 class SavedFilters:
     """The saved filters of a workspace. Not thread-safe. tasks: user-defined ones, as for ``load_checkpoint``."""
 
     def __init__(self, workspace: Path, tasks: Iterable[Task] = ()) -> None:
         self._workspace = workspace
         self._path = workspace / FILE
-        self._lists = RecordCache(partial(read_record, RECORDS))
+        self._lists = RecordCache(partial(read_record, list[SavedFilter]))
         self._loaded = RecordCache(partial(load_checkpoint, given=tuple(tasks)))
 
     def all(self) -> list[SavedFilter]:
@@ -68,7 +63,7 @@ class SavedFilters:
     def _read(self) -> list[SavedFilter]:
         """Raises BadInput for a list that cannot be read, such as a later version's, so that it is not overwritten."""
         try:
-            return self._existing(read_record(RECORDS, self._path))
+            return self._existing(read_record(list[SavedFilter], self._path))
         except FileNotFoundError:
             return []
         except (OSError, ValueError, TypeError):

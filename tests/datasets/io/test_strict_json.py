@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from pydantic import TypeAdapter
 
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.datasets.io.strict_json import read_json
@@ -43,4 +42,4 @@ def test_integers_never_become_infinity(tmp_path: Path) -> None:
     path = tmp_path / "job.json"
     path.write_text("1" + "0" * 400)
     with pytest.raises(ValueError, match="401 digits"):
-        read_record(TypeAdapter(float), path)
+        read_record(float, path)
