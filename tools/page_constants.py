@@ -16,6 +16,7 @@ from beliefscope.app.runs.result_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
+from beliefscope.inspect.maps.map_engine import COARSE, FINE
 
 PATH = Path(__file__).parents[1] / "app" / "page" / "core" / "constants.js"
 
@@ -32,7 +33,7 @@ def constants() -> dict[str, tuple[str, object]]:
     return {
         "MAP_SIZE": (
             "Cells along a side of a likelihood map: while scrubbing, and afterwards.",
-            dict(zip(("coarse", "fine"), messages.MAP_SIZES, strict=True)),
+            {"coarse": COARSE, "fine": FINE},
         ),
         "MAP_QUANTITIES": ("What likelihood maps can show, the default first.", QUANTITIES),
         "LOG_RANGE": ("Nats below its peak that a map distinguishes.", map_format.LOG_RANGE),

@@ -10,7 +10,6 @@ from beliefscope.inspect.maps.plane import Others
 
 MAX_ANGLE = 1e3  # rad: beyond the turns of any door
 READ_ONLY = "This server is read-only."
-MAP_SIZES = (41, 135)  # cells per side: coarse while the cursor moves, fine when it rests
 
 SceneLayer = Literal["replay", "objects", "estimates", "contours", "particles", "force", "map", "camera"]
 LAYERS: tuple[SceneLayer, ...] = get_args(SceneLayer)
@@ -51,7 +50,7 @@ class Cursor(_Message):
     episode: NonNegativeInt
     step: NonNegativeInt
     angle: Annotated[float, Field(ge=-MAX_ANGLE, le=MAX_ANGLE)] | None = None
-    size: Literal[41, 135] = 41
+    size: Literal[41, 135] = 41  # ``COARSE`` while the cursor moves, ``FINE`` when it rests
     faults: Annotated[Faults, BeforeValidator(_parse_faults)] = NO_FAULTS
     scene: bool = True
     data: str = ""

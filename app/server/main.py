@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import logging
 import signal
 import socket
@@ -38,7 +39,7 @@ from beliefscope.app.api import (
 from beliefscope.app.api.models import Error
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import InProgress, NameTaken, NotFound, QueueFull
-from beliefscope.app.protocol.messages import MAP_SIZES, describe_error
+from beliefscope.app.protocol.messages import describe_error
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.trace_worker import TraceWorker
@@ -49,11 +50,12 @@ from beliefscope.app.server.security import Guard
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.timeouts import MAX_HEAD, UNREAD_TIMEOUT, HTTPProtocol, WebSocketProtocol
 from beliefscope.app.server.vendor_files import UPLOT_FILES, viewer_wasm
-from beliefscope.app.views.memory import freeze_heap, limit_malloc_arenas, unfreeze_heap
+from beliefscope.app.views.memory import freeze_heap, limit_malloc_arenas
 from beliefscope.app.views.registry import Views
 from beliefscope.app.workspace.partial_files import delete_abandoned_parts
 from beliefscope.app.workspace.recordings import RecordingFolder
 from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.maps.map_engine import COARSE
 from beliefscope.recordings.web_viewer import WebViewer, installed
 
 __all__ = ["Settings", "create_app", "serve"]
@@ -96,7 +98,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         # A thread in C++ code at interpreter exit aborts the process.
         if warm:
             await asyncio.to_thread(warming.join)
-            unfreeze_heap()
+            gc.unfreeze()  # exit frees no frozen objects; DuckDB reports each as a leak
 
     app = FastAPI(
         title="Beliefscope",
@@ -233,7 +235,7 @@ def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> No
     """Prepare what the first page requests. Errors are only logged; the page's own request reports them."""
     for prepare in (
         store.catalog,  # the page's first request; a run at the same time would delay it
-        lambda: store.request(store.default_selection()).encoded_maps(0, MAP_SIZES[0]),
+        lambda: store.request(store.default_selection()).encoded_maps(0, COARSE),
         lambda: stopping.wait(FIRST_PAGE),  # a page that opens now needs the processor
         lambda: viewer.prepare(stopping.is_set),
         freeze_heap,

@@ -17,17 +17,9 @@ def limit_malloc_arenas() -> None:
 
 
 def freeze_heap() -> None:
-    """Exclude all current objects from later garbage collections, until ``unfreeze_heap``."""
+    """Exclude all current objects from later garbage collections, until ``gc.unfreeze``."""
     gc.collect()
     gc.freeze()
-
-
-def unfreeze_heap() -> None:
-    """Include all objects in garbage collections again.
-
-    The interpreter's exit does not free frozen objects; extension modules such as DuckDB's report each as a leak.
-    """
-    gc.unfreeze()
 
 
 def release_memory() -> None:
