@@ -60,6 +60,9 @@ SMALLEST_REST = 0.005
 MIN_HEALTHY = 10
 """Minimum number of healthy episodes with a value of a statistic."""
 
+COUNTED = ("steps", "gray levels")
+"""Units with a singular."""
+
 MIN_EFFECT = 0.5
 """Minimum difference of an alarm, in standard deviations between healthy episodes."""
 
@@ -103,8 +106,12 @@ class Deviation:
         digits = 1 - math.floor(math.log10(width)) if 0.0 < width < math.inf else 12
         numbers = (round(self.factor * x, digits) + 0.0 for x in (self.value, self.healthy, self.low, self.high))
         value, healthy, low, high = map(_number, numbers)
-        unit = self.unit and f" {self.unit}"
-        return f"{self.label} is {value}{unit}, healthy {healthy}{unit} ({low} to {high})"
+        return f"{self.label} is {self._amount(value)}, healthy {self._amount(healthy)} ({low} to {high})"
+
+    def _amount(self, number: str) -> str:
+        """The number with its unit: ``1 step``, ``3 steps``."""
+        unit = self.unit.removesuffix("s") if number in ("1", "-1") and self.unit in COUNTED else self.unit
+        return f"{number} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
