@@ -1,8 +1,8 @@
 """Catalog of filters and data sets by task: the user's own first, then pretrained filters and sample data."""
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -157,12 +157,14 @@ def task_catalogs(
     catalogs: dict[str, TaskCatalog] = {}
     problems: list[str] = []
     for name, source in checkpoints.items():
-        with _collect_error(problems):
+        try:
             checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source, tasks)
             _catalog_of(catalogs, checkpoint.task, saved, name).user_filters[name] = checkpoint
+        except BadInput as error:
+            problems.append(str(error))
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
     for name, path in data.items():
-        with _collect_error(problems):
+        try:
             episodes = open_dataset(path, given=tasks)
             initial_view(episodes)  # the page opens it there: damage of these episodes is a problem of the data set
             _catalog_of(catalogs, episodes.task, saved, name).user_data[name] = episodes
@@ -174,17 +176,15 @@ def task_catalogs(
                         catalogs[task.name].user_data[name] = other
                     else:
                         other.close()
+        except BadInput as error:
+            problems.append(str(error))
     displayed = {name for catalog in catalogs.values() if not catalog.problem for name in catalog.user_data}
     for catalog in catalogs.values():
         if catalog.problem and (catalog.user_filters or catalog.user_data.keys() - displayed):
             problems.append(catalog.problem)
-    own = {
-        name: catalog
-        for name, catalog in catalogs.items()
-        if name not in TASKS or catalog.user_data or catalog.user_filters
-    }
-    built_in = {name: catalogs.get(name, TaskCatalog(task, saved)) for name, task in TASKS.items()}
-    return own | built_in, problems
+    for name, task in TASKS.items():
+        catalogs.setdefault(name, TaskCatalog(task, saved))
+    return catalogs, problems
 
 
 def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, saved: SavedFilters | None, source: str) -> TaskCatalog:
@@ -249,12 +249,3 @@ def _data_json(name: str, data: Dataset) -> dict[str, Any]:
     episode, step = initial_view(data)
     episodes = episode_list.nearby(data, episode)
     return {"name": name, "first": episode, "first_step": step, "count": len(data), "episodes": episodes}
-
-
-@contextmanager
-def _collect_error(problems: list[str]) -> Iterator[None]:
-    """Append the message of a BadInput to ``problems``."""
-    try:
-        yield
-    except BadInput as error:
-        problems.append(str(error))

@@ -98,8 +98,7 @@ class TraceStore:
     def describe_task(self, task: Task) -> dict[str, Any]:
         """The catalog entry of a task, whether or not this server has filters and data of it."""
         with self._lock:
-            catalog = self._catalogs[0].get(task.name)
-            return (TaskCatalog(task) if catalog is None else catalog).to_json()
+            return self._catalogs[0].get(task.name, TaskCatalog(task)).to_json()
 
     def filters_of(self, run: LiveRun) -> dict[str, Checkpoint]:
         """The filters of a live run's task by name. Raises BadInput if another task here has the same name."""

@@ -85,13 +85,10 @@ class RecordingFolder:
     def path(self, name: str) -> Path:
         """Path of an existing regular file; links are not followed. Raises NotFound."""
         path = self.folder / (name.removesuffix(ENDING) + ENDING)
-        if "/" in name or not _is_listed(path.name):
-            _not_found(name)
-        try:
-            regular = stat.S_ISREG(path.lstat().st_mode)
-        except OSError:
-            regular = False
-        return path if regular else _not_found(name)
+        with suppress(OSError):
+            if "/" not in name and _is_listed(path.name) and stat.S_ISREG(path.lstat().st_mode):
+                return path
+        return _not_found(name)
 
     def path_for_new(self, name: str) -> Path:
         """Path for a new file. Raises BadInput for an invalid name, NameTaken for an existing one."""
