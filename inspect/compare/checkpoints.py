@@ -337,9 +337,8 @@ def _summary(verb: str, changes: Sequence[Difference], errors: Sequence[Differen
     if not possible:
         return f"{verb}: nothing by more than {percent(LEVEL)}"
     largest = max(possible, key=lambda d: sign * d.effect)
-    return f"{verb}: nothing significant" + (
-        f"; largest change {_description(largest)}" if sign * largest.effect > 0.0 else ""
-    )
+    change = f"; largest change {_description(largest)}" if sign * largest.effect > 0.0 else ""
+    return f"{verb}: nothing significant{change}"
 
 
 def _description(d: Difference) -> str:
