@@ -146,13 +146,10 @@ def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
     assert size("#maps") == default
 
 
-@pytest.mark.parametrize("read_only", [False, True])
-def test_names_of_tabs_have_space_beside_their_dividers(
-    server: Any, start_server: Callable[..., Any], open_page: Any, read_only: bool
-) -> None:
+def check_names_of_tabs(page: Any) -> None:
     """In the narrow panel, with the widest selected name and a running job, without wrapping or scrolling."""
-    url = start_server("--read-only").url if read_only else server.url
-    page = open_page("?task=door&tab=diagnostics", url=url, size=(1024, 768))
+    assert page.state["tab"] == "diagnostics"
+    page.page.set_viewport_size({"width": 1024, "height": 768})
     page.page.evaluate("document.querySelector('#jobs-button').dataset.active = '1'")
     space, lines, hidden = page.page.evaluate(TAB_SPACE)
     assert space >= 4.0
@@ -160,23 +157,30 @@ def test_names_of_tabs_have_space_beside_their_dividers(
     assert hidden == 0
 
 
-@pytest.mark.parametrize("module", ["tabs", "scatter"])
-def test_tabs_that_fail_to_load_say_so_and_are_tried_again(open_page: Any, server: Any, module: str) -> None:
+@pytest.mark.long
+def test_names_of_tabs_have_space_beside_their_dividers(start_server: Callable[..., Any], open_page: Any) -> None:
+    """On a read-only server; test_tabs_that_fail_to_load checks them on another one."""
+    check_names_of_tabs(open_page("?task=door&tab=diagnostics", url=start_server("--read-only").url))
+
+
+def test_tabs_that_fail_to_load_say_so_and_are_tried_again(open_page: Any, server: Any) -> None:
     """Of a server that fails while the run is displayed; the run and the scene stay usable."""
-    page = open_page()
-    page.page.route(f"**/tabs/{module}.js", lambda route: route.abort())
-    page.page.goto(f"{server.url}?tab=study")
-    note = page.page.locator("#tabs-state > .note")
-    note.filter(has_text="The tabs cannot be loaded").wait_for()
-    for tab in ("Recordings", "Diagnosis"):
-        page.page.get_by_role("tab", name=tab).click()
-        note.wait_for(state="visible")
-    page.page.get_by_role("tab", name="Scene").click()
-    note.wait_for(state="hidden")
-    page.page.get_by_role("tab", name="Study").click()
-    page.page.unroute(f"**/tabs/{module}.js")
-    note.get_by_role("button", name="Try again").click()
-    page.page.locator("#study .top, #study .note").first.wait_for()
-    page.until("() => document.documentElement.classList.contains('with-tabs')")
-    assert note.is_hidden()
+    page = open_page("?tab=diagnostics")
+    check_names_of_tabs(page)
+    for module in ("tabs", "scatter"):
+        page.page.route(f"**/tabs/{module}.js", lambda route: route.abort())
+        page.page.goto(f"{server.url}?tab=study")
+        note = page.page.locator("#tabs-state > .note")
+        note.filter(has_text="The tabs cannot be loaded").wait_for()
+        for tab in ("Recordings", "Diagnosis"):
+            page.page.get_by_role("tab", name=tab).click()
+            note.wait_for(state="visible")
+        page.page.get_by_role("tab", name="Scene").click()
+        note.wait_for(state="hidden")
+        page.page.get_by_role("tab", name="Study").click()
+        page.page.unroute(f"**/tabs/{module}.js")
+        note.get_by_role("button", name="Try again").click()
+        page.page.locator("#study .top, #study .note").first.wait_for()
+        page.until("() => document.documentElement.classList.contains('with-tabs')")
+        assert note.is_hidden()
     page.errors[:] = [line for line in page.errors if "ERR_FAILED" not in line]
