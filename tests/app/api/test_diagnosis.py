@@ -16,13 +16,13 @@ from starlette.testclient import TestClient
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
 from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.views import as_json
-from beliefscope.inspect.healthy import MAX_EPISODES
 
 pytestmark = pytest.mark.slow
 
@@ -112,10 +112,12 @@ def test_the_smallest_repair_is_that_of_the_command(server: TestClient, settings
 
 
 def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
-    tmp_path: Path, open_client: Callable[..., TestClient]
+    tmp_path: Path, open_client: Callable[..., TestClient], short_episodes: Callable[..., list[Episode]]
 ) -> None:
-    settings = Settings(workspace=tmp_path)
-    record, url = "/api/healthy-record/door/hand-on-arc", "/api/diagnosis/door/hand-on-arc/9"
+    with open_dataset(sample_path("door")) as data:
+        write_dataset(tmp_path / "short.h5", data.task, short_episodes("door", data.held_out()[:20], 60))
+    settings = Settings(workspace=tmp_path, data={"short": tmp_path / "short.h5"})
+    record, url = "/api/healthy-record/door/hand-on-arc?data=short", "/api/diagnosis/door/hand-on-arc/9?data=short"
     with open_client(settings) as client:
         assert client.get(record).json() == {"job": None}
         while (reply := client.get(url)).status_code == 202:
@@ -128,7 +130,7 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
             assert answer.json()["job"]["state"] in ("waiting", "running"), answer.text
             assert time.monotonic() < end
             time.sleep(0.05)
-        assert answer.json()["data"].endswith("held-out episodes of sample")
+        assert answer.json()["data"].endswith("held-out episodes of short")
         assert "no_diagnosis" not in client.get(url).text
         repair = url.replace("diagnosis", "repair")
         first = [start_and_cancel(client, url), start_and_cancel(client, repair)]
@@ -140,14 +142,13 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
         assert start_and_cancel(client, url) != first[0]  # the diagnosis is computed again, too
         assert start_and_cancel(client, repair) != first[1]  # and the repair, whose bound is from the record
     with open_client(settings) as client:  # the record is kept in the workspace
-        while (reply := client.get(url, params={"faults": FAULTS})).status_code == 202 and "progress" in reply.json():
+        while (reply := client.get(f"{url}&faults={FAULTS}")).status_code == 202 and "progress" in reply.json():
             time.sleep(0.05)
         result = reply.json()
         assert result["preliminary"]["causes"][0]["cause"] == "image.frozen", result
     store = TraceStore(settings)
     checkpoint = store.checkpoint("door", "hand-on-arc")
-    indices = store.dataset("door", "")[1].held_out()[:MAX_EPISODES]
-    assert required_profile(checkpoint).episodes == len(indices)
+    assert required_profile(checkpoint).episodes == 20
     assert checkpoint.hash == load_external("beliefscope.filters.external.hand_on_arc:build", "door").hash
     store.close()
 

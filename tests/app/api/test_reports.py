@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,19 +16,19 @@ pytestmark = pytest.mark.slow
 
 ORIGIN = "http://localhost:8000"
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
-OPTIONS = {"events": [7, 40], "title": "Two events"}
+OPTIONS = {"events": [7, 30], "title": "Two events"}
 
 
-def test_report_is_written_downloaded_deleted_and_restored(tmp_path: Path) -> None:
-    app = create_app(Settings(tmp_path / "workspace"), warm=False)
+def test_report_is_written_downloaded_deleted_and_restored(settings: Settings) -> None:
+    app = create_app(settings, warm=False)
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
 
         def request_report(**options: Any) -> Response:
-            params = {"data": "sample", "faults": "blackout=0.4"}
-            return client.post("/api/reports/door/crossmodal-ekf/9", params=params, json=OPTIONS | options)
+            params = {"data": "mine", "faults": "blackout=0.4"}
+            return client.post("/api/reports/door/crossmodal-ekf/1", params=params, json=OPTIONS | options)
 
         for options, status, message in (
-            ({"events": [100]}, 400, "event step 100 does not exist: the run has steps 0 to 99"),
+            ({"events": [100]}, 400, "event step 100 does not exist: the run has steps 0 to 39"),
             ({"events": [-1]}, 422, "events"),
             ({"events": list(range(30))}, 422, "at most 20"),
             ({"sections": ["all"]}, 422, "sections"),
@@ -48,16 +47,16 @@ def test_report_is_written_downloaded_deleted_and_restored(tmp_path: Path) -> No
         page = client.get(f"/{job['link']}")
         assert page.status_code == 200
         assert "attachment" in page.headers["content-disposition"]
-        assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=sample&amp;episode=9&amp;step=" in page.text
+        assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=mine&amp;episode=1&amp;step=" in page.text
         assert "faults=blackout%3D0.4" in page.text
-        assert [f"episode=9&amp;step={step}" in page.text for step in (7, 40, 41)] == [True, True, False]
-        assert "--event=7 --event=40 --title &#39;Two events&#39; -o report" in page.text
+        assert [f"episode=1&amp;step={step}" in page.text for step in (7, 30, 31)] == [True, True, False]
+        assert "--event=7 --event=30 --title &#39;Two events&#39; -o report" in page.text
         assert request_report().json()["job"]["state"] == "done", "an existing report is not written again"
         (listed,) = client.get("/api/reports").json()["reports"]
         assert (f"/{job['link']}", "Two events", None) == (listed["url"], listed["title"], listed["pdf"])
         assert client.get(listed["url"].replace(".html", ".pdf")).status_code == 404
         run = tuple(listed[key] for key in ("task", "filter", "episode", "faults"))
-        assert run == ("door", "crossmodal-ekf", 9, "blackout=0.4")
+        assert run == ("door", "crossmodal-ekf", 1, "blackout=0.4")
         inline = client.get(listed["url"], params={"inline": "true"})
         assert inline.headers["content-disposition"].startswith("inline")
         assert inline.headers["content-security-policy"].startswith("sandbox")
