@@ -277,13 +277,15 @@ def test_captions_of_scenes_name_what_is_drawn(run_: Trace) -> None:
 
 def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     content = compose([new_trace("ekf", steps=80)], None, steps=[(0, 50)])
-    document = write_report(content, tmp_path / "report")
+    assert set(content.results) >= {"consistency", "weights"}
+    few = {name: content.results[name] for name in ("consistency", "weights")}  # figures take long to draw
+    document = write_report(replace(content, results=few), tmp_path / "report")
     text = (tmp_path / "report" / "report.html").read_text()
     assert "No maps: the filter&#39;s checkpoint is not available." in text
     assert '<p class="verdict">Not available: the filter&#39;s checkpoint is not available.</p>' in text
     assert document["diagnosis"] is None
     assert set(document["not_made"]) >= {"Likelihood maps"}
-    assert set(document["diagnostics"]) >= {"consistency", "weights"}
+    assert set(document["diagnostics"]) == {"consistency", "weights"}
 
 
 def test_the_diagnosis_is_that_of_the_traces_and_links_to_its_moment(checkpoint: Checkpoint) -> None:
