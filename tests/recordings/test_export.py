@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from beliefscope.app.cli.main import main
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.trace import Trace, arrays_of, load_trace, save_trace, trace
@@ -32,11 +32,11 @@ Compare = Callable[[Trace, Trace], None]
 
 
 @pytest.fixture(scope="module", params=["door crossmodal-pf", "door crossmodal-ekf", "push image-ekf"])
-def run(request: pytest.FixtureRequest) -> Trace:
+def run(request: pytest.FixtureRequest, short_episodes: Callable[..., list[Episode]]) -> Trace:
     task, name = request.param.split()
-    with open_dataset(sample_path(task)) as data:
-        faults = Faults.parse("blackout=0.3")
-        return trace(load_checkpoint(pretrained_path(task, name)), data[9], 9, particles=40, faults=faults)
+    (episode,) = short_episodes(task, [9], 50)
+    faults = Faults.parse("blackout=0.3")
+    return trace(load_checkpoint(pretrained_path(task, name)), episode, 9, particles=40, faults=faults)
 
 
 def array_of(trace_: Trace, name: str) -> Any:
