@@ -131,13 +131,18 @@ def test_existing_recording_is_not_written_again(client: TestClient, trace_url: 
     assert other.json()["name"] != first["name"]
 
 
+def workspace_of(client: TestClient) -> Path:
+    return client.app.state.store.settings.workspace  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     "name", ["../traces/x", "..%2ftraces%2fx", "..%5cx", "%2fetc%2fpasswd", ".hidden", "door-crossmodal-pf-episode1-zz"]
 )
-def test_names_do_not_leave_the_folder(client: TestClient, settings: Settings, name: str) -> None:
-    (settings.workspace / "traces").mkdir(parents=True)
-    (settings.workspace / "traces" / "x.rrd").write_bytes(b"secret")
-    answer = client.get(f"/api/recordings/{name}.rrd")
+def test_names_do_not_leave_the_folder(shared_client: TestClient, name: str) -> None:
+    traces = workspace_of(shared_client) / "traces"
+    traces.mkdir(parents=True, exist_ok=True)
+    (traces / "x.rrd").write_bytes(b"secret")
+    answer = shared_client.get(f"/api/recordings/{name}.rrd")
     assert answer.status_code == 404
     assert b"secret" not in answer.content
 
@@ -152,13 +157,11 @@ def test_names_do_not_leave_the_folder(client: TestClient, settings: Settings, n
         (b'{"task": "door", "filter": "none", "episode": 1}', 400, "filter 'none' does not exist"),
     ],
 )
-def test_invalid_requests_write_nothing(
-    client: TestClient, settings: Settings, body: bytes, status: int, message: str
-) -> None:
-    answer = client.post("/api/recordings", content=body, headers={"Content-Type": "application/json"})
+def test_invalid_requests_write_nothing(shared_client: TestClient, body: bytes, status: int, message: str) -> None:
+    answer = shared_client.post("/api/recordings", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == status
     assert message in answer.json()["error"]
-    assert not (settings.workspace / "recordings").exists()
+    assert not (workspace_of(shared_client) / "recordings").exists()
 
 
 def test_upload_reads_metadata(client: TestClient, run_recording: bytes, folder: Path) -> None:
