@@ -13,9 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import typer.main
 
-from beliefscope.app.cli.main import COMMANDS, cli, main
+from beliefscope.app.cli.main import COMMANDS, cli, command_group, main
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 
 pytestmark = pytest.mark.slow
@@ -96,7 +95,7 @@ def test_examples_are_accepted(line: str) -> None:
     name, *arguments = shlex.split(line)[1:]
     if name.startswith("-"):
         return
-    command = typer.main.get_command(cli).commands[name]  # type: ignore[attr-defined]
+    command = command_group().commands[name]
     command.make_context(name, arguments)
 
 

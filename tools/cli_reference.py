@@ -8,11 +8,8 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
-from typing import Any
 
-import typer
-
-from beliefscope.app.cli.main import COMMANDS, cli
+from beliefscope.app.cli.main import COMMANDS, command_group
 
 FILE = Path(__file__).resolve().parent.parent / "docs" / "cli.md"
 
@@ -25,7 +22,7 @@ The commands of `beliefscope`, from their help texts<!-- generated: python tools
 
 def reference() -> str:
     """The page: for each command its description, arguments, options and examples."""
-    group: Any = typer.main.get_command(cli)
+    group = command_group()
     context = group.make_context("beliefscope", ["--version"], resilient_parsing=True)
     parts = [INTRODUCTION, ", ".join(f"[{name}](#{name})" for name in COMMANDS) + "\n"]
     for name in COMMANDS:

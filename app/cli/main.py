@@ -9,10 +9,12 @@ import os
 import signal
 import sys
 from contextlib import suppress
+from functools import cache
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+import typer.main
 
 from beliefscope import __version__
 from beliefscope.app.cli import console
@@ -53,6 +55,12 @@ for name in COMMANDS:
     cli.command(name)(with_options(getattr(import_module(f"beliefscope.app.cli.commands.{function}"), function)))
 
 
+@cache
+def command_group() -> Any:
+    """The group of all commands. Kept, as building it takes longer than most errors need to be found."""
+    return typer.main.get_command(cli)
+
+
 def main() -> None:
     """Run the command in ``sys.argv`` and exit."""
     debug = "--debug" in sys.argv[1:]
@@ -62,7 +70,7 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # like standard error: file names may not be valid text
     signal.signal(signal.SIGTERM, _terminate)
     try:
-        code = cli(prog_name="beliefscope", standalone_mode=False)
+        code = command_group()(prog_name="beliefscope", standalone_mode=False)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         console.flush()
