@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import pickle
 import re
@@ -165,7 +164,7 @@ def test_variable_markup_is_detected(tmp_path: Path) -> None:
 def test_documented_threats_have_tests() -> None:
     names = set()
     for path in (ROOT / "tests").rglob("test_*.py"):
-        names |= {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
+        names |= {*re.findall(r"^def (test_\w+)", path.read_text(), re.MULTILINE)}
     rows = re.findall(r"^\| .* \|$", (ROOT / "docs" / "security.md").read_text().split("## Threats")[1], re.MULTILINE)[
         2:
     ]
