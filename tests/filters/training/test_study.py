@@ -92,23 +92,17 @@ def without_seconds(path: Path) -> str:
     return save_checkpoint(checkpoint.filter, checkpoint.name, record, path.with_name("compared.safetensors"))
 
 
-def without_figures(patch: pytest.MonkeyPatch) -> None:
-    """Skips drawing the figures in this process."""
-    patch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder, tasks: [])
-
-
 @pytest.fixture(scope="module")
 def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished study that was not interrupted."""
     folder = tmp_path_factory.mktemp("finished") / "study"
     with pytest.MonkeyPatch.context() as patch:
-        without_figures(patch)
+        patch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder, tasks: [])
         assert run(arguments(data, folder)) == 0
     with redirect_stdout(io.StringIO()) as out:  # draws the figures once instead of after each cell
         assert run(arguments(data, folder, "--json", "-")) == 0
-    printed = json.loads(out.getvalue())
     written = json.loads((folder / "study.json").read_text())
-    assert printed == written | {"path": str(folder)}
+    assert json.loads(out.getvalue()) == written | {"path": str(folder)}
     assert written["cells"] == dict.fromkeys(NAMES, "finished")
     return folder
 
@@ -119,7 +113,7 @@ def document(folder: Path, name: str) -> dict[str, Any]:
 
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    monkeypatch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder, tasks: [])
 
 
 @pytest.mark.long
