@@ -16,7 +16,8 @@ PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_F
 # Otherwise each of the many processes that the tests start would compile PyTorch again: 2 s of CPU time.
 export PYTHONDONTWRITEBYTECODE :=
 
-# loadfile: the tests of a file share a server, a browser or a training. tests/conftest.py orders the files.
+# loadfile: the tests of a file share a server, a browser or a training. tests/conftest.py orders the files and keeps
+# those of the browser together.
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
