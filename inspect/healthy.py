@@ -17,7 +17,8 @@ from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
 from beliefscope.inspect.diagnosis.reading_checks import modelled_keys
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, pretrained_reference
-from beliefscope.inspect.statistics.reading_model import ReadingModel, fit_reading_models
+from beliefscope.inspect.statistics.reading_fit import fit_reading_models
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 from beliefscope.inspect.traces.batch import Progress, trace_all
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.catalog import load_task
-from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
@@ -368,36 +367,6 @@ def test_field_tasks(task: str) -> None:
     delayed = [Faults.parse("delay=haptics:steps=4").apply(episode) for episode in clean]
     lags = [sensor_statistics(episode, None)["lag/control/all"] for episode in delayed]
     assert np.nanmean(lags) == pytest.approx(lag - 4.0, abs=0.5)
-
-
-def test_bearings_have_the_statistics_of_continuous_angles() -> None:
-    """A turn more or less in the readings changes nothing, also in windows and between absent readings."""
-    rng = np.random.default_rng(1)
-    course = np.cumsum(rng.normal(0.05, 0.05, (100, 2)), axis=0) + rng.normal(0.0, 0.02, (100, 2))
-    task = Task(
-        "boat",
-        (Component("x", "m"),),
-        observations={"bearing": (2,)},
-        modalities={"radar": ("bearing",)},
-        masks={"bearing": "seen"},
-        covariates={"seen": Covariate("boolean")},
-        control_size=0,
-        dt=0.1,
-    )
-    seen = (np.arange(100) % 7 != 0).astype(np.float32)
-
-    def statistics(bearings: np.ndarray) -> dict[str, float]:
-        readings = {"bearing": np.where(seen[:, None] > 0.0, bearings, 9.0)}
-        return sensor_statistics(
-            Episode(task, np.zeros((100, 1)), np.zeros((100, 0)), readings, covariates={"seen": seen}), None
-        )
-
-    continuous, jumping = statistics(course), statistics((course + np.pi) % (2.0 * np.pi) - np.pi)
-    assert np.abs(np.diff(course, axis=0)).max() < 1.0 < np.ptp(course)
-    assert continuous.keys() == jumping.keys()
-    for name, value in continuous.items():
-        turns = (jumping[name] - value) / (2.0 * np.pi) if name.startswith("level/") else 0.0
-        assert jumping[name] == pytest.approx(value + 2.0 * np.pi * round(turns), abs=1e-4, nan_ok=True), name
 
 
 def test_empty_and_other_tasks() -> None:

@@ -1,0 +1,53 @@
+"""Sensors of angles that wrap around, such as bearings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.covariate import Covariate
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.statistics.signals import is_angle
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.4])
+@pytest.mark.parametrize("start", [-np.pi, 0.0])
+def test_angles_are_those_that_jump_by_a_turn(bias: float, start: float) -> None:
+    rng = np.random.default_rng(0)
+    course = np.cumsum(rng.normal(0.1, 0.1, 200))
+    assert is_angle((course - start) % (2.0 * np.pi) + start + bias)
+    assert not is_angle(course % 1.0 * 6.0 + 4.0), "another range"
+    assert not is_angle(rng.uniform(-3.0, 3.0, 200)), "noise jumps by other amounts"
+    assert not is_angle(0.01 * course), "no jump"
+
+
+def test_bearings_have_the_statistics_of_continuous_angles() -> None:
+    """A turn more or less in the readings changes nothing, also in windows and between absent readings."""
+    rng = np.random.default_rng(1)
+    course = np.cumsum(rng.normal(0.05, 0.05, (100, 2)), axis=0) + rng.normal(0.0, 0.02, (100, 2))
+    task = Task(
+        "boat",
+        (Component("x", "m"),),
+        observations={"bearing": (2,)},
+        modalities={"radar": ("bearing",)},
+        masks={"bearing": "seen"},
+        covariates={"seen": Covariate("boolean")},
+        control_size=0,
+        dt=0.1,
+    )
+    seen = (np.arange(100) % 7 != 0).astype(np.float32)
+
+    def statistics(bearings: np.ndarray) -> dict[str, float]:
+        readings = {"bearing": np.where(seen[:, None] > 0.0, bearings, 9.0)}
+        return sensor_statistics(
+            Episode(task, np.zeros((100, 1)), np.zeros((100, 0)), readings, covariates={"seen": seen}), None
+        )
+
+    continuous, jumping = statistics(course), statistics((course + np.pi) % (2.0 * np.pi) - np.pi)
+    assert np.abs(np.diff(course, axis=0)).max() < 1.0 < np.ptp(course)
+    assert continuous.keys() == jumping.keys()
+    for name, value in continuous.items():
+        turns = (jumping[name] - value) / (2.0 * np.pi) if name.startswith("level/") else 0.0
+        assert jumping[name] == pytest.approx(value + 2.0 * np.pi * round(turns), abs=1e-4, nan_ok=True), name

@@ -1,0 +1,74 @@
+"""Measurement functions and noise of external filters, by what they report."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.inspect.diagnosis.test_innovation_checks import STD, Boat, run, sail
+
+from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
+from beliefscope.inspect.statistics.reading_fit import fit_reading_models
+from beliefscope.inspect.statistics.reading_model import ReadingModel
+from beliefscope.inspect.trace import Trace
+
+MODELS = fit_reading_models([sail(seed) for seed in range(30)], list(STD))
+
+
+def rms(values: dict[str, float]) -> list[float]:
+    """Of the range and the bearing of the radar, relative to their noise."""
+    return [values[f"measurement function/radar {axis}/all"] for axis in "xy"]
+
+
+def test_the_models_are_exact() -> None:
+    radar, compass = MODELS
+    np.testing.assert_allclose(radar.noise, STD["radar"], rtol=0.1)
+    np.testing.assert_allclose(compass.noise, STD["compass"], rtol=0.1)
+    for channel in radar.of_channels:
+        np.testing.assert_allclose(channel.landmark, [0.0, 0.0], atol=0.1)
+
+
+def test_an_offset_of_the_measurement_function_shows_whatever_the_readings() -> None:
+    """h(x) = z - nu: 0.5 m in a noise of 0.3 m, with and without a fault of the sensor."""
+    assert max(rms(measurement_model_statistics(run(Boat()), MODELS))) < 0.2
+    wrong = run(Boat(offset=0.5))
+    radar_range, bearing = rms(measurement_model_statistics(wrong, MODELS))
+    assert radar_range == pytest.approx(0.5 / MODELS[0].noise[0], rel=0.15)
+    assert bearing < 0.2
+    shift = np.array([3.0, 0.2], np.float32)
+    observations = {**wrong.episode.observations, "radar": wrong.episode.observations["radar"] + shift}
+    shifted = replace(
+        wrong,
+        episode=replace(wrong.episode, observations=observations),
+        innovation=wrong.innovation + np.stack([shift, [0.0, 0.0]]).astype(np.float32),
+    )
+    assert rms(measurement_model_statistics(shifted, MODELS)) == pytest.approx([radar_range, bearing], rel=1e-3)
+
+
+def with_likelihoods(trace: Trace, models: tuple[ReadingModel, ...], scale: float, offset: float) -> Trace:
+    """Particles around the estimates with Gaussian likelihoods of a scaled noise and of ranges with an offset, m."""
+    rng = np.random.default_rng(0)
+    steps, count, n = len(trace), 80, trace.estimate_mean.shape[1]
+    particles = trace.estimate_mean[:, None] + rng.normal(0.0, 0.3, (steps, count, n))
+    distance = np.hypot(particles[..., 0], particles[..., 1]) + offset
+    expected = np.stack([distance, np.arctan2(particles[..., 1], particles[..., 0])], axis=-1)
+    error = trace.episode.observations["radar"][:, None] - expected
+    error[..., 1] = (error[..., 1] + math.pi) % (2.0 * math.pi) - math.pi
+    radar = -0.5 * np.square(error / (scale * models[0].noise)).sum(-1)
+    likelihood = np.stack([radar, np.zeros((steps, count))], axis=1).astype(np.float32)
+    return replace(trace, particles=particles.astype(np.float32), log_likelihood=likelihood, innovation=None)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (0.3, 0.0), (3.0, 0.6)])
+def test_log_likelihoods_over_particles_show_noise_and_function(scale: float, offset: float) -> None:
+    values = measurement_model_statistics(with_likelihoods(run(Boat()), MODELS, scale, offset), MODELS)
+    noise = MODELS[0].noise
+    assert values["measurement noise/radar/all"] == pytest.approx(scale * math.sqrt(noise[0] * noise[1]), rel=0.03)
+    assert rms(values)[0] == pytest.approx(offset / noise[0], abs=0.2)
+    assert "measurement noise/compass/all" not in values, "likelihoods without evidence"
+
+
+def test_sensors_without_models_have_no_statistics() -> None:
+    assert measurement_model_statistics(run(Boat()), ()) == {}
