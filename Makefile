@@ -2,12 +2,12 @@
 #   PYTHON=...     interpreter for .venv (3.11 or newer)
 #   PIP_FLAGS=...  additional pip options, such as another package index
 #   ARGS=...       additional arguments of the command: make serve ARGS="--port 9000"
-#   JOBS=...       number of test processes (2)
+#   JOBS=...       number of test processes (3: those of the browser and of servers wait for others)
 
 PYTHON    ?= $(shell command -v python3.11 || command -v python3)
 PIP_FLAGS ?=
 ARGS      ?=
-JOBS      ?= 2
+JOBS      ?= 3
 
 VENV := .venv
 BIN  := $(VENV)/bin

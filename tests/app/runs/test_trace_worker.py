@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import termios
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -47,6 +50,17 @@ def pid(worker: TraceWorker) -> int:
     return worker._process.pid
 
 
+def wait_for_call(worker: TraceWorker) -> None:
+    """Wait until a call waits in the pipe of the stopped process."""
+    assert worker._process is not None
+    assert worker._process.stdin is not None
+    end, unread = time.monotonic() + TIMEOUT, bytearray(4)
+    while not any(unread):
+        assert time.monotonic() < end, "no call"
+        time.sleep(0.01)
+        fcntl.ioctl(worker._process.stdin.fileno(), termios.FIONREAD, unread)
+
+
 def request(store: TraceStore, selection: Selection) -> RunRequest:
     return store._run_request(selection, store.checkpoint(selection.task, selection.filter))
 
@@ -67,6 +81,7 @@ def test_traces_are_identical_and_a_killed_worker_is_replaced(
     first = pid(worker)
     os.kill(first, signal.SIGSTOP)  # during the next run
     run = store.request(OTHER)
+    wait_for_call(worker)  # a process that is dead before is replaced
     os.kill(first, signal.SIGKILL)
     with pytest.raises(RuntimeError, match=r"its process was ended by signal 9 \(SIGKILL\)"):
         run.future.result(TIMEOUT)

@@ -55,7 +55,7 @@ def test_files_of_a_folder_are_episodes(tmp_path: Path) -> None:
     assert episodes[3].states[:, 0].tolist() == [3.0, 6.0, 9.0]
     assert episodes[3].contact.tolist() == [False, True, True]
     assert {episode.dt for episode in episodes} == {0.05}, "times since 1970 have 0.2 us"
-    with pytest.raises(BadInput, match="logs has 2 episodes, and --split auto needs 10"):
+    with pytest.raises(BadInput, match="logs has 2 episodes; --split auto needs 10"):
         read_log({n: c[:6] for n, c in read_columns(logs, mapping).items()}, mapping, "logs", "auto")
 
 
