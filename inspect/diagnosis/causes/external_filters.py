@@ -1,4 +1,4 @@
-"""Causes in external Kalman filters that report predictions and innovations, by the names of the modalities."""
+"""Causes in external filters that report predictions, innovations or likelihoods, by the names of the modalities."""
 
 from __future__ import annotations
 
