@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from beliefscope.inspect.diagnosis.image_checks import registration
 from beliefscope.inspect.statistics.reference_images import Reference, normalised
@@ -31,6 +31,8 @@ def scene(rng: np.random.Generator, healthy: Reference, shift: tuple[int, int]) 
 
 @pytest.mark.parametrize("shift", [(0, 0), (3, 0), (-2, 4), (0, -5)])
 def test_the_shift_is_that_of_the_largest_correlation_summed_over_the_images(shift: tuple[int, int]) -> None:
+    from scipy import signal  # takes a second
+
     rng = np.random.default_rng(abs(shift[0]) + 10 * abs(shift[1]))
     healthy = reference(rng)
     hand, images = scene(rng, healthy, shift)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,7 +15,11 @@ from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.trace import Trace
 
-MODELS = fit_reading_models([sail(seed) for seed in range(30)], list(STD))
+
+@cache
+def models() -> tuple[ReadingModel, ...]:
+    """Of the radar and the compass."""
+    return fit_reading_models([sail(seed) for seed in range(30)], list(STD))
 
 
 def rms(values: dict[str, float]) -> list[float]:
@@ -23,7 +28,7 @@ def rms(values: dict[str, float]) -> list[float]:
 
 
 def test_the_models_are_exact() -> None:
-    radar, compass = MODELS
+    radar, compass = models()
     np.testing.assert_allclose(radar.noise, STD["radar"], rtol=0.1)
     np.testing.assert_allclose(compass.noise, STD["compass"], rtol=0.1)
     for channel in radar.of_channels:
@@ -32,10 +37,10 @@ def test_the_models_are_exact() -> None:
 
 def test_an_offset_of_the_measurement_function_shows_whatever_the_readings() -> None:
     """h(x) = z - nu: 0.5 m in a noise of 0.3 m, with and without a fault of the sensor."""
-    assert max(rms(measurement_model_statistics(run(Boat()), MODELS))) < 0.2
+    assert max(rms(measurement_model_statistics(run(Boat()), models()))) < 0.2
     wrong = run(Boat(offset=0.5))
-    radar_range, bearing = rms(measurement_model_statistics(wrong, MODELS))
-    assert radar_range == pytest.approx(0.5 / MODELS[0].noise[0], rel=0.15)
+    radar_range, bearing = rms(measurement_model_statistics(wrong, models()))
+    assert radar_range == pytest.approx(0.5 / models()[0].noise[0], rel=0.15)
     assert bearing < 0.2
     shift = np.array([3.0, 0.2], np.float32)
     observations = {**wrong.episode.observations, "radar": wrong.episode.observations["radar"] + shift}
@@ -44,10 +49,10 @@ def test_an_offset_of_the_measurement_function_shows_whatever_the_readings() -> 
         episode=replace(wrong.episode, observations=observations),
         innovation=wrong.innovation + np.stack([shift, [0.0, 0.0]]).astype(np.float32),
     )
-    assert rms(measurement_model_statistics(shifted, MODELS)) == pytest.approx([radar_range, bearing], rel=1e-3)
+    assert rms(measurement_model_statistics(shifted, models())) == pytest.approx([radar_range, bearing], rel=1e-3)
 
 
-def with_likelihoods(trace: Trace, models: tuple[ReadingModel, ...], scale: float, offset: float) -> Trace:
+def with_likelihoods(trace: Trace, scale: float, offset: float) -> Trace:
     """Particles around the estimates with Gaussian likelihoods of a scaled noise and of ranges with an offset, m."""
     rng = np.random.default_rng(0)
     steps, count, n = len(trace), 80, trace.estimate_mean.shape[1]
@@ -56,15 +61,15 @@ def with_likelihoods(trace: Trace, models: tuple[ReadingModel, ...], scale: floa
     expected = np.stack([distance, np.arctan2(particles[..., 1], particles[..., 0])], axis=-1)
     error = trace.episode.observations["radar"][:, None] - expected
     error[..., 1] = (error[..., 1] + math.pi) % (2.0 * math.pi) - math.pi
-    radar = -0.5 * np.square(error / (scale * models[0].noise)).sum(-1)
+    radar = -0.5 * np.square(error / (scale * models()[0].noise)).sum(-1)
     likelihood = np.stack([radar, np.zeros((steps, count))], axis=1).astype(np.float32)
     return replace(trace, particles=particles.astype(np.float32), log_likelihood=likelihood, innovation=None)
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (0.3, 0.0), (3.0, 0.6)])
 def test_log_likelihoods_over_particles_show_noise_and_function(scale: float, offset: float) -> None:
-    values = measurement_model_statistics(with_likelihoods(run(Boat()), MODELS, scale, offset), MODELS)
-    noise = MODELS[0].noise
+    values = measurement_model_statistics(with_likelihoods(run(Boat()), scale, offset), models())
+    noise = models()[0].noise
     assert values["measurement noise/radar/all"] == pytest.approx(scale * math.sqrt(noise[0] * noise[1]), rel=0.03)
     assert rms(values)[0] == pytest.approx(offset / noise[0], abs=0.2)
     assert "measurement noise/compass/all" not in values, "likelihoods without evidence"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from beliefscope.inspect.diagnosis.undo import undo
 from beliefscope.inspect.diagnosis.undo_readings import scale_control
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.healthy import sensor_record
+from beliefscope.inspect.healthy import SensorRecord, sensor_record
 
 SENSORS = {"image": (8, 8), "gps": (2,)}
 TASK = Task("cart", (Component("x", "m"), Component("y", "m")), SENSORS, {k: (k,) for k in SENSORS}, 0, 0.1)
@@ -110,7 +111,9 @@ def slide(seed: int) -> Episode:
     return Episode(WRENCH, states, controls, {"camera": images, "wrench": wrench}, contact=contact)
 
 
-RECORD = sensor_record([slide(seed) for seed in range(30)])
+@cache
+def record() -> SensorRecord:
+    return sensor_record([slide(seed) for seed in range(30)])
 
 
 def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
@@ -137,11 +140,11 @@ STILL = as_external(still, "still", WRENCH)
 )
 def test_faults_of_readings_and_controls_of_a_task_without_a_measured_hand(faults: str, cause: str) -> None:
     """A bias of 0.02 is small for the force of 2 N and large for the torque of 0.02 N m in the same sensor."""
-    rows = RECORD.rows
+    rows = record().rows
     values = {name: np.array([row.get(name, np.nan) for row in rows]) for name in rows[0]}
-    profile = HealthyProfile("peg", len(rows), None, values, RECORD.reference, RECORD.readings)
+    profile = HealthyProfile("peg", len(rows), None, values, record().reference, record().readings)
     tested = [
-        sensor_statistics(Faults.parse(faults).apply(slide(seed), seed), RECORD.reference, RECORD.readings)
+        sensor_statistics(Faults.parse(faults).apply(slide(seed), seed), record().reference, record().readings)
         for seed in range(30, 42)
     ]
     deviations = with_critical_values(profile, compare(profile, tested, task=WRENCH), 0.02)
@@ -153,7 +156,7 @@ def test_faults_of_readings_and_controls_of_a_task_without_a_measured_hand(fault
 
 def test_wrong_channels_are_put_back() -> None:
     """The undo restores the readings up to their noise: order and signs, of the affected episodes only."""
-    profile = HealthyProfile("peg", len(RECORD.rows), None, {}, RECORD.reference, RECORD.readings)
+    profile = HealthyProfile("peg", len(record().rows), None, {}, record().reference, record().readings)
     episode = slide(50)
     wrong = Faults.parse("sensor_swapped=wrench, sensor_gain=wrench:factor=-1").apply(episode, 0)
     inputs = RunInputs(STILL, {0: wrong, 1: wrong}, 1, frozenset({0}), healthy=profile)

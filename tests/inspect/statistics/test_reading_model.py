@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -56,20 +57,29 @@ def with_readings(episode: Episode, key: str, readings: np.ndarray) -> Episode:
 
 
 EPISODES = [rove(seed) for seed in range(12)]
-MODELS = fit_reading_models(EPISODES, modelled_sensors(PLANE))
 NEW = rove(100)
-GPS, ODOMETRY = MODELS
+
+
+@cache
+def models() -> tuple[ReadingModel, ...]:
+    """Of the GPS and the odometry."""
+    return fit_reading_models(EPISODES, modelled_sensors(PLANE))
+
+
+@pytest.fixture
+def model(request: pytest.FixtureRequest) -> ReadingModel:
+    return models()[request.param]
 
 
 def test_only_sensors_that_the_labels_explain_have_a_model() -> None:
-    assert [(model.key, model.channels) for model in MODELS] == [("gps", (0, 1)), ("odometry", (0, 1))]
+    assert [(model.key, model.channels) for model in models()] == [("gps", (0, 1)), ("odometry", (0, 1))]
     assert fit_reading_models(EPISODES[:3], ["gps"]) == (), "too few episodes"
     unlabelled = [replace(e, states=np.full_like(e.states, np.nan)) for e in EPISODES]
     assert fit_reading_models(unlabelled, ["gps"]) == ()
     assert len(fit_reading_models([*EPISODES, *unlabelled], ["gps"])) == 1
 
 
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.key)
+@pytest.mark.parametrize("model", [0, 1], ids=["gps", "odometry"], indirect=True)
 def test_expected_readings_of_new_episodes_are_the_noise_free_ones(model: ReadingModel) -> None:
     compared = model.compare(NEW)
     error = (compared.readings - compared.expected)[compared.present]
@@ -97,18 +107,18 @@ def test_readings_in_the_body_of_a_rotation_in_space_are_expected() -> None:
 
 def test_errors_are_those_of_the_noise_where_channels_match() -> None:
     """A signed permutation of the channels has them at the places of this permutation."""
-    clean = GPS.compare(NEW).errors()
+    clean = models()[0].compare(NEW).errors()
     readings = NEW.observations["gps"][:, ::-1] * [1.0, -1.0]
-    turned = GPS.compare(with_readings(NEW, "gps", readings)).errors()
+    turned = models()[0].compare(with_readings(NEW, "gps", readings)).errors()
     assert np.diagonal(clean[0]).max() < 2.0 < 100.0 < min(clean[0, 0, 1], clean[1, 0, 0])
     np.testing.assert_allclose([turned[0, 0, 1], turned[1, 1, 0]], [clean[0, 1, 1], clean[0, 0, 0]], rtol=1e-3)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 4, 9])
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.key)
+@pytest.mark.parametrize("model", [0, 1], ids=["gps", "odometry"], indirect=True)
 def test_delays_are_exact(model: ReadingModel, delay: int) -> None:
     late = NEW.observations[model.key][np.maximum(np.arange(STEPS) - delay, 0)]
-    values = reading_statistics(with_readings(NEW, model.key, late), MODELS)
+    values = reading_statistics(with_readings(NEW, model.key, late), models())
     assert values[f"reading lag/{model.key}/all"] == pytest.approx(delay, abs=0.02 if delay == 0 else 0.0)
     assert values[f"inverted/{model.key} x/all"] == 0.0, "errors, gain and noise are those at the delay"
     assert (values[f"reading gain/{model.key} x/all"], round(values[f"reading noise/{model.key} x/all"])) == (1.0, 1)
@@ -118,14 +128,14 @@ def test_wrong_channels_show_in_their_own_statistics_only() -> None:
     gps = NEW.observations["gps"]
 
     def of(readings: np.ndarray) -> dict[str, float]:
-        return reading_statistics(with_readings(NEW, "gps", readings), MODELS)
+        return reading_statistics(with_readings(NEW, "gps", readings), models())
 
     clean, inverted, exchanged = of(gps), of(gps * [1.0, -1.0]), of(gps[:, ::-1])
     assert max(v for name, v in clean.items() if name.startswith(("inverted", "exchanged"))) == 0.0
     assert inverted["inverted/gps y/all"] > 3.0, "log-ratio of the motion and the noise"
     assert inverted["inverted/gps x/all"] == inverted["exchanged/gps x/all"] == 0.0
     assert min(exchanged["exchanged/gps x/all"], exchanged["exchanged/gps y/all"]) > 1.0
-    biased = of(gps + GPS.noise)
+    biased = of(gps + models()[0].noise)
     assert biased["reading bias/gps x/all"] - clean["reading bias/gps x/all"] == pytest.approx(1.0, abs=1e-4)
 
 
@@ -134,15 +144,15 @@ def test_absent_readings_do_not_count() -> None:
     fix = (np.arange(STEPS) % 3 == 0).astype(np.float32)
     readings = np.where(fix[:, None] > 0.0, NEW.observations["gps"], 0.0)
     episode = replace(with_readings(NEW, "gps", readings), task=task, covariates={"fix": fix})
-    assert np.diagonal(GPS.compare(episode).errors()[0]).max() < 2.0
+    assert np.diagonal(models()[0].compare(episode).errors()[0]).max() < 2.0
 
 
 def test_models_are_stored_as_json() -> None:
-    stored = ReadingModel.from_json(json.loads(json.dumps(GPS.to_json())))
-    np.testing.assert_allclose(stored.compare(NEW).expected, GPS.compare(NEW).expected, rtol=0.0, atol=2e-3)
-    channel = GPS.to_json()["of_channels"][0]
+    stored = ReadingModel.from_json(json.loads(json.dumps(models()[0].to_json())))
+    np.testing.assert_allclose(stored.compare(NEW).expected, models()[0].compare(NEW).expected, rtol=0.0, atol=2e-3)
+    channel = models()[0].to_json()["of_channels"][0]
     with pytest.raises(ValueError, match=r"constants \(2,\)"):
-        ReadingModel.from_json({**GPS.to_json(), "of_channels": [{**channel, "constants": [1.0, 2.0]}]})
+        ReadingModel.from_json({**models()[0].to_json(), "of_channels": [{**channel, "constants": [1.0, 2.0]}]})
 
 
 def test_a_model_of_other_features_has_no_steps() -> None:
@@ -175,17 +185,19 @@ def fly(seed: int) -> Episode:
     return Episode(IMU, states, noisy, {"compass": heading[:, None]}, contact=np.zeros(STEPS))
 
 
-FLIGHTS = [fly(seed) for seed in range(12)]
-OF_FLIGHTS = fit_reading_models(FLIGHTS, modelled_keys(IMU))
+@cache
+def of_flights() -> tuple[ReadingModel, ...]:
+    """Of the compass and the controls."""
+    return fit_reading_models([fly(seed) for seed in range(12)], modelled_keys(IMU))
 
 
 def test_angles_are_compared_modulo_a_turn() -> None:
-    compass, flight = OF_FLIGHTS[0], fly(100)
+    compass, flight = of_flights()[0], fly(100)
     assert (compass.key, compass.is_angle.tolist()) == ("compass", [True])
     assert np.abs(np.diff(flight.observations["compass"][:, 0])).max() > np.pi, "it wraps around"
     turned = (flight.observations["compass"] + 0.4 + np.pi) % (2.0 * np.pi) - np.pi
     before, after = (
-        reading_statistics(with_readings(flight, "compass", readings), OF_FLIGHTS)["reading bias/compass/all"]
+        reading_statistics(with_readings(flight, "compass", readings), of_flights())["reading bias/compass/all"]
         for readings in (flight.observations["compass"], turned)
     )
     assert (after - before) * compass.noise[0] == pytest.approx(0.4, abs=1e-4)
@@ -241,12 +253,12 @@ def test_bearings_and_distances_of_unknown_beacons_are_expected() -> None:
 
 
 def test_controls_in_the_body_frame_are_sensors() -> None:
-    controls, flight = OF_FLIGHTS[1], fly(100)
+    controls, flight = of_flights()[1], fly(100)
     assert (controls.key, controls.channels) == ("control", (0, 1, 2))
-    clean = reading_statistics(flight, OF_FLIGHTS)
-    exchanged = reading_statistics(replace(flight, controls=flight.controls[:, [1, 0, 2]]), OF_FLIGHTS)
-    inverted = reading_statistics(replace(flight, controls=flight.controls * [1, 1, -1]), OF_FLIGHTS)
-    degrees = reading_statistics(replace(flight, controls=flight.controls * [1, 1, 180 / np.pi]), OF_FLIGHTS)
+    clean = reading_statistics(flight, of_flights())
+    exchanged = reading_statistics(replace(flight, controls=flight.controls[:, [1, 0, 2]]), of_flights())
+    inverted = reading_statistics(replace(flight, controls=flight.controls * [1, 1, -1]), of_flights())
+    degrees = reading_statistics(replace(flight, controls=flight.controls * [1, 1, 180 / np.pi]), of_flights())
     assert clean["exchanged/control x/all"] == clean["inverted/control z/all"] == 0.0
     assert min(exchanged["exchanged/control x/all"], inverted["inverted/control z/all"]) > 0.5
     assert degrees["reading gain/control z/all"] == pytest.approx(180 / np.pi, rel=0.05)
@@ -259,7 +271,7 @@ def test_periodic_readings_with_the_opposite_sign_are_not_delayed() -> None:
     episode = replace(NEW, states=states)
     for sign, name in ((1.0, "clean"), (-1.0, "inverted")):
         values = reading_statistics(
-            with_readings(episode, "gps", sign * (np.array([3.0, -2.0]) + states[:, :2])), MODELS
+            with_readings(episode, "gps", sign * (np.array([3.0, -2.0]) + states[:, :2])), models()
         )
         assert abs(values["reading lag/gps/all"]) < 0.1, name
         assert (values["inverted/gps x/all"] > 1.0) == (sign < 0.0)
