@@ -14,7 +14,6 @@ from beliefscope.inspect.diagnosis.vector_checks import axis_name
 from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
-from beliefscope.inspect.statistics.signals import wrapped
 from beliefscope.inspect.trace import Trace
 
 LIKELIHOODS, PARTICLES = 40, 60
@@ -51,8 +50,8 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
             errors = [h - g for end in ends if (g := model.expected(end)) is not None]
             if len(errors) < len(ends):
                 continue
-            first, last = (np.where(model.is_angle, wrapped(error), error)[keep] for error in errors)
-            outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first) / model.noise
+            first, last = (model.relative(error)[keep] for error in errors)
+            outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first)
             for i, channel in enumerate(model.channels):
                 known = outside[np.isfinite(outside[:, i]), i]
                 if len(known) >= MIN_STEPS:
@@ -88,8 +87,7 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         for model in sensors:
             readings, expected = readings_of(trace.episode, model.key)[steps, None], model.expected(there)
             assert expected is not None  # is_complete
-            error = readings - expected.reshape(*states.shape[:2], -1)
-            errors.append(np.where(model.is_angle, wrapped(error), error) / model.noise)
+            errors.append(model.relative(readings - expected.reshape(*states.shape[:2], -1)))
         e = np.concatenate(errors, axis=-1)  # (S, P, A)
         columns = np.concatenate([e, -0.5 * np.square(e)], axis=-1)
         columns, y = (

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task, display_name, with_unit
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
@@ -85,7 +86,7 @@ class Consistency(Diagnostic):
     @property
     def verdict(self) -> str:
         fused = self.entry(FUSED)
-        parts = [f"The covariance is not positive definite in {self.indefinite} steps."] if self.indefinite else []
+        parts = [_sentence(text) for text in self._of_covariances]
         if self.healthy is not None:
             return " ".join((*parts, f"{self.healthy.sentence} {fused.evidence}; 1 in theory."))
         parts += [f"{NO_RECORD} {_sentence(f'{fused.assessment} ({fused.evidence})')}"]
@@ -104,8 +105,13 @@ class Consistency(Diagnostic):
         return " ".join(parts)
 
     @property
+    def _of_covariances(self) -> tuple[str, ...]:
+        steps = plural(self.indefinite, "step")
+        return (f"the covariance is not positive definite in {steps}",) if self.indefinite else ()
+
+    @property
     def alarms(self) -> tuple[str, ...]:
-        steps = (f"the covariance is not positive definite in {self.indefinite} steps",) if self.indefinite else ()
+        steps = self._of_covariances
         if self.healthy is not None:
             return (*steps, *(alarm.text for alarm in self.healthy.alarms))
         entries = [entry for entry in self.by_layer if entry.inconsistent]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import is_image, lost_images
 from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.inspect.statistics.signals import wrapped as modulo_turn
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -46,7 +47,7 @@ def wrap_angles(difference: NDArray[Any], angles: Sequence[int]) -> Array:
     """Differences (..., n) with the components of these indices wrapped to -pi..pi."""
     difference = np.array(difference, dtype=np.float64)
     where = list(angles)
-    difference[..., where] = (difference[..., where] + np.pi) % (2.0 * np.pi) - np.pi
+    difference[..., where] = modulo_turn(difference[..., where])
     return difference
 
 

@@ -67,8 +67,7 @@ class ComparedReadings:
             return np.full((2, readings.shape[1], readings.shape[1]), np.nan)
         signs = np.array([1.0, -1.0])[:, None, None, None]
         difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
-        difference = np.where(self.model.is_angle, wrapped(difference), difference)
-        return np.asarray(np.square(difference / self.model.noise).mean(1))
+        return np.asarray(np.square(self.model.relative(difference)).mean(1))
 
 
 @dataclass(frozen=True)
@@ -165,6 +164,10 @@ class ReadingModel:
     def is_angle(self) -> Mask:
         """(A,): channels that are angles which wrap around."""
         return np.array([model.is_angle for model in self.of_channels])
+
+    def relative(self, errors: Array) -> Array:
+        """Errors (..., A) of readings, those of angles modulo a turn, in standard deviations of the noise."""
+        return np.asarray(np.where(self.is_angle, wrapped(errors), errors) / self.noise)
 
     def with_noise_of(self, other: ReadingModel) -> ReadingModel:
         """The model with the noise of another one of the same channels, in which its errors then are."""
