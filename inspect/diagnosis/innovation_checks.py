@@ -34,7 +34,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     nu, variance = pair[0][keep], np.diagonal(pair[1][keep], axis1=-2, axis2=-1)
     used = np.isfinite(nu) & (variance > 0.0)
     deviation = np.sqrt(np.where(used, variance, np.nan))
-    accepted = _accepted(trace, np.isfinite(nu), keep)
+    accepted = accepted_channels(trace, np.isfinite(nu), keep)
     values: dict[str, float] = {}
     for k, modality in enumerate(trace.modalities):
         values[f"updates/{modality}/all"] = float(np.mean(accepted[:, k].any(-1)))
@@ -80,7 +80,7 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     predicted = prediction(trace)
     if predicted is None or predicted[1] is None or not trace.has_covariance:
         return {}
-    used = _accepted(trace, np.isfinite(nu))
+    used = accepted_channels(trace, np.isfinite(nu))
     s = np.where(used[..., :, None] & used[..., None, :], s, np.eye(nu.shape[-1]))
     before, after = predicted[1], trace.estimate_covariance.astype(np.float64)
     (sign_s, of_s), (sign, of_before), (sign_after, of_after) = map(np.linalg.slogdet, (s, before, after))
@@ -95,7 +95,7 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     return {f"measurement noise/{m}/all": math.exp(v) for m, v in values.items() if abs(v) < LARGEST_LOGARITHM}
 
 
-def _accepted(trace: Trace, used: Mask, keep: Mask | slice = slice(None)) -> Mask:
+def accepted_channels(trace: Trace, used: Mask, keep: Mask | slice = slice(None)) -> Mask:
     """The used channels (T, K, m) without rejected measurements."""
     return used if trace.accepted is None else used & (trace.accepted[keep] != 0.0)[..., None]
 

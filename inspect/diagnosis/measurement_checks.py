@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,26 @@ def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -
     return _functions(trace, models) | _likelihoods(trace, models)
 
 
+@dataclass(frozen=True)
+class ModelledSensor:
+    """A vector sensor of a modality whose readings a model expects. columns: of its A channels in the innovations."""
+
+    model: ReadingModel
+    columns: list[int]
+
+
+def sensors_in(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[ModelledSensor]:
+    """Sensors of modality k with models, if its innovations have the channels of all its sensors."""
+    by_key, start = {model.key: model for model in models}, 0
+    sensors = []
+    for key in trace.task.modalities.get(trace.modalities[k], ()):
+        if (model := by_key.get(key)) is not None:
+            sensors.append(ModelledSensor(model, [start + i for i in model.channels]))
+        start += math.prod(trace.task.observations[key])
+    width = 0 if trace.innovation is None else trace.innovation.shape[-1]
+    return sensors if start <= width else []
+
+
 def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
     """``measurement function/CHANNEL/all``: root mean square error of h(x) in the noise of the readings, by channel.
 
@@ -36,26 +56,19 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
     if trace.innovation is None or predicted is None or trace.task.rotations:
         return {}
     ends = [replace(trace.episode, states=x.astype(np.float32)) for x in (predicted[0], trace.estimate_mean)]
-    by_key, keep = {model.key: model for model in models}, counted(trace)
+    keep = counted(trace)
     values: dict[str, float] = {}
-    for k, modality in enumerate(trace.modalities):
-        start = 0
-        for key in trace.task.modalities.get(modality, ()):
-            shape, model = trace.task.observations[key], by_key.get(key)
-            columns = [] if model is None else [start + i for i in model.channels]
-            start += math.prod(shape)
-            if model is None or max(columns) >= trace.innovation.shape[-1]:
-                continue
-            h = readings_of(trace.episode, key)[:, model.channels] - trace.innovation[:, k, columns]
-            errors = [h - g for end in ends if (g := model.expected(end)) is not None]
-            if len(errors) < len(ends):
-                continue
-            first, last = (model.relative(error)[keep] for error in errors)
+    for k in range(len(trace.modalities)):
+        for sensor in sensors_in(trace, k, models):
+            model = sensor.model
+            readings = readings_of(trace.episode, model.key)
+            h = readings[:, model.channels] - trace.innovation[:, k, sensor.columns]
+            first, last = (model.relative(h - model.expected(end))[keep] for end in ends)
             outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first)
             for i, channel in enumerate(model.channels):
                 known = outside[np.isfinite(outside[:, i]), i]
                 if len(known) >= MIN_STEPS:
-                    name = f"measurement function/{axis_name(key, channel, shape[0])}/all"
+                    name = f"measurement function/{axis_name(model.key, channel, readings.shape[1])}/all"
                     values[name] = float(np.sqrt(np.square(known).mean()))
     return values
 
@@ -85,9 +98,8 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         there = Episode(trace.task, states.reshape(-1, states.shape[-1]))
         errors = []
         for model in sensors:
-            readings, expected = readings_of(trace.episode, model.key)[steps, None], model.expected(there)
-            assert expected is not None  # is_complete
-            errors.append(model.relative(readings - expected.reshape(*states.shape[:2], -1)))
+            readings = readings_of(trace.episode, model.key)[steps, None]
+            errors.append(model.relative(readings - model.expected(there).reshape(*states.shape[:2], -1)))
         e = np.concatenate(errors, axis=-1)  # (S, P, A)
         columns = np.concatenate([e, -0.5 * np.square(e)], axis=-1)
         columns, y = (

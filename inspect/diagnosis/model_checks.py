@@ -24,6 +24,7 @@ from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
+from beliefscope.inspect.diagnosis.jacobian_checks import jacobian_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
 from beliefscope.inspect.statistics import measures
@@ -69,7 +70,7 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
     has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
     if external:
         values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
-        values |= measurement_model_statistics(trace, readings)
+        values |= measurement_model_statistics(trace, readings) | jacobian_statistics(trace, readings)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if has_truth:

@@ -190,11 +190,11 @@ class ReadingModel:
         count = readings_of(episode, self.key).shape[1]
         return len(self.of_channels) == count and not any(values.any() for values in others)
 
-    def expected(self, episode: Episode) -> Array | None:
-        """(T, A) expected readings of the states of an episode; None if the model has other features."""
+    def expected(self, episode: Episode) -> Array:
+        """(T, A) expected readings of the states of an episode; NaN if the model has features of another version."""
         inputs, _ = features(episode)
         if any(len(m.coefficients) != inputs.shape[1] for m in self.of_channels if not len(m.landmark)):
-            return None
+            return np.full((len(episode), len(self.of_channels)), np.nan)
         states = states_of(episode)
         places = positions(episode.task, states)
         return np.stack([model.expected(inputs, states, places) for model in self.of_channels], axis=1)
@@ -205,9 +205,8 @@ class ReadingModel:
         No step has both if the model has the features of another version.
         """
         readings, present = readings_of(episode, self.key)[:, self.channels], steps_of(episode, self.key)
-        if (expected := self.expected(episode)) is None:
-            return ComparedReadings(readings, readings, np.zeros_like(present), self)
-        return ComparedReadings(readings, expected, present, self)
+        expected = self.expected(episode)
+        return ComparedReadings(readings, expected, present & np.isfinite(expected).all(1), self)
 
 
 def readings_of(episode: Episode, key: str) -> Array:

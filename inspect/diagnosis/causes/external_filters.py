@@ -93,6 +93,18 @@ def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             prior=-0.6,
         ),
         Cause(
+            f"measurement.{modality}.jacobian",
+            f"Jacobian of the measurement function of {name} wrong",
+            (
+                Symptom(
+                    f"measurement jacobian/{modality}/*",
+                    otherwise=(Symptom(f"correction slope/{modality}/*", 0),),
+                ),
+            ),
+            f"measurement function/*|correction slope/*|measurement jacobian/*|{FILTER}",
+            f"Compare the Jacobian of {name} with finite differences of h: signs, columns, units.",
+        ),
+        Cause(
             f"innovation.{modality}.turns",
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),

@@ -71,6 +71,10 @@ def sail(seed: int, every: int = 4) -> bs.Episode:
     )
 
 
+FLIPPED = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, 1.0]])
+"""Signs of the radar's Jacobian: that of the bearing by x is wrong."""
+
+
 class Boat:
     """An extended Kalman filter with one update after another. Its arguments are the defects."""
 
@@ -86,10 +90,11 @@ class Boat:
         turn: float = 1.0,
         offset: float = 0.0,
         separate: bool = False,
+        jacobian: float | Array = 1.0,
     ) -> None:
         self.factors = {"radar": radar, "compass": compass}
         self.wraps, self.has_bias, self.updates = wraps, has_bias, updates
-        self.turn, self.offset, self.separate = turn, offset, separate
+        self.turn, self.offset, self.separate, self.jacobian = turn, offset, separate, np.asarray(jacobian)
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.mean, self.covariance, self.random = mean, covariance, np.random.default_rng(0)
@@ -140,7 +145,7 @@ class Boat:
         x, y = mean[:2]
         r = math.hypot(x, y)
         expected = np.array([r + self.offset, math.atan2(y, x)])
-        return np.array([[x / r, y / r, 0, 0], [-y / r**2, x / r**2, 0, 0]]), expected
+        return self.jacobian * np.array([[x / r, y / r, 0, 0], [-y / r**2, x / r**2, 0, 0]]), expected
 
 
 def loaded(filter_: Boat, every: int = 4) -> Checkpoint:
@@ -209,6 +214,9 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         (Boat(turn=0.6), "dynamics.frozen"),
         (Boat(offset=0.5), "measurement.radar.function"),
         (Boat(radar=0.1, separate=True), "measurement_noise.radar.small"),
+        (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),
+        (Boat(jacobian=-1.0), "measurement.radar.jacobian"),
+        (Boat(jacobian=0.5), "measurement.radar.jacobian"),
     ],
 )
 def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:
