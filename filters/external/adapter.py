@@ -6,6 +6,7 @@ the units of their sensors.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput, type_name, unknown_name
@@ -245,6 +246,16 @@ def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -
             size = slice(part.shape[-1] if axes else None)
             values[(..., k, *(size,) * axes)] = part.double()
     return values
+
+
+def joined(name: str, runs: Sequence[Tensor]) -> Tensor:
+    """Values (T, N, ...) of several runs along N; NaN after the last channels of smaller measurements."""
+    if len(runs) == 1:
+        return runs[0]
+    if axes := letters_of(name).count("m"):
+        size = max(values.shape[-1] for values in runs)
+        runs = [nn.functional.pad(v, (0, size - v.shape[-1]) * axes, value=math.nan) for v in runs]
+    return torch.cat(list(runs), dim=1)
 
 
 def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str) -> Values:

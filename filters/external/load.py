@@ -41,6 +41,7 @@ from beliefscope.filters.external.adapter import (
     check_values,
     copied,
     derived,
+    joined,
     model_names,
     named_values,
 )
@@ -176,7 +177,7 @@ class ExternalFilter(Checkpoint):
             runs.append(self._run([episodes[i] for i in group], seed, share, belief))
         models = runs[0][1]
         common = [name for name in runs[0][0] if all(name in values for values, _ in runs)]
-        values = {k: torch.cat([run[k] for run, _ in runs], dim=1) if len(runs) > 1 else runs[0][0][k] for k in common}
+        values = {name: joined(name, [values[name] for values, _ in runs]) for name in common}
         return derived(self._units.to_si(values), self._task), self._names(values, models)
 
     def _run(

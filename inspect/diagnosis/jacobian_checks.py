@@ -1,98 +1,203 @@
-"""Jacobians of an external Kalman filter's updates, against the healthy record's models of the readings."""
+"""Jacobians of an external Kalman filter, against finite differences of its own functions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
-from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS, accepted_channels
-from beliefscope.inspect.diagnosis.measurement_checks import sensors_in
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.external.calls import has_own_start, is_stepwise
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.statistics.innovations import prediction
-from beliefscope.inspect.statistics.measures import Array, Mask, counted
-from beliefscope.inspect.statistics.reading_model import ReadingModel
+from beliefscope.inspect.statistics.measures import Array, counted
 from beliefscope.inspect.trace import Trace
 
-OFFSET = 1e-3
-"""Difference of states for derivatives, relative to the largest state: the states have single precision."""
+MOST, COST = 4, 0.25
+"""Largest number of repeated steps, and of all steps from other beliefs relative to those of the episode; at least one
+step of each modality is repeated."""
 
-SMALLEST = 1e-3
-"""Smallest variation of ``H P H^T`` over the steps, relative to S, that can be compared."""
+SHIFT = 0.1
+"""Shift of a component of the mean, in its standard deviations."""
+
+SMALLEST_SHIFT = 1e-4
+"""Smallest shift, relative to the largest value of the component: beliefs have single precision."""
+
+GROWTH = 0.05
+"""Growth of the variance of a component, relative to itself: gains remain almost the same."""
+
+SAME = 0.02
+"""Largest difference of a repeated step from the original one, in standard deviations and relative to variances."""
 
 
-def jacobian_statistics(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
-    """``KIND/MODALITY/all`` -> value, from the record's derivative H of the readings at the predicted states.
+def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
+    """``KIND/SUBJECT/all`` -> value, of a Kalman filter whose whole state is its reported belief; none of others.
 
-    ``measurement jacobian``: root mean square of ``S - H P H^T`` around its mean, relative to that of ``H P H^T``. In a
-    filter with the same derivative, the difference is the measurement noise R. Shows neither signs of whole rows nor
-    updates with the wrong sign.
-    ``correction slope``: slope of the filter's corrections on ``P+ H^T R^-1 nu``, which they are in an extended Kalman
-    filter with joint updates, and nearly are with one update after another.
+    Some steps are repeated from other beliefs. With a variance of component i that is larger by d, the covariance of
+    the prediction is larger by ``E = d F_i F_i^T``, with column i of the filter's F, and the covariance S of the
+    innovations by ``H E H^T``; also with one update after another, since a small d leaves the gains almost the same.
 
-    Readings that depend on changes of the state have a derivative by the state only, in healthy episodes as well.
+    ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
+    mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
+    ``correction slope``, by modality, as these products do not show the sign of the filter's H: slope of the corrections
+    on ``P+ H^T R^-1 nu``, from -1 to 1. It is 1 with joint updates, and nearly so with others.
     """
-    innovation, s_all = trace.innovation, trace.innovation_covariance
-    means, covariances = trace.predicted_mean, trace.predicted_covariance
-    if innovation is None or s_all is None or means is None or covariances is None or trace.task.rotations:
+    steps, module = _steps(trace), checkpoint.adapter.module
+    if not len(steps) or has_own_start(module) or not is_stepwise(module):
         return {}
-    channels = accepted_channels(trace, np.isfinite(innovation))
-    after = trace.estimate_covariance.astype(np.float64)
-    values: dict[str, float] = {}
-    corrections: dict[int, Array] = {}
-    for k, modality in enumerate(trace.modalities):
-        sensors = sensors_in(trace, k, models)
-        columns = [column for sensor in sensors for column in sensor.columns]
-        if not columns:
-            continue
-        noise = np.concatenate([sensor.model.noise for sensor in sensors])
-        s = s_all[:, k][:, columns][:, :, columns] / (noise[:, None] * noise)
-        h = _derivative(trace, means[:, k].astype(np.float64), [sensor.model for sensor in sensors])
-        size = h @ covariances[:, k].astype(np.float64) @ h.mT
-        keep = counted(trace) & np.isfinite(s - size).all((-2, -1))
-        if keep.sum() < MIN_STEPS:
-            continue
-        rest, variation = (s - size)[keep], size[keep] - size[keep].mean(0)
-        r, scale = rest.mean(0), np.sqrt(np.square(variation).mean())
-        if scale > SMALLEST * np.sqrt(np.square(s[keep]).mean()):
-            values[f"measurement jacobian/{modality}/all"] = float(np.sqrt(np.square(rest - r).mean()) / scale)
-        if len(columns) == channels[:, k].any(0).sum():
-            nu = innovation[:, k, columns].astype(np.float64) / noise
-            corrections[k] = np.einsum("tij,taj,ab,tb->ti", after, h, np.linalg.pinv(r), nu)
-    slopes = _slopes(trace, np.any(channels, axis=-1), corrections) if corrections else {}
-    return values | {f"correction slope/{trace.modalities[k]}/all": slope for k, slope in slopes.items()}
+    try:
+        repeated = RepeatedSteps(trace, checkpoint, steps)
+    except BadInput:  # the filter refuses a changed belief
+        return {}
+    if not repeated.are_same(trace):
+        return {}
+    names = [component.name for component in trace.task.components]
+    values = dict(zip((f"prediction jacobian/{name}/all" for name in names), repeated.dynamics_errors(), strict=True))
+    if trace.innovation is not None:
+        for kind, each in (
+            ("measurement jacobian", repeated.measurement_errors()),
+            ("correction slope", repeated.slopes()),
+        ):
+            values |= {f"{kind}/{name}/all": value for name, value in zip(trace.modalities, each, strict=True)}
+    return {name: float(value) for name, value in values.items()}
 
 
-def _derivative(trace: Trace, states: Array, models: Sequence[ReadingModel]) -> Array:
-    """(T, A, n) derivatives of all expected readings, relative to their noise, by the states (T, n)."""
-    turning = [i for i, component in enumerate(trace.task.components) if component.wraps]
-    states[:, turning] = np.unwrap(states[:, turning], axis=0)  # no offset turns the series around
-    derivatives = []
-    for offset in OFFSET * np.abs(states).max(0, initial=1e-6) * np.eye(states.shape[1]):
-        ends = [Episode(trace.task, (states + sign * offset).astype(np.float32)) for sign in (1.0, -1.0)]
-        difference = (ends[0].states.astype(np.float64) - ends[1].states).sum(1, keepdims=True)
-        columns = [model.relative(model.expected(ends[0]) - model.expected(ends[1])) for model in models]
-        derivatives.append(np.concatenate(columns, axis=1) / difference)
-    return np.stack(derivatives, axis=-1)
+def _steps(trace: Trace) -> NDArray[np.intp]:
+    """Steps to repeat: of each modality as many steps with its measurement, evenly spaced."""
+    if (
+        trace.predicted_covariance is None
+        or trace.particles is not None
+        or not trace.has_covariance
+        or trace.task.rotations
+    ):
+        return np.empty(0, dtype=np.intp)
+    beliefs = 1 + 3 * len(trace.task.components)
+    count = int(np.clip(COST * len(trace) / beliefs, 1, MOST))
+    candidates = np.flatnonzero(counted(trace)[1:]) + 1
+    used = np.ones((len(trace), 1), bool)
+    if trace.innovation is not None:
+        used = np.asarray(np.isfinite(trace.innovation).any(-1))
+    chosen = [at for column in used.T if len(at := candidates[column[candidates]])]
+    each = -(-count // max(1, len(chosen)))
+    rows = [at[np.linspace(0, len(at) - 1, min(each, len(at))).astype(int)] for at in chosen]
+    return np.unique(np.concatenate(rows)) if rows else np.empty(0, dtype=np.intp)
 
 
-def _slopes(trace: Trace, used: Mask, corrections: dict[int, Array]) -> dict[int, float]:
-    """Modality k -> slope on its corrections (T, n), in standard deviations of the prediction.
+class RepeatedSteps:
+    """J steps of a filter from B = 1 + 3 n beliefs each.
 
-    Of the steps that use no modality without corrections. used: (T, K) whether there is an update.
+    They are the filter's own belief, and those with a larger mean, a smaller mean and a larger variance of each
+    component.
+
+    Attributes:
+        mean: (J, B, n) predictions. covariance: (J, B, n, n) of these.
+        innovation: (J, B, K, m), if there are any, NaN without a measurement. size: (J, B, K, m, m) their covariance,
+            0 without a measurement.
+        correction, posterior: (J, n) and (J, n, n), from the filter's own belief.
     """
-    belief = prediction(trace)
-    if belief is None or (covariance := belief[1]) is None:
-        return {}
-    columns = np.stack([np.where(used[:, [k]], x, 0.0) for k, x in corrections.items()], axis=-1)  # (T, n, C)
-    made = trace.task.difference(trace.estimate_mean.astype(np.float64), belief[0])
-    others = np.delete(used, list(corrections), axis=1)
-    finite = np.isfinite(columns).all((1, 2)) & np.isfinite(covariance).all((1, 2))
-    keep = np.flatnonzero(counted(trace) & used.any(1) & ~others.any(1) & finite)
-    keep = keep[(np.linalg.eigvalsh(covariance[keep]) > 0.0).all(-1)]
-    if len(keep) < MIN_STEPS:
-        return {}
-    factor = np.linalg.cholesky(covariance[keep])
-    x, y = np.linalg.solve(factor, columns[keep]), np.linalg.solve(factor, made[keep, :, None])
-    slopes, _, rank, _ = np.linalg.lstsq(x.reshape(-1, x.shape[-1]), y.ravel(), rcond=1e-6)
-    return dict(zip(corrections, slopes.tolist(), strict=True)) if rank == len(corrections) else {}
+
+    def __init__(self, trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> None:
+        """Raises BadInput if the filter fails."""
+        self.steps, self.task, n = steps, trace.task, len(trace.task.components)
+        before = trace.estimate_mean[steps - 1].astype(np.float64)
+        covariance = trace.estimate_covariance[steps - 1].astype(np.float64)
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        smallest = SMALLEST_SHIFT * np.abs(trace.estimate_mean).max(0)
+        self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
+        unit, none = np.eye(n), np.zeros((n, n))
+        shifts = np.concatenate([none[:1], unit, -unit, none]) * self.shift[:, None]
+        growths = np.concatenate([none[:1], none, none, unit]) * self.growth[:, None]  # (J, B, n)
+        start = Gaussian(
+            torch.from_numpy((before[:, None] + shifts).reshape(-1, n)),
+            torch.from_numpy((covariance[:, None] + growths[..., None] * unit).reshape(-1, n, n)),
+        )
+        episodes = [trace.episode.part(step, step + 1) for step in steps for _ in range(shifts.shape[1])]
+        values, _ = checkpoint.run(episodes, start=start)
+        arrays = {k: v[0].unflatten(0, (len(steps), -1)).double().numpy() for k, v in values.items()}
+        rows, first = np.arange(len(steps)), _least_certain(arrays["predicted_covariance"][:, 0])
+        self.mean, self.covariance = (arrays[f"predicted_{name}"][rows, :, first] for name in ("mean", "covariance"))
+        self.correction = self.task.difference(arrays["estimate_mean"][:, 0], self.mean[:, 0])
+        self.posterior = arrays["estimate_covariance"][:, 0]
+        if trace.innovation is not None:
+            self.innovation, self.size = arrays["innovation"], np.nan_to_num(arrays["innovation_covariance"])
+
+    def are_same(self, trace: Trace) -> bool:
+        """Whether the filter's own beliefs give the trace's predictions, so that they are its whole state."""
+        belief = prediction(trace)
+        if belief is None or belief[1] is None:
+            return False
+        mean, covariance = belief[0][self.steps], belief[1][self.steps]
+        moved = self.task.difference(mean, self.mean[:, 0]) / _std(covariance)
+        grown = _weights(covariance) * (covariance - self.covariance[:, 0])
+        return bool(max(np.abs(moved).max(), np.abs(grown).max()) < SAME)  # False if they are not finite
+
+    def dynamics_errors(self) -> Array:
+        """(n,) of the columns of F."""
+        columns = self._dynamics_jacobian().mT
+        expected = self.growth[..., None, None] * columns[..., :, None] * columns[..., None, :]  # (J, i, n, n)
+        weights = _weights(self.covariance[:, :1])
+        return _relative(weights * (self._growth(self.covariance) - expected), weights * expected, (-2, -1))
+
+    def measurement_errors(self) -> Array:
+        """(K,) of the modalities' H."""
+        h = self._measurement_jacobian()[:, None]
+        expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT  # (J, i, K, m, m)
+        weights = _weights(self.size[:, :1])
+        return _relative(weights * (self._growth(self.size) - expected), weights * expected, (1, -2, -1))
+
+    def slopes(self) -> Array:
+        """(K,) of the corrections; NaN without a measurement."""
+        h, prior = self._measurement_jacobian(), self.covariance[:, :1]
+        noise, innovation = self.size[:, 0] - h @ prior @ h.mT, np.nan_to_num(self.innovation[:, 0])
+        parts = (self.posterior[:, None] @ h.mT @ np.linalg.pinv(noise) @ innovation[..., None])[..., 0]  # (J, K, n)
+        std = _std(prior[:, 0])
+        columns = (parts / std[:, None]).swapaxes(1, 2).reshape(-1, parts.shape[1])
+        slopes = np.linalg.lstsq(columns, (self.correction / std).ravel(), rcond=1e-9)[0]
+        return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
+
+    def _dynamics_jacobian(self) -> Array:
+        """(J, n, n) derivative of the predicted mean."""
+        return np.moveaxis(self._derivative(self.task.difference(self.mean, self.mean[:, :1])), 1, -1)
+
+    def _measurement_jacobian(self) -> Array:
+        """(J, K, m, n) derivative of the predicted measurements by the prediction; 0 without a measurement."""
+        by_mean = np.moveaxis(self._derivative(self.innovation), 1, -1)
+        return np.nan_to_num(-by_mean @ np.linalg.pinv(self._dynamics_jacobian())[:, None])
+
+    def _derivative(self, values: Array) -> Array:
+        """(J, n, ...) derivatives of (J, B, ...) by each component of the mean."""
+        n = self.shift.shape[1]
+        difference = values[:, 1 : n + 1] - values[:, n + 1 : 2 * n + 1]
+        return np.asarray(difference / (2.0 * self.shift.reshape(*self.shift.shape, *(1,) * (values.ndim - 2))))
+
+    def _growth(self, values: Array) -> Array:
+        """(J, n, ...) growth of (J, B, ...) with the variance of each component."""
+        return np.asarray(values[:, 1 + 2 * self.shift.shape[1] :] - values[:, :1])
+
+
+def _least_certain(covariance: Array) -> NDArray[np.intp]:
+    """(J,) index of the belief before all updates, from covariances (J, K, n, n) before each of them."""
+    return np.asarray(np.linalg.slogdet(covariance)[1].argmax(-1))
+
+
+def _std(covariance: Array) -> Array:
+    """(..., n) standard deviations."""
+    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+
+def _weights(covariance: Array) -> Array:
+    """(..., n, n) inverse products of the standard deviations; 0 for a variance of 0."""
+    std = _std(covariance)
+    inverse = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0.0)
+    return np.asarray(inverse[..., :, None] * inverse[..., None, :])
+
+
+def _relative(difference: Array, expected: Array, axes: tuple[int, ...]) -> Array:
+    """(S,) root of the sum of squares over axes, relative to that of the expected values; median over the first axis.
+
+    Of arrays (J, S, ...) after the sums; NaN where nothing is expected.
+    """
+    error, size = np.square(difference).sum(axes), np.square(expected).sum(axes)
+    known = np.where(size > 0.0, np.sqrt(error / np.where(size > 0.0, size, 1.0)), np.nan)
+    return np.array([np.median(v) if len(v := column[np.isfinite(column)]) else np.nan for column in known.T])

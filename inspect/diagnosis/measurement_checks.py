@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,21 +25,16 @@ def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -
     return _functions(trace, models) | _likelihoods(trace, models)
 
 
-@dataclass(frozen=True)
-class ModelledSensor:
-    """A vector sensor of a modality whose readings a model expects. columns: of its A channels in the innovations."""
+def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
+    """Models of the sensors of modality k, and the columns of their channels among its innovations.
 
-    model: ReadingModel
-    columns: list[int]
-
-
-def sensors_in(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[ModelledSensor]:
-    """Sensors of modality k with models, if its innovations have the channels of all its sensors."""
+    None if the innovations do not have the channels of all sensors.
+    """
     by_key, start = {model.key: model for model in models}, 0
     sensors = []
     for key in trace.task.modalities.get(trace.modalities[k], ()):
         if (model := by_key.get(key)) is not None:
-            sensors.append(ModelledSensor(model, [start + i for i in model.channels]))
+            sensors.append((model, [start + i for i in model.channels]))
         start += math.prod(trace.task.observations[key])
     width = 0 if trace.innovation is None else trace.innovation.shape[-1]
     return sensors if start <= width else []
@@ -59,10 +54,9 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
     keep = counted(trace)
     values: dict[str, float] = {}
     for k in range(len(trace.modalities)):
-        for sensor in sensors_in(trace, k, models):
-            model = sensor.model
+        for model, columns in _sensors(trace, k, models):
             readings = readings_of(trace.episode, model.key)
-            h = readings[:, model.channels] - trace.innovation[:, k, sensor.columns]
+            h = readings[:, model.channels] - trace.innovation[:, k, columns]
             first, last = (model.relative(h - model.expected(end))[keep] for end in ends)
             outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first)
             for i, channel in enumerate(model.channels):

@@ -68,9 +68,9 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
     Statistics that do not apply are absent, such as those of measurement functions without models of the readings.
     """
     has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
-    if external:
+    if isinstance(checkpoint, ExternalFilter):
         values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
-        values |= measurement_model_statistics(trace, readings) | jacobian_statistics(trace, readings)
+        values |= measurement_model_statistics(trace, readings) | jacobian_statistics(trace, checkpoint)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if has_truth:

@@ -26,10 +26,23 @@ DRIFT = Cause(
 )
 """A bias that the filter does not estimate, such as that of a gyroscope."""
 
+JACOBIAN = Cause(
+    "dynamics.jacobian",
+    "Jacobian of the dynamics wrong",
+    (Symptom("prediction jacobian/*"),),
+    f"{_dynamics('error', 'nis', 'slope', 'spread')}|process noise/*|{FILTER}",
+    "Compare the Jacobian of the dynamics with finite differences: signs, columns, the time step.",
+)
+"""A derivative in the prediction of the covariance, other than that of the predicted mean."""
+
 
 def external_causes(task: Task) -> tuple[Cause, ...]:
     """Causes that show in the predictions and innovations of an external filter only."""
-    return (DRIFT, *(cause for modality, keys in task.modalities.items() for cause in _of_updates(modality, keys)))
+    return (
+        DRIFT,
+        JACOBIAN,
+        *(cause for modality, keys in task.modalities.items() for cause in _of_updates(modality, keys)),
+    )
 
 
 def in_predictions(cause: Cause) -> Cause:
@@ -46,8 +59,11 @@ def in_predictions(cause: Cause) -> Cause:
         cause = replace(cause, symptoms=(Symptom("dynamics slope/*", -1),))
         consequences += "|dynamics spread/*"
     is_smaller = cause.name in ("dynamics.frozen", "dynamics.inverted")
-    lowers = f"{cause.lowers}|process noise/*" if is_smaller else cause.lowers
-    return replace(cause, consequences=consequences, lowers=lowers)
+    if not is_smaller:
+        return replace(cause, consequences=consequences)
+    return replace(
+        cause, consequences=f"{consequences}|prediction jacobian/*", lowers=f"{cause.lowers}|process noise/*"
+    )
 
 
 def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
@@ -98,7 +114,7 @@ def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             (
                 Symptom(
                     f"measurement jacobian/{modality}/*",
-                    otherwise=(Symptom(f"correction slope/{modality}/*", 0),),
+                    otherwise=(Symptom(f"correction slope/{modality}/*", -1),),
                 ),
             ),
             f"measurement function/*|correction slope/*|measurement jacobian/*|{FILTER}",

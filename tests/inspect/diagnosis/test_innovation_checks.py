@@ -91,10 +91,12 @@ class Boat:
         offset: float = 0.0,
         separate: bool = False,
         jacobian: float | Array = 1.0,
+        heading_jacobian: float = 1.0,
     ) -> None:
         self.factors = {"radar": radar, "compass": compass}
         self.wraps, self.has_bias, self.updates = wraps, has_bias, updates
-        self.turn, self.offset, self.separate, self.jacobian = turn, offset, separate, np.asarray(jacobian)
+        self.turn, self.offset, self.separate = turn, offset, separate
+        self.jacobian, self.heading_jacobian = np.asarray(jacobian), heading_jacobian
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.mean, self.covariance, self.random = mean, covariance, np.random.default_rng(0)
@@ -105,6 +107,7 @@ class Boat:
         turn = 0.1 * self.turn * (controls[1] - (bias if self.has_bias else 0.0))
         mean, jacobian = np.array([x + speed * c, y + speed * s, heading + turn, bias]), np.eye(4)
         jacobian[:2, 2], jacobian[2, 3] = (-speed * s, speed * c), -0.1 if self.has_bias else 0.0
+        jacobian[:2, 2] *= self.heading_jacobian
         noise = np.diag([1e-4, 1e-4, 4e-6, 1e-8])
         covariance = jacobian @ self.covariance @ jacobian.T + noise
         beliefs, innovations, covariances = [], [], []
@@ -217,6 +220,7 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),
         (Boat(jacobian=-1.0), "measurement.radar.jacobian"),
         (Boat(jacobian=0.5), "measurement.radar.jacobian"),
+        (Boat(heading_jacobian=-1.0), "dynamics.jacobian"),
     ],
 )
 def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:

@@ -119,7 +119,7 @@ def test_a_guessed_map_imports_the_recording(tmp_path: Path) -> None:
     [
         ('time = "sim"\n', "", 'timelines sim, number: add time = "sim"'),
         ('"sim"', '"simulated"', "timeline 'simulated' does not exist. Available: log_time, number, sim"),
-        ('"/imu"', '"/imi"', "topic of column '/imi'"),
+        ('"/imu"', '"/imi"', "topic in column '/imi'"),
         ('"/imu"', '"/stage"', "has text"),
     ],
 )
