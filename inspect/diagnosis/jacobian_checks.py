@@ -40,8 +40,8 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 
     ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality, as these products do not show the sign of the filter's H: slope of the corrections
-    on ``P+ H^T R^-1 nu``, from -1 to 1. It is 1 with joint updates, and nearly so with others.
+    ``correction slope``, by modality: slope of the corrections on ``P+ H^T R^-1 nu``, from -1 to 1, since these products
+    do not show the sign of the filter's H. It is 1 with joint updates, and nearly so with others.
     """
     steps, module = _steps(trace), checkpoint.adapter.module
     if not len(steps) or has_own_start(module) or not is_stepwise(module):
