@@ -119,8 +119,8 @@ TASK_OF_FILES = option(
 OPTIONS: dict[str, Any] = {
     "task": argument(
         "TASK",
-        "Task: door, push, door-field, push-field, push-real, a variant, or your own as FILE.py:NAME (docs/data.md). "
-        "Its name is enough if --data or a checkpoint contains its definition.",
+        "Task: door, push, door-field, push-field, push-field-yaw, push-real or a variant of it (docs/data.md), or "
+        "your own as FILE.py:NAME. The name is enough if --data or a checkpoint contains the definition.",
     ),
     "filter": option(
         "NAME|CHECKPOINT|FILE.py:FUNCTION",

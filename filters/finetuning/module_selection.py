@@ -54,13 +54,13 @@ PRESETS: dict[str, tuple[str, ...]] = {
 model's image encoders, which would make a step many times slower; ``all`` and custom patterns can include them."""
 
 PRESET_HELP = {
-    "weights-only": "Learns when to rely on which modality; each modality estimates as before.",
-    "noise-only": "Learns the size of process and measurement noise; the estimates of each modality stay the same.",
-    "reliability-only": "Learns how far to trust each measurement: its noise and the fusion weights. What each "
-    "modality measures stays the same, which makes it the safest choice for sensor faults.",
-    "dynamics-only": "Learns the prediction of the next state; all measurements stay the same.",
-    "heads-only": "Learns the output layers; all features stay the same.",
-    "all": "Learns everything, image encoders included: the largest effect, slow, and likely to regress elsewhere.",
+    "weights-only": "Trains the fusion weights; the measurements of each modality stay the same.",
+    "noise-only": "Trains the size of process and measurement noise; the measurements of each modality stay the same.",
+    "reliability-only": "Trains the noise of each measurement and the fusion weights. The measurements themselves stay "
+    "the same, so this is the safest choice for sensor faults.",
+    "dynamics-only": "Trains the prediction of the next state; all measurements stay the same.",
+    "heads-only": "Trains the output layers; all features stay the same.",
+    "all": "Trains everything, including image encoders: the largest effect, slow, and likely to regress elsewhere.",
 }
 """Preset -> effect. For that of a modality see ``preset_help``."""
 
@@ -68,7 +68,7 @@ PRESET_HELP = {
 def preset_help(name: str) -> str:
     """The effect of a preset in words."""
     modality = name.removesuffix("-only")
-    return PRESET_HELP.get(name, f"Learns what {modality} measures and its noise; all other modules stay the same.")
+    return PRESET_HELP.get(name, f"Trains the measurements of {modality} and their noise; other modules stay the same.")
 
 
 DESCRIPTIONS = {

@@ -104,7 +104,7 @@ class Counterfactual(Diagnostic):
         others = {name: peak for name, peak in self._peaks().items() if name not in self._main()}
         for name, (change, step, unit) in others.items() if len(others) <= MAX_OTHERS else ():
             text += f" and the {name} by up to {change:.3g} {unit} ({self._at(step)})"
-        text = f"{text}: {self._recovery()}. "
+        text = f"{text}, {self._recovery()}. "
         main = self.task.main_error
         errors = (self.error, self.counterfactual_error)
         before, after = (main.factor * float(error[self.during].mean()) for error in errors)
@@ -114,16 +114,16 @@ class Counterfactual(Diagnostic):
     def _recovery(self) -> str:
         """Largest difference in standard deviations, and when the run with the intervention recovered."""
         largest = float(self.sigmas[self.first :].max())
-        text = f"at most {largest:.1f} standard deviations of the original"
+        text = f"at most {largest:.1f} standard deviations of the original run"
         if largest <= RECOVERED or self.to >= len(self.sigmas):
             return text
         if self.recovery is None:
-            return f"{text}, not recovered by the last step"
+            return f"{text}, and did not recover by the last step"
         delay = self.recovery - self.to
         if not delay:
-            return f"{text}, recovered immediately after the intervention"
+            return f"{text}, and recovered immediately after the intervention"
         seconds = "" if self.time is None else f" ({self.time[self.recovery] - self.time[self.to]:.2f} s)"
-        return f"{text}, recovered {plural(delay, 'step')}{seconds} after the intervention"
+        return f"{text}, and recovered {plural(delay, 'step')}{seconds} after the intervention"
 
     def _at(self, step: int) -> str:
         """A step, and its time where the data have timestamps."""

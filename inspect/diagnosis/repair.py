@@ -195,7 +195,7 @@ def smallest_repair(
         return None
     search = Candidates(checkpoint, trace, failure, clean)
     if len(search.filter.names) < 2 and clean is None:
-        raise BadInput(f"filter {checkpoint.name!r} has one measurement model: without it nothing is measured")
+        raise BadInput(f"filter {checkpoint.name!r} has only one measurement model: dropping it leaves no measurement")
     error = float(np.sqrt(np.square(main_error(trace)[failure[0] : failure[1] + 1, -1]).mean()))
     for count in range(1, len(search.modalities) + 1):
         candidates = search.longest(count)

@@ -189,7 +189,7 @@ def _run(trace: Trace) -> Passage:
     if task.start_distance:
         start = "Runs start at an offset from the true state, with a covariance that matches the distance"
     elif not measures.starts_at_truth(trace):
-        start = "Runs start at a belief of the filter or its user"
+        start = "Runs start at a first belief that the filter or its user sets"
     elif trace.has_covariance:
         start += ", with covariance 0.1 $I$ in units of the training set's standard deviations"
     excluded = f"exclude the first {task.warmup} steps of each episode, which depend on the start"

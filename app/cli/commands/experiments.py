@@ -12,7 +12,7 @@ def experiments(
     sort: str = opt.option("COLUMN", "Column of the overview that ranks the checkpoints, worst first.", "error"),
     top: int = opt.option("N", "Number of rows.", 20, parser=opt.integer(1)),
     sql: str | None = opt.option(
-        "QUERY", "Run this SQL query (DuckDB) of the tables results, checkpoints and datasets instead.", None
+        "QUERY", "Run this SQL query (DuckDB) over the tables results, checkpoints and datasets instead.", None
     ),
     output: Path | None = opt.output_file("FILE", "Write all rows to a file: .csv or .parquet.", ".csv", ".parquet"),
 ) -> console.Result:

@@ -38,7 +38,10 @@ class Learning:
         None,
     )
     events: list[str] | None = opt.option(
-        "EPISODE[:FIRST-LAST]", "Restrict the slices to these steps. Repeatable.", None, "--event"
+        "EPISODE[:FIRST-LAST]",
+        "Restrict the slices to an episode, or to some of its steps. Repeatable.",
+        None,
+        "--event",
     )
     data: Path | None = None
     skip_bad: bool = False

@@ -30,7 +30,7 @@ def sweep(
     engine: opt.Engine = "local",
     workers: int = 1,
 ) -> console.Result:
-    """Run many checkpoints over many episodes; store a table.
+    """Run many checkpoints over many episodes and store a table.
 
     DIR/results.parquet has one row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES,
     coverage, fusion weights and the provenance of the episode. DIR/checkpoints.parquet has one row for each checkpoint,

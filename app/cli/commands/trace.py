@@ -15,7 +15,7 @@ def trace(
     weights as output by the network and effective weights, particles and their ancestors. Estimates are bit-identical
     to those of a run without tracing. To limit memory, at most --particles-kept particles are stored in each step, and
     episodes of more than 4096 steps are read and written in parts (but not with --faults, --align or an external
-    filter). Read a trace in Python with beliefscope.inspect.trace.load_trace.
+    filter). Read a trace in Python with beliefscope.load_trace.
 
     \b
     Examples:

@@ -260,7 +260,7 @@ export class Diagnosis {
     if (host.hidden || !trace) return;
     const { data } = trace.selection;
     const source = isOld
-      ? 'The healthy record lacks statistics of this version.'
+      ? 'The healthy record lacks some statistics of this version.'
       : 'The record was measured in this workspace.';
     const about = `${source} Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
     html('.verdict', host).textContent = stateOf(entry) || (isInUse || isOld ? about : '');

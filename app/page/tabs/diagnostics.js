@@ -333,5 +333,5 @@ function summary(result) {
   if (result.state === 'ready') return result.result.verdict;
   if (result.state === 'refused' || result.state === 'error') return sentence(result.error);
   if (result.state === 'active' || result.state === 'ended') return jobSummary(result.job);
-  return result.state === 'absent' ? 'Takes a while: computed on request.' : 'Computing …';
+  return result.state === 'absent' ? 'Slow: computed on request.' : 'Computing …';
 }

@@ -37,7 +37,7 @@ const ACTIONS = {
   active: 'Cancel',
 };
 const SLICES_NOTE =
-  'A slice is a condition, or two, under which the score is larger, tested over episodes. A click opens its worst step, if possible in an episode that no slice above opens.';
+  'A slice is one condition, or two, under which the score is larger, tested over episodes. A click opens its worst step.';
 const MAX_RESULTS = 8; // in the cache
 
 /**

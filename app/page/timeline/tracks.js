@@ -295,7 +295,7 @@ const isSequenceModel = (kind) => kind === 'lstm' || kind === 'transformer';
 /** @param {string} kind of the filter */
 function missingInnovation(kind) {
   if (kind === 'pf')
-    return 'None: a particle filter weights its particles and does not measure the state.';
+    return 'None: a particle filter has likelihoods of its particles in place of measurements.';
   if (isSequenceModel(kind)) return 'None: the network has no separate prediction and measurement.';
   return 'None: this filter does not report its predictions and measurements.';
 }
