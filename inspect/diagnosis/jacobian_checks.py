@@ -40,7 +40,7 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 
     ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality: slope of the corrections on ``P+ H^T R^-1 nu``, from -1 to 1, since these products
+    ``correction slope``, by modality: slope of the corrections on ``P+ H^T R^-1 nu``, from -1 to 1, as these products
     do not show the sign of the filter's H. It is 1 with joint updates, and nearly so with others.
     """
     steps, module = _steps(trace), checkpoint.adapter.module
