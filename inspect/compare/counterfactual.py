@@ -204,7 +204,12 @@ class Counterfactual(Diagnostic):
             curves.append(Curve(layer_label(m), scale * self.modality_distance[:, k], chart, unit, m))
         curves.append(
             Curve(
-                "fused", self.sigmas, "Distance in standard deviations of the original", "", "fused", (0.0, RECOVERED)
+                "fused",
+                self.sigmas,
+                "Distance in standard deviations of the original run",
+                "",
+                "fused",
+                (0.0, RECOVERED),
             )
         )
         for layer_error, name in ((self.error, "original"), (self.counterfactual_error, "with intervention")):

@@ -210,7 +210,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
         kept, total = trace.particles.shape[1], trace.particle_count
         return f"the trace has {kept} of {total} particles; trace with --particles-kept {total}"
     if trace.ancestors is None and trace.prior_log_weights is None and has_equal_weights(trace):
-        return f"all particles of {trace.filter} have the same weight in every step: see the diagnostic ensemble"
+        return f"all particles of {trace.filter} have the same weight in every step: see the diagnostic Ensemble"
     return None
 
 

@@ -106,7 +106,7 @@ class Shapley(Diagnostic):
             parts = changes[0].format(f"the {main.name} RMSE"), *(change.format("it") for change in changes[1:])
             empty, complete = main.text(values.rmse[0, 0]), main.text(values.rmse[-1, 0])
             sentences.append(
-                f"{PHASE_NAMES.get(values.phase, 'Over all steps')} {', '.join(parts)} "
+                f"{PHASE_NAMES.get(values.phase, 'Over all steps')}, {', '.join(parts)} "
                 f"({empty} with {self.baseline}, {complete} with "
                 f"{'all modalities' if len(self.modalities) > 1 else display_name(self.modalities[0])})."
             )

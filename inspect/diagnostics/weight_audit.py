@@ -166,7 +166,9 @@ class WeightAudit(Diagnostic):
         source = "beta" if self.beta_is_effective else "effective_weights"
         correlations = [pair for other in OTHERS if (pair := self.correlation(source, name, other))]
         if correlations:
-            parts.append(f"Correlation of its weight: {', '.join(map(_description, correlations))}.")
+            parts.append(
+                f"Correlation of the weight of {display_name(name)}: {', '.join(map(_description, correlations))}."
+            )
         return " ".join(parts)
 
     def _comparison_with_constant_weights(self) -> str:

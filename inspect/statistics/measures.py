@@ -26,7 +26,7 @@ def layers(trace: Trace) -> tuple[str, ...]:
     return (*trace.modalities, "fused")
 
 
-UPDATES_NOTE = "Updates start from the fused prior; the diagnostic standalone measures each modality by itself."
+UPDATES_NOTE = "Updates start from the fused prior; the diagnostic Standalone modalities measures each by itself."
 """Part of every verdict that compares modalities by their updates."""
 
 

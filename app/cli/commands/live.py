@@ -18,7 +18,7 @@ def live(
 
     Runs the filter over one episode step by step, at the robot's rate. The dashboard (beliefscope serve --workspace
     DIR) shows the steps as they arrive. They are also written to DIR/live/NAME.live and NAME.rrd; data survive any
-    exit, including Ctrl-C and kill. To record a filter in your own loop, use beliefscope.recordings.live.LiveRecorder
+    exit, including Ctrl-C and kill. To record a filter in your own loop, use beliefscope.LiveRecorder
     (docs/live.md).
 
     \b

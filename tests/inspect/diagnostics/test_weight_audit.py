@@ -100,7 +100,7 @@ def test_regret_of_a_worked_example() -> None:
     )
     assert "constant weights: too few episodes (1; at least 5 needed)." in result.verdict
     assert UPDATES_NOTE in result.verdict
-    assert f"diagnostic {DIAGNOSTICS['standalone'].name} " in UPDATES_NOTE
+    assert f"diagnostic {DIAGNOSTICS['standalone'].title} " in UPDATES_NOTE
 
 
 def test_angles_wrap() -> None:
