@@ -333,6 +333,18 @@ test('measures as text', () => {
   );
 });
 
+test('the measures of a posterior whose estimate is off the map', () => {
+  const far = { ...maps, quantity: 'posterior', estimate: [0.5, 2.05, 0] };
+  assert.deepEqual(shapeName(far, 2), ['estimate off the map']);
+  assert.equal(
+    layerMeasures(far, 2, false).cells.at(-1),
+    'estimate off the map, at −50.0, +5.0 cm',
+  );
+  assert.equal(layerMeasures(far, 2, false).cells[0], '–');
+  assert.equal(shapeName({ ...far, quantity: 'likelihood' }, 2)[0].slice(0, 4), 'ring');
+  assert.equal(shapeName({ ...far, estimate: [1.2, 2, 0] }, 2)[0].slice(0, 4), 'ring');
+});
+
 test('SVG drawing', () => {
   const context = new SvgContext();
   context.save();

@@ -63,6 +63,7 @@ const WHITE = [
 ];
 // px; the marks leave the middle open, so that a sharp peak stays visible, and none covers another one.
 const MARK = { circle: 6, corner: 10, leg: 4, square: 9, arms: [13, 19], gap: 9 };
+const ARROW = { shaft: 16, leg: 6 }; // px, towards an estimate off the map
 /** Two standard deviations, and the standard deviation of a Gaussian from the area of its 95 % region. */
 const [SIGMAS, AREA95] = [2, Math.PI * 5.991];
 const DIRECTIONS = [
@@ -272,9 +273,13 @@ function drawMarks(context, layer, side, { cloud, zoom, hover }) {
   const single = name !== 'fused' && trace.fuses;
   if (single) {
     const mean = axes.map(({ index, scale }) => (trace.mean(name, index)?.[step] ?? NaN) / scale);
-    drawModalityEstimate(context, project(mean), lineStyle(name));
+    const place = project(mean);
+    if (isOutside(place, side)) drawArrow(context, place, side, lineStyle(name));
+    else drawModalityEstimate(context, place, lineStyle(name));
   }
-  drawEstimate(context, project(axes.map(({ index }) => estimate[index])));
+  const place = project(axes.map(({ index }) => estimate[index]));
+  if (isOutside(place, side)) drawArrow(context, place, side, lineStyle('fused'));
+  else drawEstimate(context, place);
   if (hover) drawCrosshair(context, project(hover.map((d, i) => centre[i] + d)), side);
 }
 
@@ -395,6 +400,37 @@ function drawEstimate(context, [x, y]) {
       context.moveTo(tipX - leg * (dx - dy), tipY - leg * (dy - dx));
       context.lineTo(tipX, tipY);
       context.lineTo(tipX - leg * (dx + dy), tipY - leg * (dy + dx));
+    }
+  });
+}
+
+/**
+ * @param {number[]} position px
+ * @param {number} side px
+ */
+const isOutside = (position, side) => position.some((value) => value < 0 || value > side);
+
+/**
+ * Draws an arrow at the border of the map towards an estimate outside of it.
+ * @param {Context} context
+ * @param {number[]} position px
+ * @param {number} side px
+ * @param {LineStyle} style
+ */
+function drawArrow(context, [x, y], side, { stroke }) {
+  const half = side / 2;
+  const [right, down] = [x - half, y - half];
+  const reach = (half - 2) / Math.max(Math.abs(right), Math.abs(down));
+  const [tipX, tipY] = [half + reach * right, half + reach * down];
+  const length = Math.hypot(right, down);
+  const [dx, dy] = [right / length, down / length];
+  const { shaft, leg } = ARROW;
+  strokeAll(context, [HALO, [stroke, 2]], () => {
+    context.moveTo(tipX - shaft * dx, tipY - shaft * dy);
+    context.lineTo(tipX, tipY);
+    for (const turn of [-1, 1]) {
+      context.moveTo(tipX, tipY);
+      context.lineTo(tipX - leg * (dx - turn * dy), tipY - leg * (dy + turn * dx));
     }
   });
 }

@@ -5,9 +5,11 @@
 /** @import { Reference } from './reference_maps.js' */
 
 import { displayName, displayUnit, fixed, mainName, percent, signed } from '../core/units.js';
-import { areaUnit, cellAt, rangeDigits, rangeLabels, valueAt } from './map_values.js';
+import { areaUnit, cellAt, offsetOffMap, rangeDigits, rangeLabels, valueAt } from './map_values.js';
 
 export const QUANTITY_NAMES = { likelihood: 'Likelihood', posterior: 'Posterior' };
+
+const OFF_MAP = 'estimate off the map';
 
 /** @param {number | null} radians */
 const degrees = (radians) => (radians === null ? null : (radians * 180) / Math.PI);
@@ -79,6 +81,11 @@ export function colourTitle(quantity, scale, range, reference) {
  * @param {boolean} world whether the axes show world coordinates
  */
 export function layerMeasures(maps, layer, world) {
+  const off = posteriorOffMap(maps, layer);
+  if (off) {
+    const short = `${OFF_MAP}, at ${positionText(maps, off, world)}`;
+    return { cells: ['–', '–', '–', '–', short], description: short };
+  }
   const { log_max: logMax, numbers } = maps;
   const { unit, scale } = areaUnit(maps.axes);
   const peak = positionText(maps, maps.peak[layer], world);
@@ -161,7 +168,17 @@ export function colourScale(quantity, scale, range, layers, reference) {
  * @param {Maps} maps
  * @param {number} layer
  */
-export const shapeName = (maps, layer) => shapeText(maps, layer).short.split(', ').slice(0, 2);
+export const shapeName = (maps, layer) =>
+  posteriorOffMap(maps, layer) ? [OFF_MAP] : shapeText(maps, layer).short.split(', ').slice(0, 2);
+
+/**
+ * Returns the offset of the estimate if the layer is its posterior and it is off the map: the measures of the map are
+ * then those of an edge. Null otherwise.
+ * @param {Maps} maps
+ * @param {number} layer
+ */
+const posteriorOffMap = (maps, layer) =>
+  maps.quantity === 'posterior' && maps.layers[layer] === 'fused' ? offsetOffMap(maps) : null;
 
 /**
  * Returns the labels of the colour bar of small maps of several steps, whose colours have the same ends.

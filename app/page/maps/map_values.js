@@ -247,6 +247,17 @@ export const offsetOf = ({ axes, centre }, position) =>
   });
 
 /**
+ * Returns the offset of the estimate from the centre if it is off the maps; null otherwise.
+ * @param {Pick<Maps, 'axes' | 'centre' | 'estimate'>} maps
+ */
+export function offsetOffMap(maps) {
+  const { axes, estimate } = maps;
+  const position = axes.map(({ index }) => estimate[index]);
+  const offset = offsetOf(maps, position);
+  return offset.some((d, i) => Math.abs(d) > axes[i].half_width) ? offset : null;
+}
+
+/**
  * Returns whether maps are curves over one component.
  * @param {Pick<Maps, 'axes'>} maps
  */
