@@ -87,7 +87,8 @@ def _load_user_task(name: str) -> Task:
     place, _, attribute = name.rpartition(":")
     key = (str(Path(place).resolve()) if place.endswith(".py") else place, attribute)
     if key not in _user_tasks:
-        module = user_code.load_module(place)
+        with user_code.importable(place):
+            module = user_code.load_module(place)
         task = getattr(module, attribute, None)
         if not isinstance(task, Task):
             available = ", ".join(n for n, value in vars(module).items() if isinstance(value, Task)) or "none"

@@ -72,9 +72,12 @@ class Dataset(ABC):
 
     def __getitem__(self, index: int) -> Episode:
         """Read an episode. Raises BadInput for an index out of range or invalid data."""
+        self._check_index(index)
+        return self._episode(index)
+
+    def _check_index(self, index: int) -> None:
         if not 0 <= index < len(self):
             raise BadInput(f"Episode {index} is not in {self.path}, which has episodes 0 to {len(self) - 1}.")
-        return self._episode(index)
 
     def in_parts(self, index: int) -> Episode | EpisodeParts:
         """An episode that is read in parts, if it is long and the file allows it. Raises BadInput as ``[index]``."""

@@ -31,7 +31,7 @@ from beliefscope.datasets.readers.mit_push import MitPushDataset, is_mit_push
 from beliefscope.datasets.readers.paper_authors import PaperDataset, is_paper_file
 from beliefscope.datasets.readers.push_real_task import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.task_json import difference, task_to_json
+from beliefscope.datasets.task_json import check_definition, difference, task_to_json
 
 EXAMINED = 100
 """Files of a folder that are searched for data files; data sets of other formats have thousands."""
@@ -125,9 +125,10 @@ for _kind in (EpisodeFile, MitPushDataset, PaperDataset):
 def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> None:
     """Write episodes to a file, which is replaced atomically, and its index. The same episodes give the same bytes.
 
-    Raises BadInput if the file cannot be written.
+    Raises BadInput, and writes nothing, if the definition of the task is inconsistent or the file cannot be written.
     """
     path = Path(path)
+    check_definition(task)  # otherwise the file could not be opened
     if not path.parent.is_dir():
         raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.")
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -243,6 +243,8 @@ class Task:
 
     def __post_init__(self) -> None:
         """Fill in the default map, and the unit for display of lengths in a large space."""
+        if wrong := [part for part in self.components if not isinstance(part, Component)]:
+            raise BadInput(f'task {self.name!r:.200}: component {wrong[0]!r:.200}, expected Component("x", "m").')
         if not self.map_components:
             first = self.components[:2]
             alike = [c.name for c in first if c.unit == first[0].unit]

@@ -220,6 +220,8 @@ def _check_points(task: Task, place: str) -> None:
 def _check_covariates(task: Task, place: str) -> None:
     groups = ["all", "blackout"]
     for name, covariate in task.covariates.items():
+        if not isinstance(covariate, Covariate):
+            raise BadInput(f'{place}: covariate {name!r:.200} is {covariate!r:.200}, expected Covariate("boolean").')
         where, cuts = f"{place}: covariate {name!r:.200}", covariate.cuts
         if not name or "/" in name or covariate.kind not in get_args(Kind) or not isinstance(covariate.unit, str):
             raise BadInput(f"{where} has kind {covariate.kind!r:.200}, expected one of {', '.join(get_args(Kind))}.")

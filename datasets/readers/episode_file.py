@@ -84,6 +84,7 @@ class EpisodeFile(Dataset):
 
     def in_parts(self, index: int) -> Episode | EpisodeParts:
         """An episode that is stored in chunks of steps is read in parts."""
+        self._check_index(index)
         group = self._group(index)
         steps = self._summary(group, 0).steps
         if steps <= STEPS_PER_PART or any(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -308,6 +309,14 @@ def test_external_hdf5_file_is_rejected(tmp_path: Path) -> None:
 def test_unknown_episode(path: Path, index: int) -> None:
     with open_dataset(path) as data, pytest.raises(BadInput, match=f"Episode {index} is not in .* 0 to 1"):
         data[index]
+    with open_dataset(path) as data, pytest.raises(BadInput, match=f"Episode {index} is not in .* 0 to 1"):
+        data.in_parts(index)
+
+
+def test_an_inconsistent_task_is_refused_before_its_episodes_are_written(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="dt is 0 s"):
+        write_dataset(tmp_path / "set.h5", replace(DOOR, dt=0), [random_episode()])
+    assert not list(tmp_path.iterdir())
 
 
 def test_unknown_task() -> None:

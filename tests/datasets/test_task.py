@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.catalog import TASKS, find_task, load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
-from beliefscope.datasets.task_json import difference, task_from_json, task_to_json
+from beliefscope.datasets.task_json import check_definition, difference, task_from_json, task_to_json
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
@@ -29,6 +30,22 @@ def test_unknown_names_list_the_available_ones() -> None:
         find_task("dor")
     with pytest.raises(BadInput, match=r"component 'hinge_z' of task 'door' .*Available: hinge_x, hinge_y, angle"):
         find_task("door").index("hinge_z")
+
+
+def test_parts_of_the_wrong_type_are_refused() -> None:
+    with pytest.raises(BadInput, match=r"component 'hinge_x', expected Component\("):
+        replace(DOOR, components=("hinge_x",))  # type: ignore[arg-type]
+    with pytest.raises(BadInput, match=r"covariate 'fix' is 'boolean', expected Covariate\("):
+        check_definition(replace(DOOR, covariates={"fix": "boolean"}))  # type: ignore[dict-item]
+
+
+def test_the_file_of_a_task_imports_files_next_to_it(tmp_path: Path) -> None:
+    (tmp_path / "lengths_of_it.py").write_text("UNIT = 'mm'\n")
+    (tmp_path / "own.py").write_text(
+        "import beliefscope as bs\nfrom lengths_of_it import UNIT\n"
+        "TASK = bs.Task('rod', (bs.Component('x', UNIT),), {'gauge': (1,)}, {'gauge': ('gauge',)}, 0, 0.1)\n"
+    )
+    assert load_task(f"{tmp_path / 'own.py'}:TASK").components[0].unit == "mm"
 
 
 @pytest.mark.parametrize(
