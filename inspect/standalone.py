@@ -30,6 +30,16 @@ def check_standalone(checkpoint: Checkpoint, modality: str) -> None:
         raise BadInput(f"Modality {modality!r} is not in this filter. Available: {', '.join(modalities)}.")
 
 
+def removal_note(checkpoint: Checkpoint) -> str:
+    """Warning about runs of an external filter without some sensors, if it takes their replacements for measurements."""
+    if not isinstance(checkpoint, ExternalFilter) or checkpoint.adapter.absent == "nan":
+        return ""
+    return (
+        "A removed sensor reads its mean over the episode, which the filter takes for a measurement; one that skips "
+        'missing readings takes Adapter(absent="nan").'
+    )
+
+
 def standalone_runs(traces: Sequence[Trace], checkpoint: Checkpoint | None) -> dict[str, list[Trace]]:
     """Modality -> standalone run of each trace; empty for one modality, and without checkpoint."""
     if checkpoint is None:

@@ -21,7 +21,7 @@ from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.fusion_gaps import Reason, reasons_of
 from beliefscope.inspect.diagnostics.standalone_modalities import why_not
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
-from beliefscope.inspect.standalone import standalone_errors
+from beliefscope.inspect.standalone import removal_note, standalone_errors
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife, too_few
 from beliefscope.inspect.statistics.measures import GROUPS, Mask
@@ -74,6 +74,7 @@ class FusionEfficiency(Diagnostic):
         fused, best: (T,) m, position errors of the filter and of the best combination.
         standalone: (T, K) m, position errors of the standalone filters.
         contact, blackout: (T,) masks.
+        note: ``removal_note`` of the filter.
     """
 
     task: Task
@@ -87,9 +88,13 @@ class FusionEfficiency(Diagnostic):
     standalone: Array
     contact: Mask
     blackout: Mask
+    note: str = ""
 
     @property
     def verdict(self) -> str:
+        return f"{self._result()} {self.note}".strip()
+
+    def _result(self) -> str:
         total = self.phases[0]
         main = self.task.main_error
         alone = [
@@ -201,6 +206,7 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
         standalone=position[:, 1:],
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
+        note=removal_note(checkpoint),
     )
 
 

@@ -21,6 +21,7 @@ from beliefscope.filters.rollout import rollout
 from beliefscope.filters.subsets import modalities_of, subset_evidence
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.standalone import removal_note
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, too_few
 from beliefscope.inspect.trace import Trace
@@ -75,6 +76,7 @@ class Shapley(Diagnostic):
         position_values: (T, K) Shapley values of the position error.
         estimate_values: (T, K, n) Shapley values of the estimate.
         contact, blackout: (T,) masks.
+        note: ``removal_note`` of the filter.
     """
 
     task: Task
@@ -91,6 +93,7 @@ class Shapley(Diagnostic):
     estimate_values: Array
     contact: Mask
     blackout: Mask
+    note: str = ""
 
     @property
     def verdict(self) -> str:
@@ -120,7 +123,7 @@ class Shapley(Diagnostic):
             sentences.append(f"Runs start at the true state, which favours {self.baseline}.")
         if why := too_few(self.trajectories):
             sentences.append(f"No intervals: {why}.")
-        return " ".join(sentences)
+        return " ".join(sentences + [self.note] * bool(self.note))
 
     @property
     def baseline(self) -> str:
@@ -317,6 +320,7 @@ def shapley(
         estimate_values=np.einsum("ks,tsn->tkn", weights, errors[0][:keep]),
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
+        note=removal_note(checkpoint),
     )
 
 
@@ -354,7 +358,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
 ENTRY = Entry(
     name="shapley",
     title="Shapley values",
-    question="How much does each modality lower or raise the error, in contact and in free motion?",
+    question="How much does each modality lower or raise the error, overall and by phase?",
     run=shapley,
     why_not=why_not,
     needs="checkpoint",

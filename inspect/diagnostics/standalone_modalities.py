@@ -17,7 +17,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
-from beliefscope.inspect.standalone import standalone_errors
+from beliefscope.inspect.standalone import removal_note, standalone_errors
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife, too_few
 from beliefscope.inspect.statistics.measures import Mask
@@ -61,6 +61,7 @@ class StandaloneModalities(Diagnostic):
         fused: (T,) m, position error of the filter.
         updates, standalone: (T, K) m, position errors of the updates and of the standalone filters.
         contact, blackout: (T,) masks.
+        note: ``removal_note`` of the filter.
     """
 
     task: Task
@@ -73,9 +74,13 @@ class StandaloneModalities(Diagnostic):
     standalone: Array
     contact: Mask
     blackout: Mask
+    note: str = ""
 
     @property
     def verdict(self) -> str:
+        return f"{self._result()} {self.note}".strip()
+
+    def _result(self) -> str:
         total, main = self.phases[0], self.task.main_error
         numbers = []
         for name, update, alone in zip(self.modalities, total.updates[:, 0], total.standalone[:, 0], strict=True):
@@ -180,6 +185,7 @@ def standalone_modalities(
         standalone=position[:, 1 + len(modalities) :],
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
+        note=removal_note(checkpoint),
     )
 
 

@@ -44,15 +44,14 @@ def evaluate(
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.start_offset import StartOffset
     from beliefscope.inspect.accuracy_tables import accuracy_tables
-    from beliefscope.inspect.standalone import check_standalone
+    from beliefscope.inspect.standalone import check_standalone, removal_note
 
     checkpoint, faults = runs.open()
     if only is not None:
         check_standalone(checkpoint, only)
     offset = StartOffset.parse(start_offset, checkpoint.task)
     with runs.episodes(checkpoint.task) as data:
-        data_hash, held_out = data.hash, [data[index] for index in data.held_out()]
-    held_out = runs.check(checkpoint, held_out, align)
+        data_hash, held_out = data.hash, runs.check(checkpoint, [data[i] for i in data.held_out()], align)
     with console.progress("Evaluating") as advance:
         metrics = measure(
             checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
@@ -81,4 +80,5 @@ def evaluate(
     }
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {plural(len(held_out), 'episode')}"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
-    return console.Result(document, "\n\n".join(map(str, accuracy_tables(title, metrics))))
+    text = "\n\n".join([*map(str, accuracy_tables(title, metrics)), removal_note(checkpoint)]).strip()
+    return console.Result(document, text)

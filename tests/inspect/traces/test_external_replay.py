@@ -36,7 +36,7 @@ EXAMPLE = str(Path(__file__).parents[3] / "examples" / "04_own_filter.py:build")
 
 
 def external(filter_: Any, **adapter: Any) -> ExternalFilter:
-    return ExternalFilter(Adapter(filter_, batched=False, absent="nan", **adapter), vehicle.TASK, "mine")
+    return ExternalFilter(Adapter(filter_, batched=False, **{"absent": "nan", **adapter}), vehicle.TASK, "mine")
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +106,15 @@ def test_absent_sensors_have_their_mean() -> None:
     readings = without(episode, ["gps"], "mean", slice(0, 50)).observations["gps"]
     np.testing.assert_allclose(readings[:50], np.tile(np.nanmean(episode.observations["gps"], 0), (50, 1)), rtol=1e-5)
     np.testing.assert_array_equal(readings[50:], episode.observations["gps"][50:])
+
+
+def test_runs_with_the_mean_of_a_removed_sensor_say_so() -> None:
+    for absent, expected in (("nan", False), ("mean", True)):
+        filter_ = external(vehicle.NumpyKalman(), absent=absent)
+        run = trace(filter_, vehicle.drive(2))
+        for name in ("standalone", "efficiency", "shapley"):
+            verdict = DIAGNOSTICS[name]([run], filter_).verdict
+            assert ('Adapter(absent="nan")' in verdict) == expected, name
 
 
 def test_shapley_values_add_up() -> None:
