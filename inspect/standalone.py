@@ -31,7 +31,7 @@ def check_standalone(checkpoint: Checkpoint, modality: str) -> None:
 
 
 def removal_note(checkpoint: Checkpoint) -> str:
-    """Warning about runs of an external filter without some sensors, if it takes their replacements for measurements."""
+    """Warning about runs without some sensors, if an external filter takes their replacements for measurements."""
     if not isinstance(checkpoint, ExternalFilter) or checkpoint.adapter.absent == "nan":
         return ""
     return (

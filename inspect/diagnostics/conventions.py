@@ -33,6 +33,9 @@ MAX_AXES = 3
 DELAY = 2
 """Steps by which a modality, or the controls, are delayed."""
 
+MAX_BARS = 5
+"""Number of changes in the plot; the table has all."""
+
 RELEVANT = 0.2
 """Smallest share of an error whose removal the verdict mentions."""
 
@@ -135,12 +138,15 @@ class Conventions(Diagnostic):
         return [Table("Errors with other conventions", columns, tuple(rows), note)]
 
     def plots(self) -> list[Plot]:
-        texts = tuple(change.text for change in self.changes)
-        x = np.arange(len(texts), dtype=np.float64)
+        """The changes that remove most; bars below -100 %, of errors that more than double, are cut off."""
+        first = np.argsort(-self.share.max(1), kind="stable")[:MAX_BARS]
+        texts = tuple(self.changes[i].text for i in first)
+        x, share = np.arange(len(texts), dtype=np.float64), np.maximum(self.share[first], -1.0)
         lines = tuple(
-            Line(name, x, 100.0 * self.share[:, j], layer="" if j else "fused") for j, name in enumerate(self.errors)
+            Line(name, x, 100.0 * share[:, j], layer="" if j else "fused") for j, name in enumerate(self.errors)
         )
-        return [Plot("Removed error", "", "% of the RMS error", lines, "bars", names=texts)]
+        more = f", first {len(first)} of {len(self.changes)} changes" if len(first) < len(self.changes) else ""
+        return [Plot(f"Removed error{more}", "", "% of the RMS error", lines, "bars", names=texts)]
 
 
 def changes_of(task: Task, modalities: Sequence[str], episode: Episode) -> tuple[Change, ...]:

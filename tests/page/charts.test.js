@@ -12,6 +12,7 @@ import { trackHeights } from '../../app/page/timeline/layout.js';
 import { areShares, upperEdges } from '../../app/page/timeline/stacked_weights.js';
 import { withMovedBorder } from '../../app/page/timeline/track_sizes.js';
 import { TRACKS, tracks } from '../../app/page/timeline/tracks.js';
+import { wrapped } from '../../app/page/widgets/plots.js';
 import { FUSION, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
@@ -21,6 +22,14 @@ const state = { component: 'hinge_x', weights: 'effective', track: 'error', char
 /** @param {number[][]} rows */
 const series = (...rows) =>
   rows.map((values, i) => ({ name: String(i), values: Float32Array.from(values) }));
+
+test('names of categories are wrapped between words', () => {
+  assert.equal(
+    wrapped('channels 0 and 2 of gps fix exchanged', 16),
+    'channels 0 and 2\nof gps fix\nexchanged',
+  );
+  assert.equal(wrapped('image', 3), 'image');
+});
 
 test('series are stacked if they sum to one at each step', () => {
   assert.ok(areShares(series([0.25, 1, NaN], [0.75, 0, NaN])));

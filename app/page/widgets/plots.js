@@ -29,6 +29,7 @@ const DASHES = [
   [4, 2],
   [12, 4],
 ];
+const [NAME_LENGTH, NAME_LINE] = [16, 15]; // of categories: characters in a line, px of its height
 const MARGIN = 0.06; // of a range, above and below
 
 /**
@@ -44,6 +45,7 @@ export function drawPlot(parent, plot) {
   const canvas = create('div', { className: 'canvas', role: 'img' });
   canvas.ariaLabel = `${plot.title}: ${plot.y_label} over ${plot.x_label}`;
   const figure = create('figure', {}, head, canvas);
+  figure.classList.toggle('wide', Boolean(plot.names?.length)); // names need room
   parent.append(figure);
   const xs = plot.lines.flatMap((line) => line.x);
   const barWidth = plot.kind === 'bars' ? smallestDistance(xs) : 0;
@@ -189,14 +191,36 @@ export function axisStyle() {
   };
 }
 
-/** @param {string[]} names */
-const namedTicks = (names) => ({
-  space: 1,
-  size: scaled(58),
-  rotate: 38,
-  values: (/** @type {uPlot} */ _, /** @type {number[]} */ splits) =>
-    splits.map((value) => names[value] ?? ''),
-});
+/**
+ * Returns the ticks of categories, whose names are wrapped.
+ * @param {string[]} names
+ */
+function namedTicks(names) {
+  const texts = names.map((name) => wrapped(name, NAME_LENGTH));
+  const lines = Math.max(...texts.map((text) => text.split('\n').length));
+  return {
+    space: 1,
+    size: scaled(4 + NAME_LINE * lines),
+    values: (/** @type {uPlot} */ _, /** @type {number[]} */ splits) =>
+      splits.map((value) => texts[value] ?? ''),
+  };
+}
+
+/**
+ * Breaks a text between words into lines of a length, which longer words exceed.
+ * @param {string} text
+ * @param {number} length characters
+ */
+export function wrapped(text, length) {
+  /** @type {string[]} */
+  const lines = [];
+  for (const word of text.split(' ')) {
+    const longer = lines.length ? `${lines[lines.length - 1]} ${word}` : word;
+    if (lines.length && longer.length <= length) lines[lines.length - 1] = longer;
+    else lines.push(word);
+  }
+  return lines.join('\n');
+}
 
 /**
  * Returns the smallest and the largest finite value.

@@ -90,6 +90,14 @@ def test_single_traces_have_no_intervals() -> None:
     assert len(result.tables()[0].columns) == 2 + 2 * len(result.errors)
 
 
+def test_the_plot_shows_the_changes_that_remove_most() -> None:
+    result = conventions(traces(MIRRORED)[:1], filter_())
+    (plot,) = result.plots()
+    assert plot.title == f"Removed error, first 5 of {len(result.changes)} changes"
+    assert plot.names == tuple(row[0] for row in result.tables()[0].rows[:5])
+    assert min(line.y.min() for line in plot.lines) >= -100.0
+
+
 @pytest.mark.long
 def test_repeated_episodes_are_separate_runs() -> None:
     """Traces of one episode, as with several seeds, cannot run together; pooled twice, they have the same shares."""
