@@ -63,6 +63,9 @@ MIN_HEALTHY = 10
 COUNTED = ("steps", "gray levels")
 """Units with a singular."""
 
+LARGE = 1e6
+"""Magnitude from which numbers have an exponent, such as those of a filter that diverges."""
+
 MIN_EFFECT = 0.5
 """Minimum difference of an alarm, in standard deviations between healthy episodes."""
 
@@ -314,7 +317,7 @@ def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.2g}" if abs(value) < 10 else f"{value:.0f}"
+    return f"{value:.0f}" if 10 <= abs(value) < LARGE else f"{value:.2g}"
 
 
 def no_diagnosis(checkpoint: Checkpoint) -> str | None:

@@ -18,6 +18,8 @@ test('fixed uses a true minus sign and a dash for missing values', () => {
   assert.equal(fixed(1.25, 2), '1.25');
   assert.equal(fixed(-1.25, 2), '−1.25');
   assert.equal(fixed(-0.01), '0.0');
+  assert.equal(fixed(9999999.9), '9999999.9');
+  assert.equal(fixed(-1.1366969e22, 2), '−1.14e22');
   for (const value of [null, undefined, NaN, Infinity]) assert.equal(fixed(value), '–');
 });
 

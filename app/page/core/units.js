@@ -75,6 +75,11 @@ export const typeset = (text) =>
     .replace(/(?<=\d) deg\b/g, '°')
     .replace(/\(deg\b/g, '(°');
 
+const LARGE = 1e7; // numbers from here have an exponent, such as those of a filter that diverges
+
+/** @param {number} value */
+const exponential = (value) => value.toExponential(2).replaceAll('-', '−').replace('e+', 'e');
+
 /**
  * Formats a number with fixed digits and a true minus sign; a dash for a missing number.
  * @param {number | null | undefined} value
@@ -82,6 +87,7 @@ export const typeset = (text) =>
  */
 export function fixed(value, digits = 1) {
   if (value === null || value === undefined || !Number.isFinite(value)) return '–';
+  if (Math.abs(value) >= LARGE) return exponential(value);
   const text = value.toFixed(digits);
   return /^-[0.]*$/.test(text) ? text.slice(1) : text.replace('-', '−');
 }
@@ -102,8 +108,7 @@ export function significant(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return '–';
   const size = Math.abs(value);
   if (Number.isInteger(value) && size < 1e6) return fixed(value, 0);
-  if (size >= 1e6 || size < 1e-4)
-    return value.toExponential(2).replaceAll('-', '−').replace('e+', 'e');
+  if (size >= 1e6 || size < 1e-4) return exponential(value);
   return fixed(value, Math.max(0, 2 - Math.floor(Math.log10(size))));
 }
 

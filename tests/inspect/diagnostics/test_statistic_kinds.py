@@ -79,3 +79,9 @@ def test_a_deviation_is_written_in_its_unit() -> None:
     unit, factor = unit_of("error//all", TASKS["door"])
     deviation = Deviation("error//all", 0.05, 0.017, 0.015, 0.021, 0.01, True, 3.0, unit, factor)
     assert deviation.text == "RMS position error is 5 cm, healthy 1.7 cm (1.5 to 2.1)"
+
+
+def test_the_numbers_of_a_filter_that_diverges_have_an_exponent() -> None:
+    unit, factor = unit_of("error//all", TASKS["door"])
+    deviation = Deviation("error//all", 1.8e17, 0.017, 0.015, 0.021, 0.01, True, 3.0, unit, factor)
+    assert deviation.text == "RMS position error is 1.8e+19 cm, healthy 1.7 cm (1.5 to 2.1)"
