@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.task import Task
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice, fault_slice
-from beliefscope.filters.finetuning.success import Criterion
+from beliefscope.filters.finetuning.success import ERROR, Criterion, measures
 from beliefscope.inspect.diagnosis.finetune_settings import training_for, training_on
 
 PROBABLE = 0.2
@@ -54,9 +55,18 @@ def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, epi
         text = f"Probability {cause['probability']:.2f}: {evidence['text']}"
         if (recovered := cause["recovered"]) and recovered["error"] is not None:
             text += f"; undoing it removes {percent(recovered['error'], 'z.0f')} of the {recovered['measure']} error"
+            settings = _measured_by(settings, recovered["measure"], filter_.task)
         title = diagnosis["headline"] if cause is diagnosis["causes"][0] else cause["title"]
         at = episode if evidence["episode"] is None else evidence["episode"]
         yield Weakness("diagnosis", title, f"{text}.", at, evidence["step"], settings)
+
+
+def _measured_by(settings: FineTune, error: str, task: Task) -> FineTune:
+    """Settings whose criterion, if it is about an error, is about that which the cause increases."""
+    name = next((name for name, title in measures(task).items() if title == error), ERROR)
+    if settings.success is None or settings.success.measure != ERROR:
+        return settings
+    return replace(settings, success=replace(settings.success, measure=name))
 
 
 def injected(faults: Faults, filter_: Filter, episode: int) -> Iterator[Weakness]:

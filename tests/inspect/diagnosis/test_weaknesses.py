@@ -2,8 +2,11 @@
 
 from dataclasses import replace
 
+import pytest
+
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
-from beliefscope.inspect.diagnosis.weaknesses import untrained
+from beliefscope.inspect.diagnosis.weaknesses import diagnosed, untrained
 
 
 def test_a_fault_that_a_filter_was_fine_tuned_on_is_not_offered_again() -> None:
@@ -12,3 +15,14 @@ def test_a_fault_that_a_filter_was_fine_tuned_on_is_not_offered_again() -> None:
     settings = weakness.settings.to_json()
     assert [item["slice"]["faults"][0]["fault"] for item in settings["mix"]] == ["image_noise"]
     assert not list(untrained(replace(checkpoint, record={"base": {"settings": settings}})))
+
+
+@pytest.mark.parametrize(("measure", "expected"), [("angle", "angle"), ("position", "error")])
+def test_the_criterion_is_about_the_error_that_the_cause_increases(measure: str, expected: str) -> None:
+    """A frozen image of a door increases the error of the angle, hardly that of the hinge."""
+    filter_ = load_checkpoint(pretrained_path("door", "crossmodal-ekf")).filter
+    recovered = {"error": 0.3, "low": None, "high": None, "nll": 4.6, "measure": measure}
+    cause = {"cause": "image.frozen", "title": "", "probability": 1.0, "evidence": [], "recovered": recovered}
+    (weakness,) = diagnosed({"causes": [cause], "headline": ""}, filter_, Faults.parse("image_frozen=40"), 9)
+    assert weakness.settings.success is not None
+    assert weakness.settings.success.measure == expected
