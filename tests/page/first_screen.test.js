@@ -21,7 +21,7 @@ const run = (last, contact = 5) =>
     mainUnit: 'cm',
     steps: STEPS,
     modalities: ['image', 'haptics'],
-    components: [{ name: 'x' }],
+    components: [{ name: 'x' }, { name: 'hinge_x' }],
     header: {},
     stepLabel: (/** @type {number} */ step) => `step ${step}`,
     weightWidth: 1,
@@ -124,7 +124,22 @@ test('a fault comes first, then the outage, then the largest error', () => {
     headline: 'Image frozen from step 31.',
     evidence: 'Share of repeated images is 0.7.',
     step: 33,
+    component: undefined,
   });
+  const recovered = { error: 0.3, low: null, high: null, nll: 1, measure: 'hinge x' };
+  const confirmed = finding(run(14), 0, {
+    ...FAULT,
+    causes: [
+      {
+        ...FAULT.causes[0],
+        recovered,
+        steps: null,
+        evidence: [{ text: 'share of repeated images is 0.7', step: null }],
+      },
+    ],
+  });
+  assert.match(confirmed.evidence, /is 0\.7\. Undoing it removes 30 % of the hinge x error\.$/);
+  assert.deepEqual([confirmed.component, confirmed.step], ['hinge_x', 10], 'the largest error');
   assert.equal(finding(run(14), 0, { ...FAULT, masked: true }).tone, 'warn');
   const unknown = finding(run(14), 0, { ...FAULT, state: 'unsure', causes: [] });
   assert.deepEqual([unknown.tone, unknown.step], ['warn', 10]);

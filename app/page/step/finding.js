@@ -1,7 +1,7 @@
 /** The finding of a run in words: the diagnosis, an injected fault, an outage, or its largest error. */
 
 /** @import { Trace } from '../data/trace.js' */
-/** @import { Diagnosis } from '../types/server.js' */
+/** @import { Diagnosis, DiagnosisCause } from '../types/server.js' */
 
 import { SHOWN } from '../core/constants.js';
 import { displayName, fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
@@ -10,6 +10,7 @@ import { stepSummary, weightScope } from './step_summary.js';
 
 const MIN_STEPS = 5; // of an outage
 const MIN_CHANGE = 0.05; // of a weight
+const MIN_RECOVERED = 0.05; // share of the error that an undo removes
 const BEFORE = 10; // steps that are compared with the outage
 
 /**
@@ -18,6 +19,7 @@ const BEFORE = 10; // steps that are compared with the outage
  * @property {string} headline
  * @property {string} evidence
  * @property {number | null} step that shows it best
+ * @property {string} [component] state component that shows it best; undefined if the main error does
  */
 
 /**
@@ -29,7 +31,7 @@ const BEFORE = 10; // steps that are compared with the outage
  * @returns {Finding}
  */
 export function finding(trace, component, diagnosis) {
-  const fault = diagnosis && diagnosis.state !== 'healthy' ? faultFinding(diagnosis) : null;
+  const fault = diagnosis && diagnosis.state !== 'healthy' ? faultFinding(trace, diagnosis) : null;
   if (fault?.evidence) return fault;
   const injected = trace.header.faults ? injectedFinding(trace, component) : null;
   if (injected) {
@@ -71,20 +73,38 @@ function healthyHeadline(trace, component, { headline, miscalibrated }) {
 }
 
 /**
+ * Describes a fault, with the share of the error that its undo removes. A fault without steps of its own shows where the
+ * error is largest.
+ * @param {Trace} trace
  * @param {Diagnosis} diagnosis of a run that is not healthy
  * @returns {Finding}
  */
-function faultFinding({ state, masked, headline, causes }) {
+function faultFinding(trace, { state, masked, headline, causes }) {
   const [cause] = causes.filter(({ probability }) => probability >= SHOWN);
   const evidence = (cause?.evidence ?? []).slice(0, 1);
   const step = evidence[0]?.step ?? cause?.steps?.[0] ?? null;
+  const sentences = evidence.map(({ text }) => sentence(text));
+  const recovered = cause?.recovered;
+  if (recovered?.error && recovered.error >= MIN_RECOVERED)
+    sentences.push(
+      `Undoing it removes ${percent(recovered.error)} of the ${recovered.measure} error.`,
+    );
   return {
     tone: state === 'fault' && !masked ? 'bad' : 'warn',
     headline: sentence(headline.replaceAll('`', '')),
-    evidence: typeset(evidence.map(({ text }) => sentence(text)).join(' ')),
-    step,
+    evidence: typeset(sentences.join(' ')),
+    step: step ?? largest(trace.error('fused', 'main') ?? []),
+    component: affectedComponent(trace.components, cause),
   };
 }
+
+/**
+ * Returns the state component whose error a cause increases most; undefined if that is the main error, or unknown.
+ * @param {{name: string}[]} components
+ * @param {Pick<DiagnosisCause, 'recovered'> | undefined} cause
+ */
+export const affectedComponent = (components, cause) =>
+  components.find(({ name }) => displayName(name) === cause?.recovered?.measure)?.name;
 
 /**
  * Describes the injected faults, and the errors before and with them, or the largest one if they are in all steps.

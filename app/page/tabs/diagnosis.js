@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
-/** @import { Catalog, Diagnosis as Result, HealthyRecord } from '../types/server.js' */
+/** @import { Catalog, Diagnosis as Result, DiagnosisCause, HealthyRecord } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
@@ -11,6 +11,7 @@ import { SHOWN } from '../core/constants.js';
 import { create, html } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
+import { affectedComponent, largest } from '../step/finding.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
 import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
@@ -200,21 +201,38 @@ export class Diagnosis {
     if (result === this.#listed) return;
     this.#listed = result;
     const causes = (result?.causes ?? []).filter(({ probability }) => probability >= SHOWN);
-    const openStep = (/** @type {number} */ episode, /** @type {number} */ step) =>
-      this.#store.set({ episode, step, playing: false });
     const rows = causes.map((cause, i) => {
       const canTrain = this.#starts && !i && isTrainable(cause);
-      return causeItem(cause, openStep, canTrain ? [this.#finetuneButton()] : []);
+      const open = (/** @type {number} */ e, /** @type {number | null} */ s) =>
+        this.#openStep(e, s, cause);
+      return causeItem(cause, open, canTrain ? [this.#finetuneButton()] : []);
     });
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
-    const items = deviations.map((deviation) => evidenceItem(deviation, openStep));
+    const items = deviations.map((deviation) =>
+      evidenceItem(deviation, (e, s) => this.#openStep(e, s)),
+    );
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';
     html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;
     html('.gain', this.#host).hidden = !isHealthy || !this.#trace?.fuses;
     html('.about', this.#host).replaceChildren(...wholeOptions(result ? aboutOf(result) : ''));
+  }
+
+  /**
+   * Opens the step of an evidence, and charts the component whose error the cause increases. Evidence about a whole
+   * episode opens its first step, or where the error of the displayed episode is largest.
+   * @param {number} episode
+   * @param {number | null} step
+   * @param {DiagnosisCause} [cause]
+   */
+  #openStep(episode, step, cause) {
+    const { state } = this.#store;
+    const worst =
+      episode === state.episode ? largest(this.#trace?.error('fused', 'main') ?? []) : null;
+    const component = affectedComponent(this.#trace?.components ?? [], cause) ?? state.component;
+    this.#store.set({ episode, step: step ?? worst ?? 0, component, playing: false });
   }
 
   /**

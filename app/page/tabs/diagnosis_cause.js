@@ -6,7 +6,7 @@ import { create } from '../core/dom.js';
 import { fixed, percent, probabilityText, sentence, stepLabel, typeset } from '../core/units.js';
 import { copyButton } from '../widgets/copy_button.js';
 
-/** @typedef {(episode: number, step: number) => void} OpenStep */
+/** @typedef {(episode: number, step: number | null) => void} OpenStep step: null if the evidence has none */
 
 const PRESENT = 'Probability that this cause is present, alone or together with another one';
 
@@ -52,7 +52,7 @@ export function evidenceItem({ text, episode, step, time }, open) {
   const label =
     step === null ? `episode ${episode}` : `episode ${episode}, ${stepLabel(step, time)}`;
   const link = create('button', { type: 'button', className: 'text quiet', textContent: label });
-  link.addEventListener('click', () => open(episode, step ?? 0));
+  link.addEventListener('click', () => open(episode, step));
   item.append(' ', link);
   return item;
 }

@@ -16,6 +16,8 @@ export class FindingBar {
   #loading = new AbortController();
   /** @type {number | null} */
   #step = null;
+  /** @type {string | undefined} */
+  #component;
   /** Loads the run again, if that failed. @type {(() => void) | null} */
   #retry = null;
   /** @type {Trace | null} */
@@ -76,7 +78,9 @@ export class FindingBar {
 
   /** @param {number} inputTime */
   goToMoment(inputTime) {
-    if (this.#step !== null) this.#store.set({ step: this.#step, playing: false }, { inputTime });
+    if (this.#step === null) return;
+    const component = this.#component ?? this.#store.state.component;
+    this.#store.set({ step: this.#step, component, playing: false }, { inputTime });
   }
 
   /**
@@ -94,14 +98,14 @@ export class FindingBar {
    * @param {string} source
    * @param {(() => void) | null} [retry]
    */
-  #write({ tone, headline, evidence, step }, source, retry = null) {
+  #write({ tone, headline, evidence, step, component }, source, retry = null) {
     this.#host.classList.remove('stale');
     [this.#host.dataset.tone, this.#host.dataset.source] = [tone, source];
     const line = html('.sentence', this.#host);
     html('strong', line).textContent = headline;
     html('span', line).textContent = evidence;
     line.title = `${headline} ${evidence}`;
-    [this.#step, this.#retry] = [step, retry];
+    [this.#step, this.#component, this.#retry] = [step, component, retry];
     const button = html('.go-to-step', this.#host);
     button.classList.toggle('none', step === null && !retry);
     button.textContent = retry ? 'Try again' : `Go to step ${step ?? ''}`;
