@@ -216,8 +216,12 @@ test('small maps show the change to contact and the steps around the cursor', ()
   assert.deepEqual(steps(0), [11, 12, 0, 5, 10, 15, 20, 25]);
   assert.deepEqual(steps(99), [11, 12, 70, 75, 80, 85, 90, 99]);
   assert.deepEqual(tileSteps(contact, 27)[1], { step: 12, phase: 'contact', pair: true });
-  const short = tileSteps([0, 0, 0], 1).map((tile) => tile.step);
-  assert.deepEqual(short, [0, 1, 2]);
+  const short = tileSteps([0, 0, 0], 1);
+  assert.deepEqual(
+    short.map((tile) => tile.step),
+    [0, 1, 2],
+  );
+  assert.equal(short[0].phase, '', 'nothing is known about contact');
   const { values, low, high } = tileShade(maps, 2, 'normalised', 'own');
   assert.deepEqual([values[4], low, high], [1, 0, 1]);
   assert.ok(Math.abs(values[0] - Math.exp(-20)) < 1e-6);

@@ -19,7 +19,7 @@ const OPTIONS = [
     label: 'Steps',
     options: [
       ['one', 'current step'],
-      ['several', 'several, contact beside free motion'],
+      ['several', 'several'],
     ],
   },
   {

@@ -126,7 +126,7 @@ export class MapTiles {
       const head = buttons[column];
       const [label, text] = head.querySelectorAll('span');
       [label.textContent, text.textContent] = [String(step), phase];
-      head.ariaLabel = `Step ${step}, ${phase}`;
+      head.ariaLabel = `Step ${step}${phase && `, ${phase}`}`;
       for (let row = 0; row <= layers.length; row++) {
         const button = buttons[row * steps.length + column];
         button.dataset.step = String(step);
@@ -252,7 +252,8 @@ export class MapTiles {
     const name = this.#displayed.layers[Number(tile.dataset.row)];
     const position = positionText(maps, offset, this.#store.state.axes === 'world');
     const values = valuesAt(maps, maps.layers.indexOf(name), offset, null);
-    const title = `${displayName(name)}, step ${maps.step}, ${tile.dataset.phase}`;
+    const { phase } = tile.dataset;
+    const title = `${displayName(name)}, step ${maps.step}${phase && `, ${phase}`}`;
     this.#readout.show(title, [position, ...values], { x, y });
   }
 

@@ -142,7 +142,7 @@ const TILE_SPACINGS = 20; // of the run, between tiles around the cursor
  * While the cursor moves, most of these steps stay the same.
  * @param {ArrayLike<number | boolean>} contact
  * @param {number} step of the cursor
- * @returns {{step: number, phase: 'contact' | 'free', pair: boolean}[]}
+ * @returns {{step: number, phase: 'contact' | 'free' | '', pair: boolean}[]} phase: empty in a run without contact
  */
 export function tileSteps(contact, step) {
   const spacing = Math.max(1, Math.round(contact.length / TILE_SPACINGS));
@@ -155,11 +155,12 @@ export function tileSteps(contact, step) {
   );
   const distances = around.map((other) => Math.abs(other - step));
   around[distances.indexOf(Math.min(...distances))] = step;
+  const hasContact = Array.from(contact).some(Boolean);
   const onset = Array.from(contact).findIndex((value, t) => t > 0 && value && !contact[t - 1]);
   const pair = onset > 0 ? [onset - 1, onset] : [];
   return [...pair, ...around].map((t, i) => ({
     step: t,
-    phase: contact[t] ? 'contact' : 'free',
+    phase: contact[t] ? 'contact' : hasContact ? 'free' : '',
     pair: i < pair.length,
   }));
 }

@@ -38,6 +38,7 @@ const SETTLING = 500; // ms until the job of a selection starts
 export class Diagnosis {
   #host;
   #store;
+  #catalog;
   #starts;
   #repair;
   /** @type {Trace | null} */
@@ -68,6 +69,7 @@ export class Diagnosis {
   constructor(host, catalog, store, jobs, timeline) {
     this.#host = host;
     this.#store = store;
+    this.#catalog = catalog;
     this.#starts = !catalog.read_only;
     this.#repair = new Repair(html('.repair', host), jobs, timeline);
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
@@ -248,8 +250,10 @@ export class Diagnosis {
     choice(html('.choice', this.#host), [], '', () => {});
     const isReady = entry.state === 'ready'; // the run is loading again
     this.#writeHeadline(isReady ? 'Loading …' : sentence(reason));
-    const { data } = trace.selection;
-    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy. This and later episodes are then compared with them. More held-out episodes mean fewer false alarms for a single episode.`;
+    const { task, data } = trace.selection;
+    const sets = this.#catalog.tasks.find(({ name }) => name === task)?.data ?? [];
+    const other = sets.length > 1 ? ' If they are not, choose another data set above first.' : '';
+    const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy.${other} This and later episodes are then compared with them. More held-out episodes mean fewer false alarms for a single episode.`;
     const state = this.#starts
       ? stateOf(entry) || about
       : 'Read-only server: the record cannot be measured here.';
