@@ -55,6 +55,11 @@ def pretrained_path(task: str | Task, name: str) -> Path:
     available = [filter_ for filter_, path in paths.items() if is_built_in and path.is_file()]
     if name not in filters:
         raise unknown_name("filter", name, available)
+    if name not in available and task not in TASKS:
+        raise BadInput(
+            f"no pretrained {name!r} for your own task {task!r}: train one (beliefscope train FILE.py:TASK --data "
+            f"FILE.h5 --filter {name} -o FILE.safetensors) and give its file, or your own filter as FILE.py:FUNCTION."
+        )
     if name not in available:
         raise BadInput(
             f"no pretrained {name!r} for task {task!r}; train one: beliefscope train {task} --filter {name}. "

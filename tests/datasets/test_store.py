@@ -305,6 +305,11 @@ def test_external_hdf5_file_is_rejected(tmp_path: Path) -> None:
     check_rejected(path, "is an HDF5 file, but not a data set")
 
 
+def test_a_log_in_another_format_is_imported_first(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("t,x\n0,1\n")
+    check_rejected(tmp_path / "log.csv", "is not an HDF5 file; beliefscope import reads logs in other formats")
+
+
 @pytest.mark.parametrize("index", [-1, 2])
 def test_unknown_episode(path: Path, index: int) -> None:
     with open_dataset(path) as data, pytest.raises(BadInput, match=f"Episode {index} is not in .* 0 to 1"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, DeferredCheckpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
@@ -111,3 +113,9 @@ def test_a_deferred_checkpoint_checks_its_header(tmp_path: Path) -> None:
     path.write_bytes(pretrained_path("door", "crossmodal-ekf").read_bytes()[:1000])
     with pytest.raises(BadInput, match="not a readable safetensors file"):
         DeferredCheckpoint(path)
+
+
+def test_a_task_of_the_user_has_no_pretrained_filter() -> None:
+    own = replace(DOOR, name="own-door")
+    with pytest.raises(BadInput, match=r"your own task 'own-door': train one \(beliefscope train FILE.py:TASK --data "):
+        pretrained_path(own, "crossmodal-ekf")

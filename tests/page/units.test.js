@@ -46,7 +46,7 @@ test('significant keeps three digits', () => {
 test('percentages, sizes, angles and names', () => {
   assert.equal(percent(0.416), '42 %');
   assert.equal(percent(undefined), '–');
-  assert.deepEqual([512, 2.5e6, 3e9].map(formatBytes), ['1 kB', '2.5 MB', '3.0 GB']);
+  assert.deepEqual([512, 2.5e6, 3e9].map(formatBytes), ['512 B', '2.5 MB', '3.0 GB']);
   assert.deepEqual([190, -190, 10].map(wrapDegrees), [-170, 170, 10]);
   assert.equal(displayName('hinge_x'), 'hinge x');
   assert.equal(sentence('no maps'), 'No maps.');

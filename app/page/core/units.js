@@ -153,5 +153,6 @@ export const wrapDegrees = (degrees) => degrees - 360 * Math.round(degrees / 360
  */
 export function formatBytes(count) {
   if (count >= 1e9) return `${(count / 1e9).toFixed(1)} GB`;
+  if (count < 1e3) return `${count} B`;
   return count >= 1e6 ? `${(count / 1e6).toFixed(1)} MB` : `${Math.round(count / 1e3)} kB`;
 }
