@@ -229,6 +229,14 @@ test('the largest deviation of many components may be larger than that of few', 
   );
 });
 
+test('a variance that is not positive is named, not a number of deviations', () => {
+  const run = makeTrace(FUSION);
+  const largestDeviation = () => ({ sigmas: Infinity, component: 'hinge_x' });
+  const { tone, text } = stepSummary(Object.assign(run, { largestDeviation }), 0, 0);
+  assert.equal(tone, 'bad');
+  assert.match(text, /; the predicted variance of hinge x is not positive\./);
+});
+
 test('the summary explains an uninformative dominant modality', () => {
   const dark = makeTrace({ ...FUSION, blackout: { shape: [2], values: [1, 1] } });
   assert.match(stepSummary(dark, 1, 0).text, /although the image is blacked out\.$/);

@@ -65,6 +65,11 @@ function accuracy(trace, step) {
   const deviation = trace.largestDeviation(step);
   if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
   const { sigmas, component } = deviation;
+  if (sigmas === Infinity)
+    return {
+      tone: 'bad',
+      text: `${error}; the predicted variance of ${displayName(component)} is not positive.`,
+    };
   // The largest of several deviations is larger than one of them.
   const consistent = Math.sqrt(MAX_SIGMAS ** 2 + 2 * Math.log(trace.components.length));
   /** @type {[Tone, string]} */
