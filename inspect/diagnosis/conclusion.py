@@ -26,6 +26,7 @@ from beliefscope.inspect.diagnosis.cause import (
     matches,
     probability_text,
 )
+from beliefscope.inspect.diagnosis.causes.external_filters import CHECKS
 from beliefscope.inspect.diagnosis.deviations import (
     ALARM_RATE,
     Case,
@@ -228,6 +229,8 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
     if not isinstance(checkpoint, ExternalFilter):
         return text
     if not any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)()):
+        if cause.name in CHECKS:
+            return CHECKS[cause.name]
         text = re.sub(r"(, or train with noisy images| and fine-tune): `.*`", "", text)
         return re.sub(r"(Fine-tune|Calibrate) (it|them): `.*`", r"Correct \2 in the filter's own code", text)
     return re.sub(r" --train [\w-]+", "", text)  # its loss selects what is trained

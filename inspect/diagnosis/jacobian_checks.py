@@ -14,7 +14,7 @@ from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array, counted
 from beliefscope.inspect.trace import Trace
 
-MOST, COST = 4, 0.25
+MOST, COST = 6, 0.5
 """Largest number of repeated steps, and of all steps from other beliefs relative to those of the episode; at least one
 step of each modality is repeated."""
 
@@ -72,7 +72,7 @@ def _steps(trace: Trace) -> NDArray[np.intp]:
         or trace.task.rotations
     ):
         return np.empty(0, dtype=np.intp)
-    beliefs = 1 + 3 * len(trace.task.components)
+    beliefs = 2 + 3 * len(trace.task.components)
     count = int(np.clip(COST * len(trace) / beliefs, 1, MOST))
     candidates = np.flatnonzero(counted(trace)[1:]) + 1
     used = np.ones((len(trace), 1), bool)
@@ -85,10 +85,10 @@ def _steps(trace: Trace) -> NDArray[np.intp]:
 
 
 class RepeatedSteps:
-    """J steps of a filter from B = 1 + 3 n beliefs each.
+    """J steps of a filter from B = 2 + 3 n beliefs each.
 
-    They are the filter's own belief, and those with a larger mean, a smaller mean and a larger variance of each
-    component.
+    They are the filter's own belief, those with a larger mean, a smaller mean and a larger variance of each component,
+    and one with larger variances and covariances of all components, which shows the signs of columns.
 
     Attributes:
         mean: (J, B, n) predictions. covariance: (J, B, n, n) of these.
@@ -105,12 +105,12 @@ class RepeatedSteps:
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
         smallest = SMALLEST_SHIFT * np.abs(trace.estimate_mean).max(0)
         self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
-        unit, none = np.eye(n), np.zeros((n, n))
-        shifts = np.concatenate([none[:1], unit, -unit, none]) * self.shift[:, None]
-        growths = np.concatenate([none[:1], none, none, unit]) * self.growth[:, None]  # (J, B, n)
+        unit, none = np.eye(n), np.zeros((n + 1, n))
+        shifts = np.concatenate([none[:1], unit, -unit, none]) * self.shift[:, None]  # (J, B, n)
+        grown = np.concatenate([none, none[1:], unit, unit.sum(0, keepdims=True)]) * np.sqrt(self.growth)[:, None]
         start = Gaussian(
             torch.from_numpy((before[:, None] + shifts).reshape(-1, n)),
-            torch.from_numpy((covariance[:, None] + growths[..., None] * unit).reshape(-1, n, n)),
+            torch.from_numpy((covariance[:, None] + grown[..., None] * grown[..., None, :]).reshape(-1, n, n)),
         )
         episodes = [trace.episode.part(step, step + 1) for step in steps for _ in range(shifts.shape[1])]
         values, _ = checkpoint.run(episodes, start=start)
@@ -137,12 +137,13 @@ class RepeatedSteps:
         columns = self._dynamics_jacobian().mT
         expected = self.growth[..., None, None] * columns[..., :, None] * columns[..., None, :]  # (J, i, n, n)
         weights = _weights(self.covariance[:, :1])
-        return _relative(weights * (self._growth(self.covariance) - expected), weights * expected, (-2, -1))
+        growth = self._growth(self.covariance)[:, :-1]
+        return _relative(weights * (growth - expected), weights * expected, (-2, -1))
 
     def measurement_errors(self) -> Array:
         """(K,) of the modalities' H."""
         h = self._measurement_jacobian()[:, None]
-        expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT  # (J, i, K, m, m)
+        expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT  # (J, n + 1, K, m, m)
         weights = _weights(self.size[:, :1])
         return _relative(weights * (self._growth(self.size) - expected), weights * expected, (1, -2, -1))
 
@@ -172,7 +173,7 @@ class RepeatedSteps:
         return np.asarray(difference / (2.0 * self.shift.reshape(*self.shift.shape, *(1,) * (values.ndim - 2))))
 
     def _growth(self, values: Array) -> Array:
-        """(J, n, ...) growth of (J, B, ...) with the variance of each component."""
+        """(J, n + 1, ...) growth of (J, B, ...) with the variance of each component, and with all of them."""
         return np.asarray(values[:, 1 + 2 * self.shift.shape[1] :] - values[:, :1])
 
 

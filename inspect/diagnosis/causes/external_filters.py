@@ -35,12 +35,31 @@ JACOBIAN = Cause(
 )
 """A derivative in the prediction of the covariance, other than that of the predicted mean."""
 
+LARGE = Cause(
+    "dynamics.large",
+    "Predicted changes too large",
+    (Symptom("dynamics slope/*"),),
+    f"{_dynamics('error', 'nis', 'spread')}|prediction jacobian/*|process noise/*|{FILTER}",
+    "Check the time step, units and gains of the dynamics.",
+)
+"""The opposite of ``dynamics.frozen``, such as with a time step that is too long."""
+
+CHECKS = {
+    "dynamics.bias": "Check the inputs, frames and constants of the dynamics.",
+    "dynamics.frozen": LARGE.next,
+    "dynamics.broken": "Check the equations of the dynamics.",
+    "process_noise.small": "Compare Q with the errors of the predictions.",
+    "process_noise.large": "Compare Q with the errors of the predictions.",
+}
+"""Cause -> next action for a filter without parameters, which cannot be fine-tuned."""
+
 
 def external_causes(task: Task) -> tuple[Cause, ...]:
     """Causes that show in the predictions and innovations of an external filter only."""
     return (
         DRIFT,
         JACOBIAN,
+        LARGE,
         *(cause for modality, keys in task.modalities.items() for cause in _of_updates(modality, keys)),
     )
 
@@ -58,12 +77,10 @@ def in_predictions(cause: Cause) -> Cause:
     if cause.name == "dynamics.frozen":  # the spread of predictions depends on the process noise of particles
         cause = replace(cause, symptoms=(Symptom("dynamics slope/*", -1),))
         consequences += "|dynamics spread/*"
-    is_smaller = cause.name in ("dynamics.frozen", "dynamics.inverted")
-    if not is_smaller:
+    if cause.name not in ("dynamics.frozen", "dynamics.inverted"):
         return replace(cause, consequences=consequences)
-    return replace(
-        cause, consequences=f"{consequences}|prediction jacobian/*", lowers=f"{cause.lowers}|process noise/*"
-    )
+    consequences += "|prediction jacobian/*"
+    return replace(cause, consequences=consequences, lowers=f"{cause.lowers}|process noise/*")
 
 
 def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:

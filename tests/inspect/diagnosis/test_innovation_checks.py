@@ -215,6 +215,7 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         (Boat(updates=0.5), "updates.compass.missing"),
         (Boat(turn=-1.0), "dynamics.inverted"),
         (Boat(turn=0.6), "dynamics.frozen"),
+        (Boat(turn=2.0), "dynamics.large"),
         (Boat(offset=0.5), "measurement.radar.function"),
         (Boat(radar=0.1, separate=True), "measurement_noise.radar.small"),
         (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),

@@ -45,7 +45,7 @@ def test_of_a_filter_without_parameters() -> None:
 
     external = as_external(still, "still", TASK)
     actions = {cause.name: next_action(cause, external) for cause in causes_of(TASK)}
-    assert actions["dynamics.broken"] == "Correct it in the filter's own code."
+    assert actions["dynamics.broken"] == "Check the equations of the dynamics."
     assert actions["model.touch.bias"].endswith("same symptoms. Correct it in the filter's own code.")
     assert actions["data.shift"] == "Collect data of these conditions."
     assert not [action for action in actions.values() if "finetune" in action or "`" in action]
