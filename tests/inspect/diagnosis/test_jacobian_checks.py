@@ -28,7 +28,7 @@ def test_exact_derivatives_have_no_error_whatever_the_other_defects(filter_: Boa
     f, h, slopes = errors_of(filter_, every)
     exact = f[:3] if filter_.turn != 1.0 else f  # the derivative by the bias is that of the right turn
     np.testing.assert_allclose(exact, 0.0, atol=1e-3)  # of differences of single-precision covariances
-    np.testing.assert_allclose(h, 0.0, atol=5e-3)  # the gains of the update before change with the variance
+    np.testing.assert_allclose(h, 0.0, atol=0.02)  # the gains of the update before change with the variance
     assert slopes.min() > 0.7  # 1 for joint updates only
 
 
@@ -37,7 +37,7 @@ def test_the_error_of_a_scaled_jacobian_is_that_of_its_square(factor: float) -> 
     """``f^2 H E H^T`` against ``H E H^T``."""
     _, (radar, compass), _ = errors_of(Boat(jacobian=factor))
     assert radar == pytest.approx(abs(factor**2 - 1.0), rel=0.02)
-    assert compass == pytest.approx(0.0, abs=0.03)
+    assert compass == pytest.approx(0.0, abs=0.05)
 
 
 def test_corrections_with_the_wrong_sign_have_a_slope_of_minus_one() -> None:
@@ -57,7 +57,7 @@ def test_a_wrong_column_of_the_dynamics_shows_in_its_component() -> None:
     f, h, _ = errors_of(Boat(heading_jacobian=0.0))
     assert f[2] > 0.1
     np.testing.assert_allclose(np.delete(f, 2), 0.0, atol=1e-3)
-    np.testing.assert_allclose(h, 0.0, atol=5e-3)
+    np.testing.assert_allclose(h, 0.0, atol=0.02)
 
 
 class Remembering(Boat):
