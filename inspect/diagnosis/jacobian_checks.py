@@ -10,8 +10,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.statistics.innovations import prediction
-from beliefscope.inspect.statistics.measures import Array, counted
+from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
 
 MOST, COST = 6, 0.5
@@ -32,7 +31,7 @@ SAME = 0.02
 
 
 def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
-    """``KIND/SUBJECT/all`` -> value, of a Kalman filter whose whole state is its reported belief; none of others.
+    """``KIND/SUBJECT/all`` -> value, of a Kalman filter that starts at a belief and has no other state; none of others.
 
     Some steps are repeated from other beliefs. With a variance of component i that is larger by d, the covariance of
     the prediction is larger by ``E = d F_i F_i^T``, with column i of the filter's F, and the covariance S of the
@@ -46,11 +45,8 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
     steps, module = _steps(trace), checkpoint.adapter.module
     if not len(steps) or has_own_start(module) or not is_stepwise(module):
         return {}
-    try:
-        repeated = RepeatedSteps(trace, checkpoint, steps)
-    except BadInput:  # the filter refuses a changed belief
-        return {}
-    if not repeated.are_same(trace):
+    repeated = _repeat(trace, checkpoint, steps)
+    if repeated is None:
         return {}
     names = [component.name for component in trace.task.components]
     values = dict(zip((f"prediction jacobian/{name}/all" for name in names), repeated.dynamics_errors(), strict=True))
@@ -63,8 +59,24 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
     return {name: float(value) for name, value in values.items()}
 
 
+def _repeat(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> RepeatedSteps | None:
+    """The steps, by one call of the filter or, if its first call does not predict, by two.
+
+    Without those that differ, because the filter has another state than its belief; None if all do.
+    """
+    for calls in (1, 2):
+        try:
+            repeated = RepeatedSteps(trace, checkpoint, steps, calls)
+            same = repeated.are_same(trace)
+            if same.any():
+                return repeated if same.all() else RepeatedSteps(trace, checkpoint, steps[same], calls)
+        except BadInput:  # the filter refuses a changed belief
+            return None
+    return None
+
+
 def _steps(trace: Trace) -> NDArray[np.intp]:
-    """Steps to repeat: of each modality as many steps with its measurement, evenly spaced."""
+    """Steps to repeat: of each modality as many with its measurement, mostly early ones: the filter may diverge."""
     if (
         trace.predicted_covariance is None
         or trace.particles is not None
@@ -74,21 +86,21 @@ def _steps(trace: Trace) -> NDArray[np.intp]:
         return np.empty(0, dtype=np.intp)
     beliefs = 2 + 3 * len(trace.task.components)
     count = int(np.clip(COST * len(trace) / beliefs, 1, MOST))
-    candidates = np.flatnonzero(counted(trace)[1:]) + 1
     used = np.ones((len(trace), 1), bool)
     if trace.innovation is not None:
         used = np.asarray(np.isfinite(trace.innovation).any(-1))
-    chosen = [at for column in used.T if len(at := candidates[column[candidates]])]
-    each = -(-count // max(1, len(chosen)))
-    rows = [at[np.linspace(0, len(at) - 1, min(each, len(at))).astype(int)] for at in chosen]
+    chosen = [at for column in used.T if len(at := np.flatnonzero(column[1:]) + 1)]
+    early = 2 ** np.arange(-(-count // max(1, len(chosen)))) - 1  # 0, 1, 3, ...
+    rows = [at[early[early < len(at)]] for at in chosen]
     return np.unique(np.concatenate(rows)) if rows else np.empty(0, dtype=np.intp)
 
 
 class RepeatedSteps:
-    """J steps of a filter from B = 2 + 3 n beliefs each.
+    """J steps of a filter from B = 2 + 3 n beliefs each, by the last of one or two calls.
 
     They are the filter's own belief, those with a larger mean, a smaller mean and a larger variance of each component,
-    and one with larger variances and covariances of all components, which shows the signs of columns.
+    and one with larger variances and covariances of all components, which shows the signs of columns. With two calls,
+    they are before the update of the step before: F and its Jacobian include this update.
 
     Attributes:
         mean: (J, B, n) predictions. covariance: (J, B, n, n) of these.
@@ -97,13 +109,12 @@ class RepeatedSteps:
         correction, posterior: (J, n) and (J, n, n), from the filter's own belief.
     """
 
-    def __init__(self, trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> None:
+    def __init__(self, trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], calls: int) -> None:
         """Raises BadInput if the filter fails."""
         self.steps, self.task, n = steps, trace.task, len(trace.task.components)
-        before = trace.estimate_mean[steps - 1].astype(np.float64)
-        covariance = trace.estimate_covariance[steps - 1].astype(np.float64)
+        before, covariance = _beliefs(trace, steps - 1, calls == 1)
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-        smallest = SMALLEST_SHIFT * np.abs(trace.estimate_mean).max(0)
+        smallest = SMALLEST_SHIFT * np.abs(before).max(0)
         self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
         unit, none = np.eye(n), np.zeros((n + 1, n))
         shifts = np.concatenate([none[:1], unit, -unit, none]) * self.shift[:, None]  # (J, B, n)
@@ -112,9 +123,9 @@ class RepeatedSteps:
             torch.from_numpy((before[:, None] + shifts).reshape(-1, n)),
             torch.from_numpy((covariance[:, None] + grown[..., None] * grown[..., None, :]).reshape(-1, n, n)),
         )
-        episodes = [trace.episode.part(step, step + 1) for step in steps for _ in range(shifts.shape[1])]
+        episodes = [trace.episode.part(step + 1 - calls, step + 1) for step in steps for _ in range(shifts.shape[1])]
         values, _ = checkpoint.run(episodes, start=start)
-        arrays = {k: v[0].unflatten(0, (len(steps), -1)).double().numpy() for k, v in values.items()}
+        arrays = {k: v[-1].unflatten(0, (len(steps), -1)).double().numpy() for k, v in values.items()}
         rows, first = np.arange(len(steps)), _least_certain(arrays["predicted_covariance"][:, 0])
         self.mean, self.covariance = (arrays[f"predicted_{name}"][rows, :, first] for name in ("mean", "covariance"))
         self.correction = self.task.difference(arrays["estimate_mean"][:, 0], self.mean[:, 0])
@@ -122,15 +133,12 @@ class RepeatedSteps:
         if trace.innovation is not None:
             self.innovation, self.size = arrays["innovation"], np.nan_to_num(arrays["innovation_covariance"])
 
-    def are_same(self, trace: Trace) -> bool:
-        """Whether the filter's own beliefs give the trace's predictions, so that they are its whole state."""
-        belief = prediction(trace)
-        if belief is None or belief[1] is None:
-            return False
-        mean, covariance = belief[0][self.steps], belief[1][self.steps]
+    def are_same(self, trace: Trace) -> Mask:
+        """(J,) whether the filter's own beliefs give the trace's predictions, so that they are its whole state."""
+        mean, covariance = _beliefs(trace, self.steps, False)
         moved = self.task.difference(mean, self.mean[:, 0]) / _std(covariance)
         grown = _weights(covariance) * (covariance - self.covariance[:, 0])
-        return bool(max(np.abs(moved).max(), np.abs(grown).max()) < SAME)  # False if they are not finite
+        return (np.abs(moved).max(-1) < SAME) & (np.abs(grown).max((-2, -1)) < SAME)  # False if they are not finite
 
     def dynamics_errors(self) -> Array:
         """(n,) of the columns of F."""
@@ -175,6 +183,17 @@ class RepeatedSteps:
     def _growth(self, values: Array) -> Array:
         """(J, n + 1, ...) growth of (J, B, ...) with the variance of each component, and with all of them."""
         return np.asarray(values[:, 1 + 2 * self.shift.shape[1] :] - values[:, :1])
+
+
+def _beliefs(trace: Trace, steps: NDArray[np.intp], is_updated: bool) -> tuple[Array, Array]:
+    """Mean (J, n) and covariance (J, n, n) at the steps, before or after all updates."""
+    if is_updated:
+        return trace.estimate_mean[steps].astype(np.float64), trace.estimate_covariance[steps].astype(np.float64)
+    assert trace.predicted_mean is not None
+    assert trace.predicted_covariance is not None
+    mean, covariance = (x[steps].astype(np.float64) for x in (trace.predicted_mean, trace.predicted_covariance))
+    rows, first = np.arange(len(steps)), _least_certain(covariance)
+    return mean[rows, first], covariance[rows, first]
 
 
 def _least_certain(covariance: Array) -> NDArray[np.intp]:

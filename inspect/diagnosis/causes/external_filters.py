@@ -16,6 +16,9 @@ def _dynamics(*kinds: str) -> str:
     return "|".join(f"dynamics {kind}/*" for kind in kinds)
 
 
+JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*"
+"""The derivative of the prediction may include the update of the step before."""
+
 DRIFT = Cause(
     "dynamics.drift",
     "Dynamics biased, differently in each episode",
@@ -32,6 +35,7 @@ JACOBIAN = Cause(
     (Symptom("prediction jacobian/*"),),
     f"{_dynamics('error', 'nis', 'slope', 'spread')}|process noise/*|{FILTER}",
     "Compare the Jacobian of the dynamics with finite differences: signs, columns, the time step.",
+    prior=-0.1,  # another gain or sign of the predicted mean also changes its derivative
 )
 """A derivative in the prediction of the covariance, other than that of the predicted mean."""
 
@@ -134,7 +138,7 @@ def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
                     otherwise=(Symptom(f"correction slope/{modality}/*", -1),),
                 ),
             ),
-            f"measurement function/*|correction slope/*|measurement jacobian/*|{FILTER}",
+            f"{JACOBIANS}|dynamics slope/*|measurement function/*|process noise/*|{FILTER}",
             f"Compare the Jacobian of {name} with finite differences of h: signs, columns, units.",
         ),
         Cause(
