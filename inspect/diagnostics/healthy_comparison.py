@@ -104,10 +104,14 @@ class Deviation:
 
     @property
     def text(self) -> str:
-        """Label, value and healthy range, in the unit for display, without digits far below the range's width."""
+        """Label, value and healthy range, in the unit for display, without digits far below the range's width.
+
+        The healthy mean is within the range, from which a few values may move it.
+        """
         width = abs(self.factor * (self.high - self.low))
         digits = 1 - math.floor(math.log10(width)) if 0.0 < width < math.inf else 12
-        numbers = (round(self.factor * x, digits) + 0.0 for x in (self.value, self.healthy, self.low, self.high))
+        mean = min(max(self.healthy, self.low), self.high)
+        numbers = (round(self.factor * x, digits) + 0.0 for x in (self.value, mean, self.low, self.high))
         value, healthy, low, high = map(_number, numbers)
         return f"{self.label} is {self._amount(value)}, healthy {self._amount(healthy)} ({low} to {high})"
 
