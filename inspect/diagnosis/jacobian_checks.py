@@ -70,7 +70,7 @@ def _repeat(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -
             same = repeated.are_same(trace)
             if same.any():
                 return repeated if same.all() else RepeatedSteps(trace, checkpoint, steps[same], calls)
-        except BadInput:  # the filter refuses a changed belief
+        except (BadInput, KeyError):  # the filter refuses a changed belief, or does not report all values
             return None
     return None
 
@@ -113,8 +113,8 @@ class RepeatedSteps:
         """Raises BadInput if the filter fails."""
         self.steps, self.task, n = steps, trace.task, len(trace.task.components)
         before, covariance = _beliefs(trace, steps - 1, calls == 1)
-        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-        smallest = SMALLEST_SHIFT * np.abs(before).max(0)
+        variance = np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
+        smallest = SMALLEST_SHIFT * np.maximum(np.abs(before).max(0), 1e-6)
         self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
         unit, none = np.eye(n), np.zeros((n + 1, n))
         shifts = np.concatenate([none[:1], unit, -unit, none]) * self.shift[:, None]  # (J, B, n)
@@ -136,9 +136,9 @@ class RepeatedSteps:
     def are_same(self, trace: Trace) -> Mask:
         """(J,) whether the filter's own beliefs give the trace's predictions, so that they are its whole state."""
         mean, covariance = _beliefs(trace, self.steps, False)
-        moved = self.task.difference(mean, self.mean[:, 0]) / _std(covariance)
+        moved = np.abs(self.task.difference(mean, self.mean[:, 0])) <= SAME * _std(covariance)
         grown = _weights(covariance) * (covariance - self.covariance[:, 0])
-        return (np.abs(moved).max(-1) < SAME) & (np.abs(grown).max((-2, -1)) < SAME)  # False if they are not finite
+        return moved.all(-1) & (np.abs(grown).max((-2, -1)) < SAME)
 
     def dynamics_errors(self) -> Array:
         """(n,) of the columns of F."""
@@ -160,9 +160,9 @@ class RepeatedSteps:
         h, prior = self._measurement_jacobian(), self.covariance[:, :1]
         noise, innovation = self.size[:, 0] - h @ prior @ h.mT, np.nan_to_num(self.innovation[:, 0])
         parts = (self.posterior[:, None] @ h.mT @ np.linalg.pinv(noise) @ innovation[..., None])[..., 0]  # (J, K, n)
-        std = _std(prior[:, 0])
-        columns = (parts / std[:, None]).swapaxes(1, 2).reshape(-1, parts.shape[1])
-        slopes = np.linalg.lstsq(columns, (self.correction / std).ravel(), rcond=1e-9)[0]
+        scale = _inverse_std(prior[:, 0])
+        columns = (parts * scale[:, None]).swapaxes(1, 2).reshape(-1, parts.shape[1])
+        slopes = np.linalg.lstsq(columns, (self.correction * scale).ravel(), rcond=1e-9)[0]
         return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
     def _dynamics_jacobian(self) -> Array:
@@ -202,14 +202,19 @@ def _least_certain(covariance: Array) -> NDArray[np.intp]:
 
 
 def _std(covariance: Array) -> Array:
-    """(..., n) standard deviations."""
-    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    """(..., n) standard deviations; 0 for a negative variance."""
+    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+
+
+def _inverse_std(covariance: Array) -> Array:
+    """(..., n) inverse standard deviations; 0 for a variance of 0 or less."""
+    std = _std(covariance)
+    return np.divide(1.0, std, out=np.zeros_like(std), where=std > 0.0)
 
 
 def _weights(covariance: Array) -> Array:
-    """(..., n, n) inverse products of the standard deviations; 0 for a variance of 0."""
-    std = _std(covariance)
-    inverse = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0.0)
+    """(..., n, n) products of the inverse standard deviations."""
+    inverse = _inverse_std(covariance)
     return np.asarray(inverse[..., :, None] * inverse[..., None, :])
 
 

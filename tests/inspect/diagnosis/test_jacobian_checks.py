@@ -60,16 +60,16 @@ def test_a_wrong_column_of_the_dynamics_shows_in_its_component() -> None:
     np.testing.assert_allclose(h, 0.0, atol=0.02)
 
 
-class Remembering(Boat):
-    """Has a state beside its belief: it predicts a second time at its first step."""
+class Widening(Boat):
+    """Starts at another belief than it is given."""
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         super().initialize_beliefs(mean=mean, covariance=covariance + 0.1 * np.eye(4))
 
 
-def test_filters_with_another_state_or_without_covariances_have_no_statistics() -> None:
+def test_filters_with_another_start_or_without_covariances_have_no_statistics() -> None:
     trace, filter_ = run(Boat()), loaded(Boat())
-    assert jacobian_statistics(run(Remembering()), loaded(Remembering())) == {}
+    assert jacobian_statistics(run(Widening()), loaded(Widening())) == {}
     assert jacobian_statistics(replace(trace, predicted_covariance=None), filter_) == {}
     without = jacobian_statistics(replace(trace, innovation=None, innovation_covariance=None), filter_)
     assert sorted(without) == sorted(f"prediction jacobian/{name}/all" for name in COMPONENTS)
@@ -79,3 +79,21 @@ def test_trajectories_with_different_sensors_are_run_together() -> None:
     """A filter without the axis N reports one channel at steps without the radar, and two at others."""
     values, _ = loaded(Boat()).run([sail(3).part(1, 2), sail(3).part(0, 1)])
     assert values["innovation"].shape == (1, 2, 2, 2)
+
+
+class Exact(Boat):
+    """Knows the bias: its variance is 0."""
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        super().initialize_beliefs(mean=mean, covariance=covariance)
+        self.covariance = covariance * np.array([1.0, 1.0, 1.0, 0.0])
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        values = super().__call__(observations=observations, controls=controls)
+        self.covariance = self.covariance * np.outer([1, 1, 1, 0], [1, 1, 1, 0])
+        return values | {"estimate_covariance": self.covariance}
+
+
+def test_known_components_have_no_error() -> None:
+    values = jacobian_statistics(run(Exact()), loaded(Exact()))
+    assert np.isfinite([v for name, v in values.items() if "bias" not in name]).all()
