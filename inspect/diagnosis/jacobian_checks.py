@@ -62,7 +62,7 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 def _repeat(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> RepeatedSteps | None:
     """The steps, by one call of the filter or, if its first call does not predict, by two.
 
-    Without those that differ, because the filter has another state than its belief; None if all do.
+    Without steps of different results, from another state than the belief; None if all have them.
     """
     for calls in (1, 2):
         try:
