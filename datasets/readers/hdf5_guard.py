@@ -56,7 +56,8 @@ def open_hdf5(path: Path) -> h5py.File:
         raise BadInput(f"No permission to read {path}.") from None
     except HDF5_ERRORS as error:
         if not h5py.is_hdf5(path):
-            hint = "" if path.suffix.lower() in (".h5", ".hdf5") else "; beliefscope import reads logs in other formats"
+            known = path.suffix.lower() in (".h5", ".hdf5", ".safetensors")
+            hint = "" if known else "; beliefscope import reads logs in other formats"
             raise BadInput(f"{path} is not an HDF5 file{hint}.") from None
         raise read_error(path, error) from None
 
