@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -142,7 +144,7 @@ class RepeatedSteps:
 
     def dynamics_errors(self) -> Array:
         """(n,) of the columns of F."""
-        columns = self._dynamics_jacobian().mT
+        columns = self._dynamics_jacobian.mT
         expected = self.growth[..., None, None] * columns[..., :, None] * columns[..., None, :]  # (J, i, n, n)
         weights = _weights(self.covariance[:, :1])
         growth = self._growth(self.covariance)[:, :-1]
@@ -150,14 +152,14 @@ class RepeatedSteps:
 
     def measurement_errors(self) -> Array:
         """(K,) of the modalities' H."""
-        h = self._measurement_jacobian()[:, None]
+        h = self._measurement_jacobian[:, None]
         expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT  # (J, n + 1, K, m, m)
         weights = _weights(self.size[:, :1])
         return _relative(weights * (self._growth(self.size) - expected), weights * expected, (1, -2, -1))
 
     def slopes(self) -> Array:
         """(K,) of the corrections; NaN without a measurement."""
-        h, prior = self._measurement_jacobian(), self.covariance[:, :1]
+        h, prior = self._measurement_jacobian, self.covariance[:, :1]
         noise, innovation = self.size[:, 0] - h @ prior @ h.mT, np.nan_to_num(self.innovation[:, 0])
         parts = (self.posterior[:, None] @ h.mT @ np.linalg.pinv(noise) @ innovation[..., None])[..., 0]  # (J, K, n)
         scale = _inverse_std(prior[:, 0])
@@ -165,14 +167,16 @@ class RepeatedSteps:
         slopes = np.linalg.lstsq(columns, (self.correction * scale).ravel(), rcond=1e-9)[0]
         return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
+    @cached_property
     def _dynamics_jacobian(self) -> Array:
         """(J, n, n) derivative of the predicted mean."""
         return np.moveaxis(self._derivative(self.task.difference(self.mean, self.mean[:, :1])), 1, -1)
 
+    @cached_property
     def _measurement_jacobian(self) -> Array:
         """(J, K, m, n) derivative of the predicted measurements by the prediction; 0 without a measurement."""
         by_mean = np.moveaxis(self._derivative(self.innovation), 1, -1)
-        return np.nan_to_num(-by_mean @ np.linalg.pinv(self._dynamics_jacobian())[:, None])
+        return np.nan_to_num(-by_mean @ np.linalg.pinv(self._dynamics_jacobian)[:, None])
 
     def _derivative(self, values: Array) -> Array:
         """(J, n, ...) derivatives of (J, B, ...) by each component of the mean."""
