@@ -40,6 +40,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.diagnostics.jacobians import jacobians_of, shows_wrong_jacobians
 from beliefscope.inspect.diagnostics.statistic_kinds import is_contact_known, label_of
 
 SURE = 0.5
@@ -83,9 +84,11 @@ def healthy(case: Case) -> Diagnosis:
         headline = f"Healthy, though {overconfident}: {text}"
         if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
             headline = f"Always {overconfident}, also in its record; {text[:-1]}; try: {CONVENTIONS}."
-    if turned := _turned(case):
-        headline = f"{turned}; otherwise {text}"
-    return Diagnosis("healthy", False, headline, (), largest, _provenance(case))
+    if defect := _turned(case) or _wrong_jacobians(case):
+        headline = f"{defect}; otherwise {text}"
+    provenance = _provenance(case)
+    provenance["miscalibrated"] |= bool(defect)
+    return Diagnosis("healthy", False, headline, (), largest, provenance)
 
 
 def _nees(profile: HealthyProfile) -> float:
@@ -109,6 +112,21 @@ def _turned(case: Case) -> str:
     names = ", ".join(map(display_name, found))
     episodes = sorted({episode for group in found.values() for episode in group})
     return f"Innovations of {names} not wrapped in episode{'s' * (len(episodes) > 1)} {index_ranges(episodes)}"
+
+
+def _wrong_jacobians(case: Case) -> str:
+    """Wrong Jacobians of an external filter, empty if there is none.
+
+    The record has them too if it is of the same filter; from others they deviate.
+    """
+    checkpoint = case.inputs.checkpoint
+    if not isinstance(checkpoint, ExternalFilter) or not shows_wrong_jacobians(case.profile.statistics):
+        return ""
+    alarms = jacobians_of(case.traces, checkpoint).alarms
+    if not alarms:
+        return ""
+    text = "; ".join(alarms)
+    return f"{text[0].upper()}{text[1:]}, also in the healthy record"
 
 
 def _is_miscalibrated(nees: float) -> bool:
@@ -345,7 +363,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
         "healthy_data": case.profile.data,
-        "miscalibrated": _is_miscalibrated(_nees(case.profile)) or bool(_turned(case)),
+        "miscalibrated": _is_miscalibrated(_nees(case.profile)),
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers, new),
         "outdated": new > 0,

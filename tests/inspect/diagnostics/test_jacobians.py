@@ -1,4 +1,4 @@
-"""Jacobians of external filters, by single steps of them from other beliefs."""
+"""Jacobians of external Kalman filters, by single steps of them from other beliefs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from tests.inspect.diagnosis.test_innovation_checks import FLIPPED, STD, Array, Boat, loaded, run, sail, task
 
-from beliefscope.inspect.diagnosis.jacobian_checks import jacobian_statistics
+import beliefscope as bs
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnostics.jacobians import Jacobians, jacobian_statistics, jacobians_of
+from beliefscope.inspect.healthy import profile_of
 
 COMPONENTS = [component.name for component in task(1).components]
 
@@ -97,3 +102,58 @@ class Exact(Boat):
 def test_known_components_have_no_error() -> None:
     values = jacobian_statistics(run(Exact()), loaded(Exact()))
     assert np.isfinite([v for name, v in values.items() if "bias" not in name]).all()
+
+
+def jacobians(filter_: Boat, count: int = 3) -> Jacobians:
+    checkpoint = loaded(filter_)
+    return jacobians_of([bs.trace(checkpoint, [sail(seed)]) for seed in range(count)], checkpoint)
+
+
+@pytest.mark.parametrize("filter_", [Boat(), Boat(separate=True), Boat(radar=5.0, offset=0.5)])
+def test_right_jacobians_raise_no_alarm(filter_: Boat) -> None:
+    result = jacobians(filter_)
+    assert result.alarms == ()
+    assert result.verdict.startswith("All Jacobians agree with finite differences of the filter's own functions")
+
+
+def test_a_wrong_jacobian_is_named_with_its_part() -> None:
+    scaled, flipped, constant = (
+        jacobians(filter_) for filter_ in (Boat(jacobian=1.2), Boat(jacobian=FLIPPED), Boat(heading_jacobian=0.0))
+    )
+    assert scaled.alarms == ("the Jacobian of radar differs from finite differences by 44 %, for x, y",)
+    assert len(flipped.alarms) == 1
+    assert flipped.alarms[0].endswith(("%, for x", "%, by the sign of a column"))  # by how much it moves the range
+    assert len(constant.alarms) == 1
+    assert constant.alarms[0].startswith("the Jacobian of the dynamics differs")
+    assert constant.alarms[0].endswith("in column heading")
+
+
+def test_a_column_of_the_wrong_sign_shows_with_all_variances_together_only() -> None:
+    result = jacobians(Boat(jacobian=np.array([-1.0, 1.0, 1.0, 1.0])))
+    assert result.columns[:-1, 0] == pytest.approx(0.0, abs=0.05)
+    assert result.columns[-1, 0] > 0.5
+    assert result.alarms[0].endswith("%, by the sign of a column")
+
+
+def test_corrections_of_the_wrong_sign_are_named() -> None:
+    assert jacobians(Boat(jacobian=-1.0)).alarms == ("corrections with radar have the wrong sign (slope -1.00)",)
+
+
+def test_a_filter_without_finite_differences_is_refused() -> None:
+    entry = DIAGNOSTICS["jacobians"]
+    trace = run(Widening())
+    assert entry.refusal(trace, loaded(Widening())) is None
+    with pytest.raises(BadInput, match="they depend on more than its belief and its inputs"):
+        entry([trace], loaded(Widening()))
+    assert entry.refusal(replace(trace, predicted_covariance=None), loaded(Widening())) is not None
+
+
+@pytest.mark.slow
+def test_wrong_jacobians_are_mentioned_although_the_record_has_them_too() -> None:
+    wrong = loaded(Boat(jacobian=FLIPPED))
+    record = profile_of(wrong, [sail(seed) for seed in range(20)], "boat")
+    result = diagnose(wrong, {seed: sail(seed) for seed in range(40, 44)}, profile=record)
+    assert result.state == "healthy"
+    assert result.provenance["miscalibrated"]
+    assert result.headline.startswith("The Jacobian of radar differs from finite differences by ")
+    assert ", for x, also in the healthy record; otherwise no significant" in result.headline

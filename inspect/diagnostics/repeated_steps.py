@@ -1,4 +1,4 @@
-"""Jacobians of an external Kalman filter, against finite differences of its own functions."""
+"""Single steps of an external Kalman filter, repeated from other beliefs, show its Jacobians."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.statistics.measures import Array, Mask
@@ -28,44 +29,36 @@ SMALLEST_SHIFT = 1e-4
 GROWTH = 0.05
 """Growth of the variance of a component, relative to itself: gains remain almost the same."""
 
+SMALLEST_CHANGE = 0.05
+"""Smallest value to which an error is relative: share of a column of F, and of the largest column of H F."""
+
 SAME = 0.02
 """Largest difference of a repeated step from the original one, in standard deviations and relative to variances."""
 
 
-def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
-    """``KIND/SUBJECT/all`` -> value, of a Kalman filter that starts at a belief and has no other state; none of others.
+def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
+    """One-line reason why the steps of a filter cannot be repeated from other beliefs, or None."""
+    if not isinstance(checkpoint, ExternalFilter):
+        return "the Jacobians of this project's filters are derivatives by construction"
+    module = checkpoint.adapter.module
+    if trace.particles is not None or trace.predicted_covariance is None or not trace.has_covariance:
+        return f"filter {trace.filter} does not report covariances of its predictions and estimates"
+    if has_own_start(module) or not is_stepwise(module):
+        return f"filter {trace.filter} does not start each call at a given belief"
+    if trace.task.rotations:
+        return "derivatives by rotations are not supported"
+    return None
 
-    Some steps are repeated from other beliefs. With a variance of component i that is larger by d, the covariance of
-    the prediction is larger by ``E = d F_i F_i^T``, with column i of the filter's F, and the covariance S of the
-    innovations by ``H E H^T``; also with one update after another, since a small d leaves the gains almost the same.
 
-    ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
-    mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality: slope of the corrections on ``P+ H^T R^-1 nu``, from -1 to 1, as these products
-    do not show the sign of the filter's H. It is 1 with joint updates, and nearly so with others.
+def repeat_steps(trace: Trace, checkpoint: ExternalFilter) -> RepeatedSteps | None:
+    """Steps of an episode, by one call of the filter or, if its first call does not predict, by two.
+
+    Without steps of different results, from another state than the belief; None if all have them, or if the filter
+    fails. Its properties must allow it (``why_not``).
     """
-    steps, module = _steps(trace), checkpoint.adapter.module
-    if not len(steps) or has_own_start(module) or not is_stepwise(module):
-        return {}
-    repeated = _repeat(trace, checkpoint, steps)
-    if repeated is None:
-        return {}
-    names = [component.name for component in trace.task.components]
-    values = dict(zip((f"prediction jacobian/{name}/all" for name in names), repeated.dynamics_errors(), strict=True))
-    if trace.innovation is not None:
-        for kind, each in (
-            ("measurement jacobian", repeated.measurement_errors()),
-            ("correction slope", repeated.slopes()),
-        ):
-            values |= {f"{kind}/{name}/all": value for name, value in zip(trace.modalities, each, strict=True)}
-    return {name: float(value) for name, value in values.items()}
-
-
-def _repeat(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> RepeatedSteps | None:
-    """The steps, by one call of the filter or, if its first call does not predict, by two.
-
-    Without steps of different results, from another state than the belief; None if all have them.
-    """
+    steps = _steps(trace)
+    if not len(steps):
+        return None
     for calls in (1, 2):
         try:
             repeated = RepeatedSteps(trace, checkpoint, steps, calls)
@@ -79,13 +72,6 @@ def _repeat(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -
 
 def _steps(trace: Trace) -> NDArray[np.intp]:
     """Steps to repeat: of each modality as many with its measurement, mostly early ones: the filter may diverge."""
-    if (
-        trace.predicted_covariance is None
-        or trace.particles is not None
-        or not trace.has_covariance
-        or trace.task.rotations
-    ):
-        return np.empty(0, dtype=np.intp)
     beliefs = 2 + 3 * len(trace.task.components)
     count = int(np.clip(COST * len(trace) / beliefs, 1, MOST))
     used = np.ones((len(trace), 1), bool)
@@ -143,19 +129,24 @@ class RepeatedSteps:
         return moved.all(-1) & (np.abs(grown).max((-2, -1)) < SAME)
 
     def dynamics_errors(self) -> Array:
-        """(n,) of the columns of F."""
-        columns = self._dynamics_jacobian.mT
-        expected = self.growth[..., None, None] * columns[..., :, None] * columns[..., None, :]  # (J, i, n, n)
-        weights = _weights(self.covariance[:, :1])
-        growth = self._growth(self.covariance)[:, :-1]
-        return _relative(weights * (growth - expected), weights * expected, (-2, -1))
+        """(J, n) of the columns of F, relative to their differences from constant states."""
+        columns, unit = self._dynamics_jacobian.mT, np.eye(self.shift.shape[1])
+        weights = _weights(self.covariance[:, :1]) * self.growth[..., None, None]  # (J, i, n, n)
+        expected = weights * columns[..., :, None] * columns[..., None, :]
+        growth = _weights(self.covariance[:, :1]) * self._growth(self.covariance)[:, :-1]
+        change = expected - weights * unit[:, :, None] * unit[:, None, :]
+        smallest = SMALLEST_CHANGE * np.sqrt(np.square(expected).sum((-2, -1)))
+        return _relative(growth - expected, change, (-2, -1), smallest)
 
     def measurement_errors(self) -> Array:
-        """(K,) of the modalities' H."""
-        h = self._measurement_jacobian[:, None]
-        expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT  # (J, n + 1, K, m, m)
-        weights = _weights(self.size[:, :1])
-        return _relative(weights * (self._growth(self.size) - expected), weights * expected, (1, -2, -1))
+        """(J, K) of the modalities' H."""
+        return _relative(*self._measured_growth, (1, -2, -1))
+
+    def measurement_errors_by_component(self) -> Array:
+        """(J, n + 1, K) of the modalities' H, with the variance of one component, and of all of them together."""
+        difference, expected = self._measured_growth
+        largest = np.sqrt(np.square(expected).sum((-2, -1)).max(1, keepdims=True))
+        return _relative(difference, expected, (-2, -1), SMALLEST_CHANGE * largest)
 
     def slopes(self) -> Array:
         """(K,) of the corrections; NaN without a measurement."""
@@ -177,6 +168,13 @@ class RepeatedSteps:
         """(J, K, m, n) derivative of the predicted measurements by the prediction; 0 without a measurement."""
         by_mean = np.moveaxis(self._derivative(self.innovation), 1, -1)
         return np.nan_to_num(-by_mean @ np.linalg.pinv(self._dynamics_jacobian)[:, None])
+
+    @cached_property
+    def _measured_growth(self) -> tuple[Array, Array]:
+        """(J, n + 1, K, m, m) growth of the innovations' covariance less that by their derivatives, and the latter."""
+        h, weights = self._measurement_jacobian[:, None], _weights(self.size[:, :1])
+        expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT
+        return weights * (self._growth(self.size) - expected), weights * expected
 
     def _derivative(self, values: Array) -> Array:
         """(J, n, ...) derivatives of (J, B, ...) by each component of the mean."""
@@ -222,11 +220,17 @@ def _weights(covariance: Array) -> Array:
     return np.asarray(inverse[..., :, None] * inverse[..., None, :])
 
 
-def _relative(difference: Array, expected: Array, axes: tuple[int, ...]) -> Array:
-    """(S,) root of the sum of squares over axes, relative to that of the expected values; median over the first axis.
+def _relative(difference: Array, expected: Array, axes: tuple[int, ...], smallest: Array | float = 0.0) -> Array:
+    """Roots of the sum of squares over axes, relative to those of the expected values, which are at least the smallest.
 
-    Of arrays (J, S, ...) after the sums; NaN where nothing is expected.
+    NaN where nothing is expected.
     """
-    error, size = np.square(difference).sum(axes), np.square(expected).sum(axes)
-    known = np.where(size > 0.0, np.sqrt(error / np.where(size > 0.0, size, 1.0)), np.nan)
-    return np.array([np.median(v) if len(v := column[np.isfinite(column)]) else np.nan for column in known.T])
+    error = np.sqrt(np.square(difference).sum(axes))
+    size = np.maximum(np.sqrt(np.square(expected).sum(axes)), smallest)
+    return np.divide(error, size, out=np.full_like(error, np.nan), where=size > 0.0)
+
+
+def known_median(values: Array) -> Array:
+    """Median over the first axis of the known values; NaN where there are none."""
+    unknown = np.isnan(values).all(0)
+    return np.where(unknown, np.nan, np.nanmedian(np.where(unknown, 0.0, values), axis=0))
