@@ -160,22 +160,26 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
         return JobReply(job=jobs.submit("repair", title, _repair_arguments(store, selection), link=link))
 
     @app.get("/api/healthy-record/{task}/{filter}", response_model=HealthyRecord, responses={202: {"model": JobReply}})
-    def get_record(task: str, filter: str, data: str = "") -> Response:
+    def get_record(task: str, filter: str, data: str = "", healthy_filter: str = "") -> Response:
         """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
-        job = jobs.find("healthy", _record_arguments(store, task, filter, data))
+        job = jobs.find("healthy", _record_arguments(store, task, filter, data, healthy_filter))
         measured = store.measured_record(task, filter)
         if measured and not (job and job.active):
             return JSONResponse({"data": measured})
         return JSONResponse({"job": job and asdict(job)}, status_code=202)
 
     @app.post("/api/healthy-record/{task}/{filter}", status_code=202)
-    def measure_record(task: str, filter: str, data: str = "") -> JobReply:
-        """Measures the healthy record of a filter, also if it was measured before."""
-        arguments = _record_arguments(store, task, filter, data)
+    def measure_record(task: str, filter: str, data: str = "", healthy_filter: str = "") -> JobReply:
+        """Measures the healthy record of a filter, also if it was measured before.
+
+        healthy_filter: filter that runs over the healthy episodes, such as an earlier version; default: the filter.
+        """
+        arguments = _record_arguments(store, task, filter, data, healthy_filter)
         name, episodes = arguments["data"], plural(len(arguments["episodes"]), "held-out episode")
         if len(arguments["episodes"]) < MIN_HEALTHY:
             raise BadInput(f"{name!r} has {episodes}; a healthy record needs at least {MIN_HEALTHY}")
-        title = f"Healthy record of {filter}, {task}, {episodes} of {name}"
+        by = f", run by {healthy_filter}" if healthy_filter else ""
+        title = f"Healthy record of {filter}, {task}, {episodes} of {name}{by}"
         link = page_link(task=task, filter=filter, data=name, tab="diagnosis")
         job = jobs.submit("healthy", title, arguments, link=link, output_exists=False)  # a new job replaces the record
         return JobReply(job=job)
@@ -216,7 +220,9 @@ def _repair_arguments(store: TraceStore, selection: Selection) -> dict[str, Any]
     return {"selection": selection.to_json(), "key": store.key(selection), "record": record}
 
 
-def _record_arguments(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:
+def _record_arguments(store: TraceStore, task: str, filter_: str, data: str, healthy_filter: str) -> dict[str, Any]:
     """Arguments of the job that measures a healthy record. Raises BadInput for an unknown name."""
     name, episodes = store.dataset(task, data)
-    return arguments_over_episodes(store, task, filter_, name, episodes.held_out()[:MAX_RECORDED])
+    run = healthy_filter or filter_
+    others = {"healthy_filter": run, "healthy_checkpoint": store.checkpoint(task, run).hash}
+    return arguments_over_episodes(store, task, filter_, name, episodes.held_out()[:MAX_RECORDED], **others)

@@ -72,7 +72,7 @@ class TraceHeader(Reply):
         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
             reasons. sensors: drawn ones.
-        no_diagnosis: why the filter has no diagnosis, or None.
+        no_diagnosis: why the filter has no diagnosis, or None. defects: errors of such a filter that show without one.
         data_warning: how the data differ from the checkpoint's training data, or None.
         scene: layers of its 3D scene. live: present while the trace is of a live run.
     """
@@ -98,6 +98,7 @@ class TraceHeader(Reply):
     columns: list[Column]
     data_warning: str | None = None
     no_diagnosis: str | None = None
+    defects: tuple[str, ...] = ()
     scene: list[SceneLayer]
     live: LiveRun | None = None
 

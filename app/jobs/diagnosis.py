@@ -50,9 +50,11 @@ def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
 
 
 def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
-    """Measure the healthy record of a filter over clean episodes, and keep it in the workspace."""
+    """Measure the healthy record of a filter over clean episodes, run by it or another one; kept in the workspace."""
     with store_of_job(arguments) as store:
-        checkpoint = store.checkpoint(arguments["task"], arguments["filter"])
+        names = arguments["filter"], arguments["healthy_filter"]
+        checkpoint, healthy_filter = (store.checkpoint(arguments["task"], name) for name in names)
+        by = "" if names[0] == names[1] else f", run by {names[1]}"
         data = store.dataset(arguments["task"], arguments["data"])[1]
         report(0.0, "measuring the sensors")
         episodes = [data[index] for index in arguments["episodes"]]
@@ -60,9 +62,9 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
         images = pretrained_reference(checkpoint.task) if is_sample else None  # of the same camera
         sensors = sensor_record(episodes, images)
         profile = profile_of(
-            checkpoint,
+            healthy_filter,
             episodes,
-            f"{len(episodes)} held-out episodes of {arguments['data']}",
+            f"{len(episodes)} held-out episodes of {arguments['data']}{by}",
             sensors,
             lambda share: report(0.5 + 0.5 * share, "running the filter over the healthy episodes"),
             arguments["episodes"],

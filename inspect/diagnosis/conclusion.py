@@ -40,7 +40,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.diagnostics.jacobians import jacobians_of, shows_wrong_jacobians
+from beliefscope.inspect.diagnostics.jacobians import shows_wrong_jacobians, wrong_jacobians
 from beliefscope.inspect.diagnostics.statistic_kinds import is_contact_known, label_of
 
 SURE = 0.5
@@ -117,16 +117,17 @@ def _turned(case: Case) -> str:
 def _wrong_jacobians(case: Case) -> str:
     """Wrong Jacobians of an external filter, empty if there is none.
 
-    The record has them too if it is of the same filter; from others they deviate.
+    They are wrong whatever the record, which has them too if it is of the same filter.
     """
-    checkpoint = case.inputs.checkpoint
-    if not isinstance(checkpoint, ExternalFilter) or not shows_wrong_jacobians(case.profile.statistics):
-        return ""
-    alarms = jacobians_of(case.traces, checkpoint).alarms
+    names = {name for row in case.rows for name in row}
+    by_name = {name: np.array([row.get(name, np.nan) for row in case.rows]) for name in names}
+    is_possible = shows_wrong_jacobians(by_name)
+    alarms = wrong_jacobians(case.traces, case.inputs.checkpoint) if is_possible else ()
     if not alarms:
         return ""
     text = "; ".join(alarms)
-    return f"{text[0].upper()}{text[1:]}, also in the healthy record"
+    also = ", also in the healthy record" if shows_wrong_jacobians(case.profile.statistics) else ""
+    return f"{text[0].upper()}{text[1:]}{also}"
 
 
 def _is_miscalibrated(nees: float) -> bool:

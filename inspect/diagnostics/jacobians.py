@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import percent, plural
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.repeated_steps import RepeatedSteps, known_median, repeat_steps, why_not
@@ -112,7 +114,7 @@ def _number(value: float) -> float | None:
 
 
 def _percent(value: float) -> float | None:
-    return _number(100.0 * value)
+    return _number(round(100.0 * value, 2))
 
 
 def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
@@ -188,6 +190,15 @@ def jacobians_of(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Jacobia
         columns=columns,
         slopes=slopes,
     )
+
+
+def wrong_jacobians(traces: Sequence[Trace], checkpoint: Checkpoint) -> tuple[str, ...]:
+    """The alarms of ``jacobians_of``; none where it does not apply."""
+    if not isinstance(checkpoint, ExternalFilter) or any(why_not(trace, checkpoint) for trace in traces):
+        return ()
+    with suppress(BadInput):
+        return jacobians_of(traces, checkpoint).alarms
+    return ()
 
 
 ENTRY = Entry(

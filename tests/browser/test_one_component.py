@@ -60,12 +60,29 @@ def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: A
     assert " cm" not in words
 
 
+SCALED = f"""
+import sys
+sys.path.insert(0, {str(TANK.parent)!r})
+import tank
+from beliefscope.filters.external.adapter import Adapter
+
+class Scaled(tank.Kalman):
+    def forward(self, *, observations, controls):
+        scaled = observations | {{"colour": 1.02 * observations["colour"]}}
+        return super().forward(observations=scaled, controls=controls)
+
+def build():
+    return Adapter(Scaled(), modalities=tuple(tank.TASK.modalities), initial_std=(0.3,), task=tank.TASK)
+"""
+
+
 @pytest.mark.long
 def test_a_healthy_record_is_measured_and_measured_again(open_page: Any, start_server: Any, tmp_path: Path) -> None:
     tank = runpy.run_path(str(TANK))
     write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(60)])
     options = ["--task", f"{TANK}:TASK", "--data", str(tmp_path / "tank.h5"), "--filter", f"{TANK}:build"]
     page = open_page("?tab=diagnosis", url=start_server(*options).url)
+    assert not page.page.locator("#diagnosis .healthy-filter >> visible=true").count()  # there is no other filter
     page.page.get_by_role("button", name="Measure a healthy record").click()
     page.until("() => document.querySelector('#diagnosis').dataset.finding === 'healthy'")
     folder = tmp_path / "workspace" / "healthy"
@@ -80,3 +97,22 @@ def test_a_healthy_record_is_measured_and_measured_again(open_page: Any, start_s
     page.until("() => document.querySelector('#diagnosis').dataset.finding === 'healthy'")
     assert record.stat().st_mtime_ns > first
     page.screenshot("measured-again")
+
+
+@pytest.mark.long
+def test_another_filter_runs_over_the_healthy_episodes(open_page: Any, start_server: Any, tmp_path: Path) -> None:
+    """A factor on all readings of a sensor is in the record of the filter that has it, but not in that of another."""
+    (tmp_path / "scaled.py").write_text(SCALED)
+    tank = runpy.run_path(str(TANK))
+    write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(60)])
+    options = ["--task", f"{TANK}:TASK", "--data", str(tmp_path / "tank.h5")]
+    filters = ["--filter", f"{tmp_path}/scaled.py:build", "--filter", f"{TANK}:build"]
+    page = open_page("?tab=diagnosis", url=start_server(*options, *filters).url)
+    choice = page.page.locator("#diagnosis > .healthy-filter select")
+    assert choice.locator("option").all_text_contents() == ["this filter", "tank-build"]
+    choice.select_option("tank-build")
+    page.page.get_by_role("button", name="Measure a healthy record").click()
+    page.until("() => document.querySelector('#diagnosis').dataset.finding === 'fault'")
+    about = page.page.locator("#diagnosis .about").text_content()
+    assert "Healthy record: 60 held-out episodes of tank, run by tank-build" in about
+    page.screenshot("record-of-another-filter")

@@ -173,6 +173,14 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.match(healthy.evidence, /^Largest error at step 10\. /);
 });
 
+test('a defect of a filter without a diagnosis comes before its largest error', () => {
+  const defects = ['the Jacobian of radar differs by 91 %'];
+  const { tone, headline, evidence, step } = finding({ ...run(11), header: { defects } }, 0, null);
+  assert.deepEqual([tone, headline], ['bad', 'The Jacobian of radar differs by 91 %.']);
+  assert.match(evidence, /^Largest error at step 10\. /);
+  assert.equal(step, 10);
+});
+
 test('a run without truth has no step to go to', () => {
   const blind = { ...run(11), error: () => series(() => NaN), hasTruth: () => false };
   assert.equal(finding(blind, 0, null).step, null);

@@ -260,23 +260,30 @@ export const startDiagnostic = (selection, name, query) =>
 const diagnosisUrl = ({ task, filter, episode, data, faults }, over) =>
   path(['diagnosis', task, filter, episode], { data, faults, over });
 
-/** @param {Selection} run */
-const recordUrl = ({ task, filter, data }) => path(['healthy-record', task, filter], { data });
+/**
+ * @param {Selection} run
+ * @param {string} healthyFilter runs over the healthy episodes; empty: the filter of the run
+ */
+const recordUrl = ({ task, filter, data }, healthyFilter) =>
+  path(['healthy-record', task, filter], { data, healthy_filter: healthyFilter });
 
 /**
  * Gets the healthy record that was measured for a filter, or the job that measures it.
  * @param {Selection} run
+ * @param {string} healthyFilter
  * @param {AbortSignal} signal
  * @returns {Promise<import('../types/server.js').HealthyRecord | JobReply>}
  */
-export const healthyRecord = (run, signal) => get(recordUrl(run), signal);
+export const healthyRecord = (run, healthyFilter, signal) =>
+  get(recordUrl(run, healthyFilter), signal);
 
 /**
  * Starts the measurement of a filter's healthy record from the held-out episodes of a run's data.
  * @param {Selection} run
+ * @param {string} healthyFilter
  * @returns {Promise<JobReply>}
  */
-export const measureHealthyRecord = (run) => send(recordUrl(run));
+export const measureHealthyRecord = (run, healthyFilter) => send(recordUrl(run, healthyFilter));
 
 /**
  * Gets the diagnosis of a filter, or its job.

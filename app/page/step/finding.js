@@ -23,8 +23,8 @@ const BEFORE = 10; // steps that are compared with the outage
  */
 
 /**
- * Describes a run. A diagnosed fault comes first, then an injected one, an outage of the camera in contact, and the
- * largest error.
+ * Describes a run. A diagnosed fault comes first, then an injected one, an outage of the camera in contact, an error
+ * of a filter without a diagnosis, and the largest error.
  * @param {Trace} trace
  * @param {number} component whose effective weights are described
  * @param {Diagnosis | null} diagnosis null without one
@@ -40,14 +40,16 @@ export function finding(trace, component, diagnosis) {
     return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
   }
   const worst = worstFinding(trace, component);
+  const summary = `${worst.headline} ${worst.evidence}`.trim();
   // As its record, which may be poor.
   const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
   const outage = fault ? null : outageFinding(trace, component);
   if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
+  const defect = trace.header.defects?.[0];
+  if (defect) return { ...worst, tone: 'bad', headline: sentence(defect), evidence: summary };
   if (!diagnosis) return worst;
-  const evidence = `${worst.headline} ${worst.evidence}`.trim();
   const { tone = healthy, headline = healthyHeadline(trace, component, diagnosis) } = fault ?? {};
-  return { tone, headline, evidence, step: worst.step };
+  return { tone, headline, evidence: summary, step: worst.step };
 }
 
 /**

@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { SHOWN } from '../core/constants.js';
-import { create, html } from '../core/dom.js';
+import { create, html, setOptions } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { affectedComponent, largest } from '../step/finding.js';
@@ -49,6 +49,7 @@ export class Diagnosis {
   #records;
   /** @type {Set<string>} keys of records after which the run was loaded again */
   #announced = new Set();
+  #healthyFilter = ''; // runs over the episodes of a record; empty: the displayed filter
   #loading = new AbortController();
   #failure = ''; // why there is no run
   #open = false;
@@ -76,6 +77,11 @@ export class Diagnosis {
       finished.includes(this.#key) ? this.load() : this.#draw(),
     );
     this.#records = new JobResults(jobs, MAX_RESULTS, (finished) => this.#followRecords(finished));
+    for (const select of this.#healthyFilters)
+      select.addEventListener('change', () => {
+        this.#healthyFilter = select.value;
+        this.load();
+      });
     html('.gain button', host).addEventListener('click', () =>
       store.set({ tab: 'diagnostics', diagnostic: 'efficiency', options: '' }),
     );
@@ -89,6 +95,7 @@ export class Diagnosis {
 
   /** @param {Trace | null} trace null while another one is loading */
   show(trace) {
+    if (trace?.selection.filter !== this.#trace?.selection.filter) this.#healthyFilter = '';
     this.#trace = trace;
     this.#failure = '';
     this.#repair.clear();
@@ -114,7 +121,7 @@ export class Diagnosis {
     this.#repair.show(trace);
     if (trace.live) return this.#draw();
     if (trace.header.no_diagnosis) return this.#loadRecord(trace, signal);
-    this.#records.load(this.#recordKey, () => api.healthyRecord(trace.selection, signal), signal);
+    this.#records.load(this.#recordKey, () => this.#getRecord(trace, signal), signal);
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
     if (this.#entry.state !== 'absent' || !this.#starts) return;
@@ -129,7 +136,7 @@ export class Diagnosis {
    */
   async #loadRecord(trace, signal) {
     const key = this.#recordKey;
-    await this.#records.load(key, () => api.healthyRecord(trace.selection, signal), signal);
+    await this.#records.load(key, () => this.#getRecord(trace, signal), signal);
     if (signal.aborted || this.#records.get(key).state !== 'ready' || this.#announced.has(key))
       return;
     this.#announced.add(key);
@@ -150,7 +157,20 @@ export class Diagnosis {
 
   get #recordKey() {
     const { task, filter, data } = this.#trace?.selection ?? {};
-    return JSON.stringify([task, filter, data]);
+    return JSON.stringify([task, filter, data, this.#healthyFilter]);
+  }
+
+  /**
+   * @param {Trace} trace
+   * @param {AbortSignal} signal
+   */
+  #getRecord(trace, signal) {
+    return api.healthyRecord(trace.selection, this.#healthyFilter, signal);
+  }
+
+  /** @returns {NodeListOf<HTMLSelectElement>} */
+  get #healthyFilters() {
+    return this.#host.querySelectorAll('.healthy-filter select');
   }
 
   get #key() {
@@ -199,6 +219,7 @@ export class Diagnosis {
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
     });
+    html('.healthy-filter', this.#host).hidden = true; // of a filter without a record
     this.#drawMeasured(result);
     if (result === this.#listed) return;
     this.#listed = result;
@@ -258,6 +279,7 @@ export class Diagnosis {
       ? stateOf(entry) || about
       : 'Read-only server: the record cannot be measured here.';
     html('.status', this.#host).textContent = isReady ? '' : state;
+    this.#drawHealthyFilter(this.#host, trace, entry);
     showJobButton(html('.doing', this.#host), entry, {
       action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
       progress: 'Progress of the healthy record',
@@ -286,6 +308,7 @@ export class Diagnosis {
       : 'The record was measured in this workspace.';
     const about = `${source} Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
     html('.verdict', host).textContent = stateOf(entry) || (isInUse || isOld ? about : '');
+    this.#drawHealthyFilter(host, trace, entry);
     showJobButton(html('.doing', host), entry, {
       action: entry.state === 'active' ? 'Cancel' : 'Measure again',
       progress: 'Progress of the healthy record',
@@ -294,9 +317,29 @@ export class Diagnosis {
     });
   }
 
+  /**
+   * Shows the choice of the filter that runs over the healthy episodes, if the task has others.
+   * @param {HTMLElement} host
+   * @param {Trace} trace
+   * @param {JobResult<HealthyRecord>} entry
+   */
+  #drawHealthyFilter(host, trace, entry) {
+    const { task, filter } = trace.selection;
+    const filters = this.#catalog.tasks.find(({ name }) => name === task)?.filters ?? [];
+    const others = filters.filter(({ name, live }) => name !== filter && !live);
+    const label = html('.healthy-filter', host);
+    label.hidden = !this.#starts || !others.length || entry.state === 'active';
+    const select = /** @type {HTMLSelectElement} */ (html('select', label));
+    setOptions(select, [
+      ['', 'this filter'],
+      ...others.map(({ name }) => [name, displayName(name)]),
+    ]);
+    select.value = this.#healthyFilter;
+  }
+
   /** @param {Trace} trace */
   #startOrCancelRecord(trace) {
-    const start = () => api.measureHealthyRecord(trace.selection);
+    const start = () => api.measureHealthyRecord(trace.selection, this.#healthyFilter);
     this.#records.startOrCancel(this.#recordKey, start);
   }
 

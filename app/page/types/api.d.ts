@@ -146,7 +146,8 @@ export interface components {
          * @description The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
          *
          *     deviations: largest ones, whatever their cause.
-         *     miscalibrated: whether the healthy record itself is over- or underconfident, or innovations are not wrapped.
+         *     miscalibrated: whether the healthy record itself is over- or underconfident or has wrong Jacobians, or
+         *         innovations are not wrapped.
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
          *     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
          *     outdated: whether an earlier version measured the healthy record, which lacks statistics.
@@ -1958,7 +1959,7 @@ export interface components {
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
          *             reasons. sensors: drawn ones.
-         *         no_diagnosis: why the filter has no diagnosis, or None.
+         *         no_diagnosis: why the filter has no diagnosis, or None. defects: errors of such a filter that show without one.
          *         data_warning: how the data differ from the checkpoint's training data, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
          */
@@ -2012,6 +2013,11 @@ export interface components {
             data_warning?: string | null;
             /** No Diagnosis */
             no_diagnosis?: string | null;
+            /**
+             * Defects
+             * @default []
+             */
+            defects: string[];
             /** Scene */
             scene: ("replay" | "objects" | "estimates" | "contours" | "particles" | "force" | "map" | "camera")[];
             live?: components["schemas"]["LiveRun"] | null;
