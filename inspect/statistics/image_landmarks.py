@@ -142,8 +142,9 @@ def fit_landmark_filter(images: Array, positions: Array, others: Array | None = 
     power /= np.maximum(power.sum((1, 2), keepdims=True), 1e-12)
     seen = np.stack([(power * columns).sum((1, 2)), (power * rows).sum((1, 2))], axis=1)
     shape = (height + 2 * RADIUS, width + 2 * RADIUS)
-    spectrum = fft.rfft2(contrasts, shape)
-    density = np.square(np.abs(spectrum)).mean(0)
+    spectrum = fft.rfft2(contrasts.astype(np.float32), shape)  # see ``LandmarkFilter._response``
+    conjugate = spectrum.conj()
+    density = (spectrum.real**2 + spectrum.imag**2).mean(0, dtype=np.float64)
     density += RIDGE * density.mean()
     for size in WIDTHS:
         camera, weights = _robust_fit(terms, seen)
@@ -151,11 +152,12 @@ def fit_landmark_filter(images: Array, positions: Array, others: Array | None = 
         # The target, a Gaussian at the landmark, is a product of its parts along y and x, and so is its spectrum.
         along_y = fft.fft(np.exp(-((np.arange(height) - y[:, 0]) ** 2) / (2.0 * size**2)) * weights[:, None], shape[0])
         along_x = fft.rfft(np.exp(-((np.arange(width) - x[:, 0]) ** 2) / (2.0 * size**2)), shape[1])
-        cross = np.einsum("ti,tj,tij->ij", along_y, along_x, np.conj(spectrum), optimize=True) / weights.sum()
+        parts = (part.astype(np.complex64) for part in (along_y, along_x))
+        cross = np.einsum("ti,tj,tij->ij", *parts, conjugate, optimize=True) / weights.sum()
         full = np.roll(fft.irfft2(cross / density, shape), (RADIUS, RADIUS), axis=(0, 1))
         result = LandmarkFilter(background, full[: 2 * RADIUS + 1, : 2 * RADIUS + 1], camera, scale)
-        near = (np.abs(columns - x) <= SEARCH) & (np.abs(rows - y) <= SEARCH)
-        response = _convolution(spectrum, result.kernel, (height, width), shape)
+        near = (np.abs(columns[:1] - x) <= SEARCH) & (np.abs(rows[:, :1] - y) <= SEARCH)
+        response = _convolution(spectrum, result.kernel.astype(np.float32), (height, width), shape)
         seen = _peaks(np.where(near, response, -np.inf))
     if np.median(np.linalg.norm(seen - terms @ camera, axis=1)) > MAX_DISTANCE:
         return None

@@ -36,8 +36,8 @@ from beliefscope.inspect.diagnosis.deviations import (
 from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
-from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, profile_document
-from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, pretrained_reference, profile_document
+from beliefscope.inspect.healthy import profile_of, sensor_record
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -56,7 +56,9 @@ def simulated(first: int, count: int) -> dict[int, Episode]:
 
 @cache
 def profile() -> HealthyProfile:
-    return profile_of(checkpoint(), list(simulated(0, 20).values()), "seed 77")
+    episodes = list(simulated(0, 20).values())
+    images = pretrained_reference(load_task("push"))  # of the same camera
+    return profile_of(checkpoint(), episodes, "seed 77", sensor_record(episodes, images))
 
 
 @cache
@@ -201,7 +203,7 @@ def test_faults_after_all_steps_are_refused() -> None:
 @pytest.mark.slow
 def test_focused_episodes_are_compared_with_each_other() -> None:
     """Statistics that depend on the other episodes are those of the chosen ones, not of all from before."""
-    episodes = dict(simulated(100, 6)) | {i: faulty("effector_offset=0.03")[i] for i in (1, 4)}
+    episodes = dict(simulated(100, 6)) | {i: faulty("effector_offset=0.05")[i] for i in (1, 4)}
     runs = list(trace_all(checkpoint(), episodes, episodes, 0, 300))
     rows, sensors = zip(*(observe(run, checkpoint(), profile()) for run in runs), strict=True)
     inputs = RunInputs(checkpoint(), episodes, 300, frozenset(episodes))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import beliefscope as bs
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 
 SENSORS = {"front": 0.02, "rear": 0.05}
@@ -67,6 +69,11 @@ def loaded(filter_: Cart) -> Checkpoint:
     return bs.load_filter(adapter, TASK, name="cart")
 
 
+@cache
+def profile() -> HealthyProfile:
+    return profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("filter_", "cause"),
@@ -79,22 +86,19 @@ def loaded(filter_: Cart) -> Checkpoint:
     ],
 )
 def test_defects_of_an_external_filter_are_named(filter_: Cart, cause: str) -> None:
-    profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
-    result = diagnose(loaded(filter_), {seed: drive(seed) for seed in range(20, 30)}, profile=profile)
+    result = diagnose(loaded(filter_), {seed: drive(seed) for seed in range(20, 30)}, profile=profile())
     assert result.causes, result.headline
     assert (result.causes[0].cause.name, result.causes[0].probability > 0.5) == (cause, True)
 
 
 @pytest.mark.slow
 def test_a_healthy_external_filter_is_healthy() -> None:
-    profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
-    assert diagnose(loaded(Cart()), {seed: drive(seed) for seed in range(20, 30)}, profile=profile).state == "healthy"
+    assert diagnose(loaded(Cart()), {seed: drive(seed) for seed in range(20, 30)}, profile=profile()).state == "healthy"
 
 
 @pytest.mark.slow
 def test_a_faulty_sensor_is_not_broken_dynamics_although_predictions_start_at_wrong_estimates() -> None:
-    profile = profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
     faulty = {seed: Faults.parse("sensor_gain=rear:factor=-1").apply(drive(seed), seed) for seed in range(50, 56)}
-    result = diagnose(loaded(Cart(weight=0.5)), faulty, profile=profile)
+    result = diagnose(loaded(Cart(weight=0.5)), faulty, profile=profile())
     probability = {c.cause.name: c.probability for c in result.causes}
     assert probability["rear.sign"] > 0.9 > 0.2 > probability.get("dynamics.broken", 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.equation_checks import reported_particle_statistics
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 
 TASK = bs.Task(
@@ -64,9 +66,13 @@ def filter_of(module: Particles) -> Any:
     return as_external(bs.Adapter(module, batched=False, modalities=tuple(STD), initial_std=(0.1,)), "rail", TASK)
 
 
+@cache
+def record() -> HealthyProfile:
+    return profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
+
+
 def diagnosis(module: Particles) -> Diagnosis:
-    record = profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
-    return diagnose(filter_of(module), {seed: ride(seed) for seed in range(100, 106)}, profile=record)
+    return diagnose(filter_of(module), {seed: ride(seed) for seed in range(100, 106)}, profile=record())
 
 
 def test_statistics_of_particles_that_a_filter_reports() -> None:
@@ -115,11 +121,10 @@ def noisy(readings: np.ndarray) -> np.ndarray:
 def test_a_sensor_of_a_users_task_has_causes(
     change: Callable[[np.ndarray], np.ndarray], cause: str, headline: str
 ) -> None:
-    record = profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
     episodes = {seed: ride(seed) for seed in range(100, 106)}
     for episode in episodes.values():
         episode.observations["near"][:] = change(episode.observations["near"])
-    result = diagnose(filter_of(Particles()), episodes, profile=record)
+    result = diagnose(filter_of(Particles()), episodes, profile=record())
     assert (result.state, result.causes[0].cause.name) == ("fault", cause)
     assert result.headline.startswith(headline)
 
