@@ -13,6 +13,7 @@ from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.statistics.innovations import least_certain
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
 
@@ -114,7 +115,7 @@ class RepeatedSteps:
         episodes = [trace.episode.part(step + 1 - calls, step + 1) for step in steps for _ in range(shifts.shape[1])]
         values, _ = checkpoint.run(episodes, start=start)
         arrays = {k: v[-1].unflatten(0, (len(steps), -1)).double().numpy() for k, v in values.items()}
-        rows, first = np.arange(len(steps)), _least_certain(arrays["predicted_covariance"][:, 0])
+        rows, first = np.arange(len(steps)), least_certain(arrays["predicted_covariance"][:, 0])
         self.mean, self.covariance = (arrays[f"predicted_{name}"][rows, :, first] for name in ("mean", "covariance"))
         self.correction = self.task.difference(arrays["estimate_mean"][:, 0], self.mean[:, 0])
         self.posterior = arrays["estimate_covariance"][:, 0]
@@ -194,13 +195,8 @@ def _beliefs(trace: Trace, steps: NDArray[np.intp], is_updated: bool) -> tuple[A
     assert trace.predicted_mean is not None
     assert trace.predicted_covariance is not None
     mean, covariance = (x[steps].astype(np.float64) for x in (trace.predicted_mean, trace.predicted_covariance))
-    rows, first = np.arange(len(steps)), _least_certain(covariance)
+    rows, first = np.arange(len(steps)), least_certain(covariance)
     return mean[rows, first], covariance[rows, first]
-
-
-def _least_certain(covariance: Array) -> NDArray[np.intp]:
-    """(J,) index of the belief before all updates, from covariances (J, K, n, n) before each of them."""
-    return np.asarray(np.linalg.slogdet(covariance)[1].argmax(-1))
 
 
 def _std(covariance: Array) -> Array:

@@ -89,8 +89,13 @@ def prediction(trace: Trace) -> tuple[Array, Array | None] | None:
         return mean[:, 0], None if covariance is None else covariance[:, 0]
     if covariance is None or not np.isfinite(covariance).all():
         return None
-    steps, first = np.arange(len(mean)), np.linalg.slogdet(covariance)[1].argmax(1)
+    steps, first = np.arange(len(mean)), least_certain(covariance)
     return mean[steps, first], covariance[steps, first]
+
+
+def least_certain(covariance: Array) -> NDArray[np.intp]:
+    """(T,) index of the belief before all updates, from covariances (T, K, n, n) before each of them."""
+    return np.asarray(np.linalg.slogdet(covariance)[1].argmax(-1))
 
 
 def _predicted_particles(trace: Trace) -> tuple[Array, Array] | None:
