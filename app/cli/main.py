@@ -58,7 +58,16 @@ for name in COMMANDS:
 @cache
 def command_group() -> Any:
     """The group of all commands. Kept, as building it takes longer than most errors need to be found."""
-    return typer.main.get_command(cli)
+    group: Any = typer.main.get_command(cli)
+    for command in group.commands.values():
+        for parameter in command.params:
+            if parameter.param_type_name == "argument":
+                parameter.display_type_rich = _no_type
+    return group
+
+
+def _no_type(ctx: object) -> None:
+    """The type of an argument in the help text: none, as its name states what it is."""
 
 
 def main() -> None:
@@ -125,6 +134,8 @@ def beliefscope(
       beliefscope record door --filter mine.safetensors --data door.h5 -o run.rrd
 
     Run a command with --help for its options. Exit codes: 0 success, 1 failure, 2 invalid input.
+
+    The paper in help texts: Lee et al., Multimodal Sensor Fusion with Differentiable Filters (IROS 2020).
     """
     if version:
         print(f"beliefscope {__version__}")
