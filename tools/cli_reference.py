@@ -45,7 +45,10 @@ def reference() -> str:
     shared = [row for row, number in numbers.most_common() if number >= SHARED]
     shared.sort(key=lambda row: row[0].startswith("-"))  # arguments before options
     parts = [INTRODUCTION, ", ".join(f"[{name}](#{name})" for name in COMMANDS) + "\n"]
-    parts.append("## Shared arguments\n\nEach command names those that it has.\n\n" + table(shared))
+    parts.append(
+        "## Shared arguments\n\nEach command lists its own arguments, then the names of shared ones.\n\n"
+        + table(shared)
+    )
     for name, text in texts.items():
         parts.append(text)
         if own := [row for row in rows[name] if row not in shared]:
