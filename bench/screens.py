@@ -110,7 +110,7 @@ def slices(page: Page) -> None:
 
 
 def finetune(end: str, seed: int | None = None) -> Callable[[Page], None]:
-    """Return a function that starts a fine-tuning, or opens the one with this seed, and waits for a condition."""
+    """Return a function that starts a fine-tuning run, or opens the one with this seed, and waits for a condition."""
 
     def show(page: Page) -> None:
         page.goto(f"{page.url.partition('?')[0]}?task=door&filter=crossmodal-ekf&tab=finetune", timeout=TIMEOUT)
@@ -159,7 +159,7 @@ READ_ONLY_VIEWS = ("first", "diagnosis", "diagnostics", "finetune", "rerun", "re
 
 
 def close(page: Page) -> None:
-    """Close dialogs and popovers, and pause a fine-tuning."""
+    """Close dialogs and popovers, and pause a fine-tuning run."""
     page.evaluate(
         "() => { document.querySelector('dialog[open]')?.close();"
         " document.querySelector('[popover]:popover-open')?.hidePopover();"

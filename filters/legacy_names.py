@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 SETTINGS = {"nominal": "clean_weight", "pull": "l2_sp", "moments": "events"}
-"""Settings of a fine-tuning."""
+"""Settings of a fine-tuning run."""
 
 PLAN = {"pictures": "images", "alone": "single"}
 """Fields of a training schedule."""

@@ -41,7 +41,7 @@ def constants() -> dict[str, tuple[str, object]]:
         "SHOWN": ("Smallest probability of a cause of a fault that is listed.", SHOWN),
         "LARGEST": ("Largest probability that is displayed as a number.", LARGEST),
         "HASH_DIGITS": ("Digits of its hash at the end of the name of a checkpoint of a sweep.", HASH_DIGITS),
-        "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning.", FineTune.clean_weight),
+        "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning run.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),
         "VIEWPOINTS": ("Viewpoints of the 3D scene.", get_args(messages.Viewpoint)),
         "SCENE_CHOICES": (

@@ -44,7 +44,7 @@ class ExperimentRow(Reply):
 
     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
     ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
-    timestamps. training: JSON of the hash of its data, plan, blackouts, faults and the settings of a fine-tuning.
+    timestamps. training: JSON of the hash of its data, plan, blackouts, faults and the settings of a fine-tuning run.
     provenance: JSON of the file beside the checkpoint.
     """
 

@@ -17,7 +17,7 @@ from beliefscope.inspect.diagnosis import weaknesses
 
 @fields_of(weaknesses.Weakness, "source", "title", "evidence", "episode", "step")
 class Weakness(Reply):
-    """A weakness and the settings of a fine-tuning that addresses it. slices: those of the settings."""
+    """A weakness and the settings of a fine-tuning run that addresses it. slices: those of the settings."""
 
     settings: dict[str, Any]
     slices: list[SliceInfo]

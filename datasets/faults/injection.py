@@ -253,7 +253,7 @@ def _parse_fault(text: str) -> Fault:
     for part in rest:
         key, equals, value = part.partition("=")
         if not equals or key in values:
-            raise BadInput(f"{part!r} in {text!r} is not a new parameter=value")
+            raise BadInput(f"{part!r} in {text!r} is not parameter=value, each parameter once")
         values[key] = _parse_value(value)
     return _create(name, values)
 

@@ -99,7 +99,7 @@ def _identity(path: Path) -> tuple[int, int, int, int]:
 
 def read_error(path: Path, error: Exception) -> BadInput:
     """Return the error for a file that HDF5 cannot read, with its message."""
-    return BadInput(f"{path} is damaged or cut short: {error_message(error)}. Collect or copy it again.")
+    return BadInput(f"{path} is damaged or truncated: {error_message(error)}. Collect or copy it again.")
 
 
 def error_message(error: Exception) -> str:

@@ -192,7 +192,7 @@ def _read(path: Path) -> dict[str, object]:
                     if isinstance(value, h5py.Dataset)
                 }
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path} is not JSON or cut short: {error}.") from None
+        raise BadInput(f"{path} is truncated or not JSON: {error}.") from None
     except BadInput:
         raise
     except HDF5_ERRORS as error:

@@ -332,7 +332,7 @@ def load_external(
     """The filter that ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION`` returns when called without arguments.
 
     The global generators of torch and NumPy are seeded for the call. ``FILE.py:FUNCTION@FILE.safetensors`` loads
-    weights into the module, such as those of a fine-tuning.
+    weights into the module, such as those of a fine-tuning run.
 
     Args:
         task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.

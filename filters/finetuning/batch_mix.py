@@ -1,4 +1,4 @@
-"""Training batches of a fine-tuning: windows of several slices in given shares, cut from episodes with faults."""
+"""Training batches of a fine-tuning run: windows of several slices in given shares, cut from episodes with faults."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class FineTuned:
 
 @dataclass(frozen=True)
 class Callbacks:
-    """Functions that a fine-tuning calls.
+    """Functions that a fine-tuning run calls.
 
     Attributes:
         report: after each step, with step, total steps and loss. on_validation: after each validation, the base

@@ -1,4 +1,4 @@
-"""The optimisation loop of a fine-tuning: its steps, its validations, and its state for resuming."""
+"""The optimisation loop of a fine-tuning run: its steps, its validations, and its state for resuming."""
 
 from __future__ import annotations
 

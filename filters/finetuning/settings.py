@@ -1,4 +1,4 @@
-"""Settings of a fine-tuning, and their JSON form."""
+"""Settings of a fine-tuning run, and their JSON form."""
 
 from __future__ import annotations
 
@@ -82,15 +82,15 @@ class FineTune:
         for name, limit in LIMITS.items():
             value = getattr(self, name)
             if not 1 <= value <= limit:
-                raise BadInput(f"{name} of a fine-tuning is {value}, not a whole number from 1 to {limit}")
+                raise BadInput(f"{name} of a fine-tuning run is {value}, not a whole number from 1 to {limit}")
         if not 0 <= self.seed < 2**63:
-            raise BadInput(f"seed of a fine-tuning is {self.seed}, not a whole number from 0 to 2^63 - 1")
+            raise BadInput(f"seed of a fine-tuning run is {self.seed}, not a whole number from 0 to 2^63 - 1")
         for name in ("rate", "l2_sp", "likelihood_weight"):
             value = getattr(self, name)
             if not (0.0 < value < math.inf or (value == 0.0 and name != "rate")):
-                raise BadInput(f"{name} of a fine-tuning is {value!r}, not a number of at least 0")
+                raise BadInput(f"{name} of a fine-tuning run is {value!r}, not a number of at least 0")
         if not 0.0 <= self.clean_weight <= 1.0:
-            raise BadInput(f"clean_weight of a fine-tuning is {self.clean_weight!r}, not from 0 to 1")
+            raise BadInput(f"clean_weight of a fine-tuning run is {self.clean_weight!r}, not from 0 to 1")
         for pattern, rate in self.rates:
             if not 0.0 <= rate < math.inf:
                 raise BadInput(f"the rate of {pattern!r} is {rate!r}, not a number of at least 0")
@@ -135,7 +135,7 @@ class FineTune:
     def from_json(cls, value: Any) -> FineTune:
         """Reads the values of ``to_json``; missing ones take their default. Raises BadInput for anything else."""
         if not isinstance(value, Mapping):
-            raise BadInput(f'settings of a fine-tuning are {value!r}, not an object such as {{"steps": 300}}')
+            raise BadInput(f'settings of a fine-tuning run are {value!r}, not an object such as {{"steps": 300}}')
         settings = {f.name: f for f in fields(cls)}
         arguments: dict[str, Any] = {}
         for key, setting in legacy_names.rename_keys(value, legacy_names.SETTINGS).items():
@@ -146,7 +146,7 @@ class FineTune:
             except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
                 if isinstance(error, BadInput):
                     raise
-                raise BadInput(f"setting {key!r} of a fine-tuning is {setting!r}, which does not fit") from None
+                raise BadInput(f"setting {key!r} of a fine-tuning run is {setting!r}, which does not fit") from None
         return cls(**arguments)
 
 

@@ -1,4 +1,4 @@
-"""Success criterion of a fine-tuning, set before the run.
+"""Success criterion of a fine-tuning run, set before the run.
 
 As text, ``SLICE:measure=MEASURE:by=PERCENT:others=PERCENT``; everything but the slice is optional:
 ``contact:by=10%:others=5%``.

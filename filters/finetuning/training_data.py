@@ -1,4 +1,4 @@
-"""Training episodes of a fine-tuning: those of the data set, or simulated ones for a sample set that has none."""
+"""Training episodes of a fine-tuning run: those of the data set, or simulated ones for a sample set that has none."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EPISODES, SEED = 60, 1000
 
 
 def simulated_episodes(name: str, data: Dataset, is_sample: bool) -> int:
-    """Number of episodes to simulate for a fine-tuning; 0 if the data set has training episodes.
+    """Number of episodes to simulate for a fine-tuning run; 0 if the data set has training episodes.
 
     Raises BadInput if it has none and is not the sample set of a task that can be simulated.
     """

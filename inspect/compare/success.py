@@ -1,4 +1,4 @@
-"""Verdict on the success criterion of a fine-tuning, from the comparison with its base checkpoint."""
+"""Verdict on the success criterion of a fine-tuning run, from the comparison with its base checkpoint."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SliceChange:
 
 @dataclass(frozen=True)
 class Success:
-    """Outcome of a fine-tuning by its criterion.
+    """Outcome of a fine-tuning run by its criterion.
 
     Attributes:
         criterion: as text. statement: in words. outcome: of all slices. verdict: the outcome in words.

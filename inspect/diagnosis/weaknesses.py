@@ -32,7 +32,7 @@ PHASE_SLICES = {
 
 @dataclass(frozen=True)
 class Weakness:
-    """A weakness and the settings of a fine-tuning that addresses it.
+    """A weakness and the settings of a fine-tuning run that addresses it.
 
     source: of the weakness. title: in words. evidence: its numbers. episode, step: where it shows, or None.
     """

@@ -145,7 +145,9 @@ def parse_weights(text: str) -> dict[str, float]:
         except ValueError:
             equals = ""
         if not equals or not name or name in weights:
-            raise BadInput(f"weights {text!r}: {part.strip()!r} is not a new MODALITY=BETA such as image=0.9")
+            raise BadInput(
+                f"weights {text!r}: {part.strip()!r} is not MODALITY=BETA such as image=0.9, each modality once"
+            )
         weights[name] = beta
     return weights
 

@@ -26,7 +26,7 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     """All columns of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays."""
     if path.suffix.lower() == ".npz":
         if not is_zipfile(path):  # NumPy would suggest to load the file as a pickle
-            raise BadInput(f"{path.name} is no complete NumPy archive, as written by np.savez")
+            raise BadInput(f"{path.name} is not a complete NumPy archive, as written by np.savez")
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     from pyarrow import csv, parquet

@@ -39,7 +39,7 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     import zarr
 
     if path.is_file() and not zipfile.is_zipfile(path):
-        raise BadInput(f"{path.name} is no complete zip archive")
+        raise BadInput(f"{path.name} is not a complete zip archive")
     names = _nodes(path)
     if ENDS not in names:
         raise BadInput(f"the store has no array {ENDS!r}: not a replay buffer{_elsewhere(path)}")

@@ -153,7 +153,7 @@ def test_not_hdf5(tmp_path: Path, content: bytes) -> None:
 def test_truncated_file(path: Path, fraction: float) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: int(fraction * len(content))])
-    check_rejected(path, "damaged or cut short|is not an HDF5 file")
+    check_rejected(path, "damaged or truncated|is not an HDF5 file")
 
 
 def test_flipped_bytes_are_detected_or_harmless(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,7 +103,7 @@ test('the effect of undoing a cause has a direction and no sign', () => {
   );
 });
 
-test('only a cause whose next action is a fine-tuning offers one', () => {
+test('only a cause whose next action is a fine-tuning run offers one', () => {
   assert.ok(
     isTrainable({ next: 'Fine-tune it: `beliefscope finetune door --filter crossmodal-ekf`.' }),
   );

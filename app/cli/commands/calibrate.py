@@ -11,8 +11,8 @@ def calibrate(
     """Calibrate the uncertainty of a filter.
 
     Fits factors on the covariances, and conformal regions, to every other held-out episode, and reports the coverage
-    over the rest, before and after. Conformal regions hold their level for any filter, also for estimators without a
-    covariance. beliefscope.filters.calibration applies the file in your own loop. Details: docs/calibration.md.
+    over the rest, before and after. Conformal regions reach their level for any filter, with or without a covariance.
+    beliefscope.filters.calibration applies the file in your own loop. Details: docs/calibration.md.
 
     \b
     Examples:

@@ -26,9 +26,9 @@ def change(
 
     Runs both filters over the held-out episodes with the same sensor faults and random numbers. Reports every
     error and covariance measure before and after, by data slice: clean, contact, free motion, 80 % image blackout,
-    each modality only, and the slices given; with 95 % intervals over episodes. A difference counts as
-    improved or regressed if it is at least 2 % and its interval excludes zero. Also lists the events with the largest
-    increase in error, and the change of each module of checkpoints.
+    each modality only, and those of --slice; with 95 % intervals over episodes. A difference counts as improved or
+    regressed if it is at least 2 % and its interval excludes zero. Also lists the events with the largest increase in
+    error, and the change of each module of checkpoints.
 
     \b
     Examples:

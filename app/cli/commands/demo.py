@@ -11,8 +11,8 @@ def demo(
     """Open the dashboard on an example.
 
     Serves the pretrained filters and the sample data from a temporary workspace, which is deleted at the end, and opens
-    the page in a browser: the camera goes dark while a robot pushes a puck. Stop it with Ctrl-C. Your own filters and
-    data: beliefscope serve.
+    the page in a browser: the camera goes dark while a robot pushes a puck. Stop it with Ctrl-C. For your own filters
+    and data, use beliefscope serve.
 
     \b
     Example:

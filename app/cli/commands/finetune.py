@@ -167,7 +167,7 @@ def _training_episodes(data: Dataset, path: Path | None, folder: Path) -> tuple[
 
 @contextmanager
 def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: str = "") -> Iterator[Callbacks]:
-    """Progress bars and logs of a fine-tuning."""
+    """Progress bars and logs of a fine-tuning run."""
     from beliefscope.filters.finetuning.finetune import Callbacks
     from beliefscope.filters.finetuning.report import curve_values, error_summary
     from beliefscope.recordings.rerun_log.training_curves import log_curves

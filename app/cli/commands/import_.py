@@ -37,7 +37,7 @@ def import_(
     """Import a recording or a log as a trace or data set.
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
-    From a live run in progress, or one that was killed, the complete steps are extracted.
+    Of a live run that is in progress or was killed, the complete steps are imported.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a

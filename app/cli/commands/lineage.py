@@ -6,7 +6,9 @@ from beliefscope.datasets.errors import BadInput
 
 def lineage(
     paths: list[Path] = opt.argument("FOLDER...", "Checkpoints, or folders with checkpoints."),
-    export: str | None = opt.option("CHECKPOINT", "Copy this checkpoint (path or hash) and its ancestors to -o.", None),
+    export: str | None = opt.option(
+        "CHECKPOINT", "Copy this checkpoint (path or hash) and its ancestors to the folder of -o.", None
+    ),
     output: Path | None = opt.option("DIR", "New folder for --export.", None, "-o"),
 ) -> console.Result:
     """Show which checkpoint was fine-tuned from which.

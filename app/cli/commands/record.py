@@ -14,8 +14,8 @@ def record(
 ) -> console.Result:
     """Record a filter run over one episode as a Rerun recording.
 
-    Contains images, particles or covariance ellipses, estimates with the true state, fusion weights, contact, errors,
-    likelihood maps and diagnostics, and their layout. Open it with: rerun run.rrd
+    The recording has images, particles or covariance ellipses, estimates with the true state, fusion weights, contact,
+    errors, likelihood maps, diagnostics, and a layout for them. Open it with: rerun run.rrd
 
     \b
     Examples:

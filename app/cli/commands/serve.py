@@ -46,10 +46,10 @@ def serve(
 ) -> None:
     """Serve the dashboard: replay, maps and weights.
 
-    Serves the pretrained filters and the sample data, and any others given. Prints the address once the server listens;
-    stop it with Ctrl-C. To use the dashboard from another machine, keep the default host and forward the port: ssh -L
-    8000:127.0.0.1:8000 MACHINE. Alternatively, --host makes the server reachable directly; the printed address then
-    contains the required token. Set BELIEFSCOPE_TOKEN in the environment to choose the token. Security:
+    Serves the pretrained filters, the sample data, and your own (--filter, --data). Prints the address once the server
+    listens; stop it with Ctrl-C. To use the dashboard from another machine, keep the default host and forward the port:
+    ssh -L 8000:127.0.0.1:8000 MACHINE. Alternatively, --host makes the server reachable directly; the printed address
+    then contains the required token. Set BELIEFSCOPE_TOKEN in the environment to choose the token. Security:
     docs/security.md; long-running servers: docs/operations.md.
 
     \b

@@ -23,7 +23,7 @@ export const LARGEST = /** @type {const} */ (0.99);
 /** Digits of its hash at the end of the name of a checkpoint of a sweep. */
 export const HASH_DIGITS = /** @type {const} */ (8);
 
-/** Weight of clean data in the loss of a fine-tuning. */
+/** Weight of clean data in the loss of a fine-tuning run. */
 export const CLEAN_WEIGHT = /** @type {const} */ (0.5);
 
 /** Layers of the 3D scene. */

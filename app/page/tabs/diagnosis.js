@@ -352,7 +352,7 @@ export class Diagnosis {
 
   #finetuneButton() {
     const textContent = 'Fine-tune the filter …';
-    const title = 'Set up a fine-tuning for this cause';
+    const title = 'Set up a fine-tuning run for this cause';
     const button = create('button', { type: 'button', className: 'text', textContent, title });
     button.addEventListener('click', () => this.#store.set({ tab: 'finetune', run: '' }));
     return button;

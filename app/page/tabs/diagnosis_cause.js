@@ -58,7 +58,7 @@ export function evidenceItem({ text, episode, step, time }, open) {
 }
 
 /**
- * Whether the next action of a cause is a fine-tuning, unlike that of a sensor that must be repaired.
+ * Whether the next action of a cause is a fine-tuning run, unlike that of a sensor that must be repaired.
  * @param {Pick<DiagnosisCause, 'next'>} cause
  */
 export const isTrainable = ({ next }) => next.includes('`beliefscope finetune ');

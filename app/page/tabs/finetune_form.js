@@ -1,4 +1,4 @@
-/** Form for a fine-tuning: a weakness, the modules and data to train, and the criterion of success. */
+/** Form for a fine-tuning run: a weakness, the modules and data to train, and the criterion of success. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog, FineTuneOffer, FineTuneRunInfo, FineTuneSettings, Weakness } from '../types/server.js' */

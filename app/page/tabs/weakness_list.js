@@ -1,4 +1,4 @@
-/** List of the weaknesses of a filter; a fine-tuning addresses the selected one. */
+/** List of the weaknesses of a filter; a fine-tuning run addresses the selected one. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Weakness } from '../types/server.js' */

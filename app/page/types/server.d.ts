@@ -72,7 +72,7 @@ export interface StartedJob {
   job: Job;
 }
 
-/** Settings of a fine-tuning. mix: data slices to train on. train: presets and modules; events: episodes and steps. */
+/** Settings of fine-tuning. mix: data slices to train on. train: presets and modules; events: episodes and steps. */
 export interface FineTuneSettings {
   train: string[];
   clean_weight: number;

@@ -156,7 +156,7 @@ def test_interrupted_run_keeps_its_losses(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ({"steps": 0}, "steps of a fine-tuning is 0"),
+        ({"steps": 0}, "steps of a fine-tuning run is 0"),
         ({"train": ["haptic-only"]}, "Did you mean haptics-only"),
         ({"nonsense": 1}, "does not exist. Available: train, freeze"),
         ({"mix": [{"slice": {"name": "a", "only": ["touch"]}, "share": 1.0}]}, "Available: image, haptics"),

@@ -25,7 +25,7 @@ ERRORS = {"haptics only": {"rmse": {"position_cm": 2.0}, "nll": 1.0}}
 
 
 def finetune(base: Path, workspace: Path, run: str, seed: int) -> str:
-    """Write the checkpoint of a fine-tuning without steps; returns its hash."""
+    """Write the checkpoint of a fine-tuning run without steps; returns its hash."""
     checkpoint = load_checkpoint(base)
     record = {
         "command": "none",

@@ -292,14 +292,14 @@ def test_truncated_file(tmp_path: Path, fraction: float) -> None:
     path = write(tmp_path, rows())
     content = path.read_bytes()
     path.write_bytes(content[: int(fraction * len(content))])
-    check_rejected(path, "is not JSON or cut short")
+    check_rejected(path, "is truncated or not JSON")
     other = path.with_suffix(".h5")
     with h5py.File(other, "w") as file:
         for key, value in rows().items():
             file[key] = np.array(value)
     content = other.read_bytes()
     other.write_bytes(content[: int(fraction * len(content))])
-    with pytest.raises(BadInput, match=r"is damaged or cut short|is not an HDF5 file"):
+    with pytest.raises(BadInput, match=r"is damaged or truncated|is not an HDF5 file"):
         open_dataset(other)
 
 

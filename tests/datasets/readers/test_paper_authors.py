@@ -262,5 +262,5 @@ def test_truncated_file(tmp_path: Path, fraction: float) -> None:
     write(path, door, 2)
     content = path.read_bytes()
     path.write_bytes(content[: int(fraction * len(content))])
-    with pytest.raises(BadInput, match=r"is damaged or cut short|is not an HDF5 file"):
+    with pytest.raises(BadInput, match=r"is damaged or truncated|is not an HDF5 file"):
         open_dataset(path, skip_bad=True)

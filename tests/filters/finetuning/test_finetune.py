@@ -302,11 +302,11 @@ def test_settings_survive_json_and_invalid_ones_are_rejected(episodes: list[Epis
     assert list(FineTune().shares()) == [CLEAN]
     for values, message in (
         ({"step": 3}, "fine-tuning setting 'step' does not exist"),
-        ({"steps": "3"}, "setting 'steps' of a fine-tuning is '3'"),
+        ({"steps": "3"}, "setting 'steps' of a fine-tuning run is '3'"),
         ({"steps": 0}, "not a whole number from 1 to"),
         ({"train": "all"}, "setting 'train'"),
         ({"clean_weight": 1.5}, "not from 0 to 1"),
-        ({"rate": 0}, "rate of a fine-tuning"),
+        ({"rate": 0}, "rate of a fine-tuning run"),
         ({"mix": [{"slice": {"name": "clean"}, "share": 1}]}, "slice names must be unique"),
         ({"events": ["x"]}, "not EPISODE or EPISODE:FIRST-LAST"),
         ([], "not an object"),

@@ -1,4 +1,4 @@
-"""A training and a fine-tuning interrupted by SIGTERM resume to identical weights."""
+"""A training and a fine-tuning run interrupted by SIGTERM resume to identical weights."""
 
 from __future__ import annotations
 

@@ -352,7 +352,7 @@ def test_files_that_are_no_archives_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.npz"
     for data in (b"", b"t,x", b"\x93NUMPY\x01\x00"):
         path.write_bytes(data)
-        with pytest.raises(BadInput, match="is no complete NumPy archive"):
+        with pytest.raises(BadInput, match="is not a complete NumPy archive"):
             read_columns(path)
     with pytest.raises(BadInput, match="column 'x' of state x has complex values, expected numbers"):
         column({"x": np.ones(3, complex)}, "x", "state x")

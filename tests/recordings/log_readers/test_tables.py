@@ -273,7 +273,7 @@ def test_archives_that_are_no_replay_buffers(tmp_path: Path) -> None:
     path, copy = tmp_path / "buffer.zip", tmp_path / "copy.zip"
     logs.write_zarr(path)
     copy.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(BadInput, match=r"copy\.zip is no complete zip archive"):
+    with pytest.raises(BadInput, match=r"copy\.zip is not a complete zip archive"):
         read_columns(copy)
     with zipfile.ZipFile(path) as source, zipfile.ZipFile(copy, "w") as target:
         for name in source.namelist():
