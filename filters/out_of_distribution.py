@@ -204,7 +204,7 @@ def _feature_findings(task: Task, summary: Mapping[str, Any], features: Array, i
     pairs = itertools.combinations(channels(task), 2)
     for (a, b), value in zip(pairs, severity[2 * len(images) :], strict=True):
         if value > 1.0 and not {a.key, b.key} & {"state", *ignored}:
-            text = f"{a.name} and {b.name} are related in another way than in the training data (axes or signs?)"
+            text = f"the relation of {a.name} and {b.name} differs from that in the training data (axes or signs?)"
             result.append(Finding(b, float(value), text, relation=True))
     return result
 

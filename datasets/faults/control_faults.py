@@ -38,7 +38,9 @@ class ControlScaled(ControlFault):
 
     name = "control_scale"
     factor: float = number_field(0.5, "factor", "scale")
-    channel: int | None = integer_field(None, "channel", "index of the only channel that is scaled; default: see above")
+    channel: int | None = integer_field(
+        None, "channel", "index of the only scaled channel; default: the change of the hand position, else all"
+    )
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         scaled, count = readings.copy(), readings.shape[1]

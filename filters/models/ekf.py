@@ -52,7 +52,7 @@ def shared(belief: Gaussian) -> Gaussian:
 
 
 class VirtualSensor(nn.Module):
-    """Observations of one measurement model to a virtual observation of the state and its standard deviations.
+    """Virtual observation of the state with its standard deviations, from the observations of one measurement model.
 
     With ``authors`` networks, each output has its own half of the trunk's features and a first layer of n units.
     """

@@ -83,7 +83,7 @@ def healthy(case: Case) -> Diagnosis:
         overconfident = f"{'over' if nees > 1 else 'under'}confident (median NEES {nees:.2g})"
         headline = f"Healthy, though {overconfident}: {text}"
         if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
-            headline = f"Always {overconfident}, also in its record; {text[:-1]}; try: {CONVENTIONS}."
+            headline = f"Always {overconfident}, even in its healthy record; {text[:-1]}; try: {CONVENTIONS}."
     if defect := _turned(case) or _wrong_jacobians(case):
         headline = f"{defect}; otherwise {text}"
     provenance = _provenance(case)

@@ -15,6 +15,7 @@ from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice, fault_slice
 from beliefscope.filters.finetuning.success import ERROR, Criterion, measures
+from beliefscope.inspect.diagnosis.cause import probability_text
 from beliefscope.inspect.diagnosis.finetune_settings import training_for, training_on
 
 PROBABLE = 0.2
@@ -52,7 +53,7 @@ def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, epi
         if cause["probability"] < PROBABLE or settings is None:
             continue
         evidence = next(iter(cause["evidence"]), None) or {"text": "", "episode": None, "step": None}
-        text = f"Probability {cause['probability']:.2f}: {evidence['text']}"
+        text = f"Probability {probability_text(cause['probability'])}: {evidence['text']}"
         if (recovered := cause["recovered"]) and recovered["error"] is not None:
             text += f"; undoing it removes {percent(recovered['error'], 'z.0f')} of the {recovered['measure']} error"
             settings = _measured_by(settings, recovered["measure"], filter_.task)

@@ -179,7 +179,7 @@ class WeightAudit(Diagnostic):
         effect = "would" if low > 100.0 * MIN_REGRET else "might" if high > 100.0 * MIN_REGRET else "would hardly"
         return (
             f"The best constant weights by phase {effect} reduce the error: {best} "
-            f"with them, {value:+.1f} % without (95 % interval {low:+.1f} to {high:+.1f} %)."
+            f"with them, from which the filter's differs by {value:+.1f} % (95 % interval {low:+.1f} to {high:+.1f} %)."
         )
 
     @property

@@ -40,7 +40,7 @@ def test_bar_opens_the_largest_error(open_page: Any) -> None:
     for label, linked in labels:
         name, share = label.split(": ")[0].split(", ")
         row = rows[name, int(share.split()[0]) / 100]
-        seeds = ", ".join(f"seed {seed} {numbers['position_cm']:.2f}" for seed, numbers in row["by_seed"].items())
+        seeds = ", ".join(f"seed {seed}: {numbers['position_cm']:.2f}" for seed, numbers in row["by_seed"].items())
         assert f": {row['mean']['position_cm']:.2f} ± {row['spread']['position_cm']:.2f} cm ({seeds}); " in label
         assert linked == (name not in ("crossmodal-ukf", "lstm")) == label.endswith("opens the worst events of seed 0")
 

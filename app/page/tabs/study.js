@@ -257,7 +257,7 @@ export class Study {
       const value = values[key] ?? null;
       return value === null ? [] : [{ seed, value, here: Number(seed) === checkpoint?.seed }];
     });
-    const seeds = dots.map(({ seed, value }) => `seed ${seed} ${fixed(value, 2)}`).join(', ');
+    const seeds = dots.map(({ seed, value }) => `seed ${seed}: ${fixed(value, 2)}`).join(', ');
     const number =
       mean === null
         ? failed
