@@ -80,6 +80,6 @@ def reason(filter_: Filter) -> str:
     modules = settings.train[0].replace("-", " ")
     return (
         f"The pretrained filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which increases "
-        f"their error several-fold. The default trains the modules of \u201c{modules}\u201d on data with this fault. "
+        f"their error. The default trains the modules of \u201c{modules}\u201d on data with this fault. "
         "If the run ends without a change, try other modules or faults."
     )

@@ -62,7 +62,7 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
     """
     subject = "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
     if trace is not None and (only := trace.settings.get("standalone")):
-        return f"a standalone run of {only} {subject}: those of the run with all modalities include {only}"
+        return f"{only} standalone {subject}; the maps of the run with all modalities show {only}"
     if isinstance(checkpoint, ExternalFilter):
         wanted = (quantity,) if quantity else QUANTITIES
         reasons = [_no_density(checkpoint, trace, each) for each in wanted]
