@@ -54,12 +54,12 @@ PRESETS: dict[str, tuple[str, ...]] = {
 model's image encoders, which would make a step many times slower; ``all`` and custom patterns can include them."""
 
 PRESET_HELP = {
-    "weights-only": "Trains the fusion weights; the measurements of each modality stay the same.",
-    "noise-only": "Trains the size of process and measurement noise; the measurements of each modality stay the same.",
-    "reliability-only": "Trains the noise of each measurement and the fusion weights. The measurements themselves stay "
-    "the same, so this is the safest choice for sensor faults.",
-    "dynamics-only": "Trains the prediction of the next state; all measurements stay the same.",
-    "heads-only": "Trains the output layers; all features stay the same.",
+    "weights-only": "Trains the weight model; all measurement models stay the same.",
+    "noise-only": "Trains the process and measurement noise; everything else stays the same.",
+    "reliability-only": "Trains the noise of the measurement models and the fusion weights; everything else stays the "
+    "same, so this is the safest choice for sensor faults.",
+    "dynamics-only": "Trains the dynamics model; all other modules stay the same.",
+    "heads-only": "Trains the output layers; all other layers stay the same.",
     "all": "Trains everything, including image encoders: the largest effect, slow, and likely to regress elsewhere.",
 }
 """Preset -> effect. For that of a modality see ``preset_help``."""
@@ -68,7 +68,7 @@ PRESET_HELP = {
 def preset_help(name: str) -> str:
     """The effect of a preset in words."""
     modality = name.removesuffix("-only")
-    return PRESET_HELP.get(name, f"Trains the measurements of {modality} and their noise; other modules stay the same.")
+    return PRESET_HELP.get(name, f"Trains the measurement model of {modality}; all other modules stay the same.")
 
 
 DESCRIPTIONS = {
