@@ -14,12 +14,12 @@ export const STEPS = [
   {
     part: '#timeline',
     title: 'Timeline',
-    text: 'The weight of each modality, the estimates and their errors over time. Coloured bands are steps in contact, hatched bands steps without an image. Click or drag to move the cursor.',
+    text: 'The weight of each modality, the estimates and their errors over time. Coloured bands are steps in contact; hatched bands are steps without an image. Click or drag to move the cursor.',
   },
   {
     part: '#maps',
     title: 'Likelihood maps',
-    text: 'Where each modality and their fusion locate the object at this step. The cross is the true position.',
+    text: 'Where each modality, and the fusion of all, locates the object at this step. The cross is the true position.',
   },
   {
     part: '#step',
@@ -33,7 +33,7 @@ export const STEPS = [
   },
   {
     part: 'header',
-    title: 'Your own questions',
+    title: 'Selection and faults',
     text: 'Choose the filter and the episode, inject sensor faults, save a Rerun recording. Ctrl K finds every command.',
   },
 ];
