@@ -74,6 +74,7 @@ def test_wheel_contains_all_modules_and_data(wheel: Path, tree: Path) -> None:
     assert not [name for name in names if "tests/" in name]
 
 
+@pytest.mark.long
 def test_doctor_accepts_the_installation(installed: Path, tmp_path: Path) -> None:
     code = "import beliefscope.app.cli.main as c; print(c.__file__)"
     command = [installed.with_name("python"), "-c", code]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -13,6 +14,7 @@ import pytest
 from starlette.testclient import TestClient
 from tests.inspect.diagnosis.test_innovation_checks import sail, task
 
+from beliefscope.app.api.diagnosis import _repair_arguments
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
@@ -159,25 +161,21 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
         assert result["state"] == "healthy"
         assert result["headline"].startswith("The Jacobian of radar differs from finite differences by ")
         assert ", also in the healthy record; otherwise no significant deviation" in result["headline"]
-        repair = url.replace("diagnosis", "repair")
-        first = [start_and_cancel(client, url), start_and_cancel(client, repair)]
+        first = repair_record(settings)
         by_right = f"{record}?healthy_filter=right"
         job = client.post(by_right).json()["job"]  # a measured record again
         assert job["title"] == "Healthy record of wrong, boat, 20 held-out episodes of short, run by right"
         assert wait_for_record(client, by_right) == "20 held-out episodes of short, run by right"
-        assert start_and_cancel(client, url) != first[0]  # the diagnosis is computed again, too
-        assert start_and_cancel(client, repair) != first[1]  # and the repair, whose bound is from the record
+        assert client.get(url).status_code == 202  # the diagnosis is computed again, too
+        assert repair_record(settings) != first  # and the repair, whose bound is from the record
     with open_client(settings) as client:  # the record is kept in the workspace
         while (reply := client.get(url)).status_code == 202 and "progress" in reply.json():
             time.sleep(0.05)
-        result = reply.json()
-        result = result.get("preliminary", result)  # the job may have ended before it was cancelled
-        assert result["causes"][0]["cause"] == "measurement.radar.jacobian", result
-    store = TraceStore(settings)
-    checkpoint = store.checkpoint("boat", "wrong")
+        assert reply.json()["preliminary"]["causes"][0]["cause"] == "measurement.radar.jacobian", reply.text
+    with closing(TraceStore(settings)) as store:
+        checkpoint = store.checkpoint("boat", "wrong")
     assert required_profile(checkpoint).episodes == 20
     assert checkpoint.hash == filters["wrong"].hash
-    store.close()
 
 
 def wait_for_record(client: TestClient, url: str) -> Any:
@@ -190,11 +188,10 @@ def wait_for_record(client: TestClient, url: str) -> Any:
     return answer.json()["data"]
 
 
-def start_and_cancel(client: TestClient, url: str) -> Any:
-    """Id of the job that a request starts."""
-    id = client.post(url).json()["job"]["id"]
-    client.delete(f"/api/jobs/{id}")
-    return id
+def repair_record(settings: Settings) -> Any:
+    """The version of the healthy record among the arguments of a repair."""
+    with closing(TraceStore(settings)) as store:
+        return _repair_arguments(store, Selection("boat", "wrong", 5))["record"]
 
 
 def test_a_healthy_record_needs_ten_episodes(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:

@@ -217,10 +217,10 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         (Boat(turn=0.6), "dynamics.frozen"),
         (Boat(turn=2.0), "dynamics.large"),
         (Boat(offset=0.5), "measurement.radar.function"),
-        (Boat(radar=0.1, separate=True), "measurement_noise.radar.small"),
+        pytest.param(Boat(radar=0.1, separate=True), "measurement_noise.radar.small", marks=pytest.mark.long),
         (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),
-        (Boat(jacobian=-1.0), "measurement.radar.jacobian"),
-        (Boat(jacobian=0.5), "measurement.radar.jacobian"),
+        pytest.param(Boat(jacobian=-1.0), "measurement.radar.jacobian", marks=pytest.mark.long),
+        pytest.param(Boat(jacobian=0.5), "measurement.radar.jacobian", marks=pytest.mark.long),
         (Boat(heading_jacobian=-1.0), "dynamics.jacobian"),
     ],
 )
@@ -233,7 +233,7 @@ def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:
 @pytest.mark.slow
 def test_innovations_that_are_not_wrapped_are_mentioned_although_the_record_has_them_too() -> None:
     unwrapped = loaded(Boat(wraps=False))
-    record = profile_of(unwrapped, [sail(seed) for seed in range(30)], "boat")
+    record = profile_of(unwrapped, [sail(seed) for seed in range(24)], "boat")
     result = diagnose(unwrapped, {seed: sail(seed) for seed in range(46, 52)}, profile=record)
     assert (result.state, result.provenance["miscalibrated"]) == ("healthy", True)
     assert result.headline.startswith("Innovations of compass not wrapped in episodes 47, 49, 50; otherwise no ")
