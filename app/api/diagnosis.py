@@ -63,7 +63,7 @@ class Diagnosis(Reply):
     """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
 
     deviations: largest ones, whatever their cause.
-    miscalibrated: whether the healthy record itself is over- or underconfident or has wrong Jacobians, or
+    miscalibrated: whether the healthy record itself is over- or underconfident, equations of the filter are wrong, or
         innovations are not wrapped.
     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.

@@ -13,7 +13,7 @@ from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.out_of_distribution import data_warning
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
-from beliefscope.inspect.diagnostics.jacobians import wrong_jacobians
+from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap, MapEngine, missing_quantities, no_maps
 from beliefscope.inspect.trace import Trace, arrays_of
@@ -83,7 +83,7 @@ class TracedRun:
         description = header(trace, self.columns[0], checkpoint.task, self.no_maps, missing)
         warning = data_warning(checkpoint, [trace.episode], trace.faults)
         reason = no_diagnosis(checkpoint)
-        defects = wrong_jacobians([trace], checkpoint) if reason else ()  # which a diagnosis contains
+        defects = wrong_equations([trace], checkpoint) if reason else ()  # which a diagnosis contains
         return description | {"data_warning": warning, "no_diagnosis": reason, "defects": defects}
 
     @cached_property

@@ -40,7 +40,7 @@ from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.diagnostics.jacobians import shows_wrong_jacobians, wrong_jacobians
+from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.diagnostics.statistic_kinds import is_contact_known, label_of
 
 SURE = 0.5
@@ -84,7 +84,7 @@ def healthy(case: Case) -> Diagnosis:
         headline = f"Healthy, though {overconfident}: {text}"
         if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
             headline = f"Always {overconfident}, even in its healthy record; {text[:-1]}; try: {CONVENTIONS}."
-    if defect := _turned(case) or _wrong_jacobians(case):
+    if defect := _turned(case) or _wrong_equations(case):
         headline = f"{defect}; otherwise {text}"
     provenance = _provenance(case)
     provenance["miscalibrated"] |= bool(defect)
@@ -114,20 +114,10 @@ def _turned(case: Case) -> str:
     return f"Innovations of {names} not wrapped in episode{'s' * (len(episodes) > 1)} {index_ranges(episodes)}"
 
 
-def _wrong_jacobians(case: Case) -> str:
-    """Wrong Jacobians of an external filter, empty if there is none.
-
-    They are wrong whatever the record, which has them too if it is of the same filter.
-    """
-    names = {name for row in case.rows for name in row}
-    by_name = {name: np.array([row.get(name, np.nan) for row in case.rows]) for name in names}
-    is_possible = shows_wrong_jacobians(by_name)
-    alarms = wrong_jacobians(case.traces, case.inputs.checkpoint) if is_possible else ()
-    if not alarms:
-        return ""
-    text = "; ".join(alarms)
-    also = ", also in the healthy record" if shows_wrong_jacobians(case.profile.statistics) else ""
-    return f"{text[0].upper()}{text[1:]}{also}"
+def _wrong_equations(case: Case) -> str:
+    """Wrong equations of an external Kalman filter, whatever the record, which may have them too; empty without any."""
+    text = "; ".join(wrong_equations(case.traces, case.inputs.checkpoint))
+    return text and f"{text[0].upper()}{text[1:]}"
 
 
 def _is_miscalibrated(nees: float) -> bool:

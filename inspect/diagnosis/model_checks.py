@@ -26,7 +26,7 @@ from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, r
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
-from beliefscope.inspect.diagnostics.jacobians import jacobian_statistics
+from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +33,9 @@ GROWTH = 0.05
 
 SMALLEST_CHANGE = 0.05
 """Smallest value to which an error is relative: share of a column of F, and of the largest column of H F."""
+
+CURVED = 0.1
+"""Largest second-order effect of one standard deviation, relative to the first-order one, of a nearly linear step."""
 
 SAME = 0.02
 """Largest difference of a repeated step from the original one, in standard deviations and relative to variances."""
@@ -93,15 +97,17 @@ class RepeatedSteps:
 
     Attributes:
         mean: (J, B, n) predictions. covariance: (J, B, n, n) of these.
-        innovation: (J, B, K, m), if there are any, NaN without a measurement. size: (J, B, K, m, m) their covariance,
-            0 without a measurement.
+        innovation: (J, B, K, m), NaN without a measurement; K = 0 if they are not reported. size: (J, B, K, m, m) their
+            covariance, 0 without a measurement.
         correction, posterior: (J, n) and (J, n, n), from the filter's own belief.
+        before: (J, n, n) covariance of the filter's own belief before the calls. calls: their number.
     """
 
     def __init__(self, trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], calls: int) -> None:
         """Raises BadInput if the filter fails."""
         self.steps, self.task, n = steps, trace.task, len(trace.task.components)
         before, covariance = _beliefs(trace, steps - 1, calls == 1)
+        self.before, self.calls = covariance, calls
         variance = np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
         smallest = SMALLEST_SHIFT * np.maximum(np.abs(before).max(0), 1e-6)
         self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
@@ -119,8 +125,11 @@ class RepeatedSteps:
         self.mean, self.covariance = (arrays[f"predicted_{name}"][rows, :, first] for name in ("mean", "covariance"))
         self.correction = self.task.difference(arrays["estimate_mean"][:, 0], self.mean[:, 0])
         self.posterior = arrays["estimate_covariance"][:, 0]
+        self.innovation, self.size = (np.empty((*shifts.shape[:2], *(0,) * axes)) for axes in (2, 3))
         if trace.innovation is not None:
-            self.innovation, self.size = arrays["innovation"], np.nan_to_num(arrays["innovation_covariance"])
+            rejected = arrays.get("accepted", np.ones((1, 1, 1)))[:, :1] == 0.0  # of the filter's own belief
+            self.innovation = np.where(rejected[..., None], np.nan, arrays["innovation"])
+            self.size = np.where(rejected[..., None, None], 0.0, np.nan_to_num(arrays["innovation_covariance"]))
 
     def are_same(self, trace: Trace) -> Mask:
         """(J,) whether the filter's own beliefs give the trace's predictions, so that they are its whole state."""
@@ -129,51 +138,77 @@ class RepeatedSteps:
         grown = _weights(covariance) * (covariance - self.covariance[:, 0])
         return moved.all(-1) & (np.abs(grown).max((-2, -1)) < SAME)
 
+    def linear(self) -> RepeatedSteps | None:
+        """The steps whose functions are nearly linear within the belief; None without any.
+
+        Covariances of filters that do not linearise, such as UKFs, follow from derivatives there only.
+        """
+        mean = self.task.difference(self.mean, self.mean[:, :1]) * inverse_std(self.covariance[:, :1])
+        nu = np.nan_to_num((self.innovation - self.innovation[:, :1]) * inverse_std(self.size[:, :1]))
+        n = self.shift.shape[1]
+        scaled = np.concatenate([mean, nu.reshape(*mean.shape[:2], -1)], axis=-1)
+        larger, smaller = scaled[:, 1 : n + 1], scaled[:, n + 1 : 2 * n + 1]
+        shift = (self.shift / np.maximum(_std(self.before), self.shift))[..., None]  # in standard deviations
+        first, second = (larger - smaller) / (2.0 * shift), (larger + smaller) / (2.0 * shift**2)
+        keep = np.square(second).sum((1, 2)) <= CURVED**2 * np.square(first).sum((1, 2))
+        if not keep.any():
+            return None
+        part = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(part, name, value[keep])
+        return part
+
     def dynamics_errors(self) -> Array:
         """(J, n) of the columns of F, relative to their differences from constant states."""
-        columns, unit = self._dynamics_jacobian.mT, np.eye(self.shift.shape[1])
+        columns, unit = self.dynamics_jacobian.mT, np.eye(self.shift.shape[1])
         weights = _weights(self.covariance[:, :1]) * self.growth[..., None, None]  # (J, i, n, n)
         expected = weights * columns[..., :, None] * columns[..., None, :]
         growth = _weights(self.covariance[:, :1]) * self._growth(self.covariance)[:, :-1]
         change = expected - weights * unit[:, :, None] * unit[:, None, :]
         smallest = SMALLEST_CHANGE * np.sqrt(np.square(expected).sum((-2, -1)))
-        return _relative(growth - expected, change, (-2, -1), smallest)
+        return relative(growth - expected, change, (-2, -1), smallest)
 
     def measurement_errors(self) -> Array:
         """(J, K) of the modalities' H."""
-        return _relative(*self._measured_growth, (1, -2, -1))
+        return relative(*self._measured_growth, (1, -2, -1))
 
     def measurement_errors_by_component(self) -> Array:
         """(J, n + 1, K) of the modalities' H, with the variance of one component, and of all of them together."""
         difference, expected = self._measured_growth
         largest = np.sqrt(np.square(expected).sum((-2, -1)).max(1, keepdims=True))
-        return _relative(difference, expected, (-2, -1), SMALLEST_CHANGE * largest)
+        return relative(difference, expected, (-2, -1), SMALLEST_CHANGE * largest)
 
     def slopes(self) -> Array:
         """(K,) of the corrections; NaN without a measurement."""
-        h, prior = self._measurement_jacobian, self.covariance[:, :1]
+        h, prior = self.measurement_jacobian, self.covariance[:, :1]
         noise, innovation = self.size[:, 0] - h @ prior @ h.mT, np.nan_to_num(self.innovation[:, 0])
         parts = (self.posterior[:, None] @ h.mT @ np.linalg.pinv(noise) @ innovation[..., None])[..., 0]  # (J, K, n)
-        scale = _inverse_std(prior[:, 0])
+        scale = inverse_std(prior[:, 0])
         columns = (parts * scale[:, None]).swapaxes(1, 2).reshape(-1, parts.shape[1])
         slopes = np.linalg.lstsq(columns, (self.correction * scale).ravel(), rcond=1e-9)[0]
         return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
+    def process_noise(self) -> Array:
+        """(J, n, n) ``P - F P F^T`` of the prediction; NaN if it is after another update."""
+        f = self.dynamics_jacobian
+        return self.covariance[:, 0] - f @ self.before @ f.mT + (0.0 if self.calls == 1 else np.nan)
+
     @cached_property
-    def _dynamics_jacobian(self) -> Array:
+    def dynamics_jacobian(self) -> Array:
         """(J, n, n) derivative of the predicted mean."""
         return np.moveaxis(self._derivative(self.task.difference(self.mean, self.mean[:, :1])), 1, -1)
 
     @cached_property
-    def _measurement_jacobian(self) -> Array:
+    def measurement_jacobian(self) -> Array:
         """(J, K, m, n) derivative of the predicted measurements by the prediction; 0 without a measurement."""
         by_mean = np.moveaxis(self._derivative(self.innovation), 1, -1)
-        return np.nan_to_num(-by_mean @ np.linalg.pinv(self._dynamics_jacobian)[:, None])
+        return np.nan_to_num(-by_mean @ np.linalg.pinv(self.dynamics_jacobian)[:, None])
 
     @cached_property
     def _measured_growth(self) -> tuple[Array, Array]:
         """(J, n + 1, K, m, m) growth of the innovations' covariance less that by their derivatives, and the latter."""
-        h, weights = self._measurement_jacobian[:, None], _weights(self.size[:, :1])
+        h, weights = self.measurement_jacobian[:, None], _weights(self.size[:, :1])
         expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT
         return weights * (self._growth(self.size) - expected), weights * expected
 
@@ -204,7 +239,7 @@ def _std(covariance: Array) -> Array:
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
 
 
-def _inverse_std(covariance: Array) -> Array:
+def inverse_std(covariance: Array) -> Array:
     """(..., n) inverse standard deviations; 0 for a variance of 0 or less."""
     std = _std(covariance)
     return np.divide(1.0, std, out=np.zeros_like(std), where=std > 0.0)
@@ -212,11 +247,11 @@ def _inverse_std(covariance: Array) -> Array:
 
 def _weights(covariance: Array) -> Array:
     """(..., n, n) products of the inverse standard deviations."""
-    inverse = _inverse_std(covariance)
+    inverse = inverse_std(covariance)
     return np.asarray(inverse[..., :, None] * inverse[..., None, :])
 
 
-def _relative(difference: Array, expected: Array, axes: tuple[int, ...], smallest: Array | float = 0.0) -> Array:
+def relative(difference: Array, expected: Array, axes: tuple[int, ...], smallest: Array | float = 0.0) -> Array:
     """Roots of the sum of squares over axes, relative to those of the expected values, which are at least the smallest.
 
     NaN where nothing is expected.

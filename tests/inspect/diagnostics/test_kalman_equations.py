@@ -1,4 +1,4 @@
-"""Jacobians of external Kalman filters, by single steps of them from other beliefs."""
+"""Jacobians and updates of external Kalman filters, by single steps of them from other beliefs."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_innovation_checks import FLIPPED, STD, Array, Boat, loaded, run, sail, task
+from tests.inspect.diagnosis.test_innovation_checks import FLIPPED, STD, Array, Boat, loaded, run, sail, task, wrapped
 
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnostics.jacobians import Jacobians, jacobian_statistics, jacobians_of
+from beliefscope.inspect.diagnostics.kalman_equations import KalmanEquations, check_equations, jacobian_statistics
 from beliefscope.inspect.healthy import profile_of
 
 COMPONENTS = [component.name for component in task(1).components]
@@ -104,21 +104,23 @@ def test_known_components_have_no_error() -> None:
     assert np.isfinite([v for name, v in values.items() if "bias" not in name]).all()
 
 
-def jacobians(filter_: Boat, count: int = 3) -> Jacobians:
+def equations(filter_: Boat, count: int = 3) -> KalmanEquations:
     checkpoint = loaded(filter_)
-    return jacobians_of([bs.trace(checkpoint, [sail(seed)]) for seed in range(count)], checkpoint)
+    return check_equations([bs.trace(checkpoint, [sail(seed)]) for seed in range(count)], checkpoint)
 
 
 @pytest.mark.parametrize("filter_", [Boat(), Boat(separate=True), Boat(radar=5.0, offset=0.5)])
 def test_right_jacobians_raise_no_alarm(filter_: Boat) -> None:
-    result = jacobians(filter_)
+    result = equations(filter_)
     assert result.alarms == ()
-    assert result.verdict.startswith("All Jacobians agree with finite differences of the filter's own functions")
+    assert result.verdict.startswith(
+        "Jacobians and updates agree with finite differences of the filter's own functions"
+    )
 
 
 def test_a_wrong_jacobian_is_named_with_its_part() -> None:
     scaled, flipped, constant = (
-        jacobians(filter_) for filter_ in (Boat(jacobian=1.2), Boat(jacobian=FLIPPED), Boat(heading_jacobian=0.0))
+        equations(filter_) for filter_ in (Boat(jacobian=1.2), Boat(jacobian=FLIPPED), Boat(heading_jacobian=0.0))
     )
     assert scaled.alarms == ("the Jacobian of radar differs from finite differences by 44 %, for x, y",)
     assert len(flipped.alarms) == 1
@@ -129,18 +131,18 @@ def test_a_wrong_jacobian_is_named_with_its_part() -> None:
 
 
 def test_a_column_of_the_wrong_sign_shows_with_all_variances_together_only() -> None:
-    result = jacobians(Boat(jacobian=np.array([-1.0, 1.0, 1.0, 1.0])))
+    result = equations(Boat(jacobian=np.array([-1.0, 1.0, 1.0, 1.0])))
     assert result.columns[:-1, 0] == pytest.approx(0.0, abs=0.05)
     assert result.columns[-1, 0] > 0.5
     assert result.alarms[0].endswith("%, by the sign of a column")
 
 
 def test_corrections_of_the_wrong_sign_are_named() -> None:
-    assert jacobians(Boat(jacobian=-1.0)).alarms == ("corrections with radar have the wrong sign (slope -1.00)",)
+    assert equations(Boat(jacobian=-1.0)).alarms == ("corrections with radar have the wrong sign (slope -1.00)",)
 
 
 def test_a_filter_without_finite_differences_is_refused() -> None:
-    entry = DIAGNOSTICS["jacobians"]
+    entry = DIAGNOSTICS["equations"]
     trace = run(Widening())
     assert entry.refusal(trace, loaded(Widening())) is None
     with pytest.raises(BadInput, match="they depend on more than its belief and its inputs"):
@@ -156,4 +158,80 @@ def test_wrong_jacobians_are_mentioned_although_the_record_has_them_too() -> Non
     assert result.state == "healthy"
     assert result.provenance["miscalibrated"]
     assert result.headline.startswith("The Jacobian of radar differs from finite differences by ")
-    assert ", for x, also in the healthy record; otherwise no significant" in result.headline
+    assert "; otherwise no significant" in result.headline
+
+
+class Joint(Boat):
+    """One update with all measurements of a step."""
+
+    factor = 1.0
+    """On the correction of the mean."""
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        values = super().__call__(observations=observations, controls=controls)
+        mean, covariance = values["predicted_mean"][0], values["predicted_covariance"][0]
+        parts = [(key, *self.measure(key, mean)) for key in STD if observations.get(f"{key}.present", True)]
+        nu = {key: observations[key] - expected for key, _, expected in parts}
+        for innovation in nu.values():
+            innovation[-1] = wrapped(innovation[-1])
+        h = np.concatenate([h for _, h, _ in parts])
+        size = h @ covariance @ h.T + np.diag(np.concatenate([np.square(STD[key]) for key, *_ in parts]))
+        gain = covariance @ h.T @ np.linalg.inv(size)
+        self.mean = mean + self.factor * gain @ np.concatenate(list(nu.values()))
+        self.mean[2] = wrapped(self.mean[2])
+        self.covariance = covariance - gain @ size @ gain.T
+        own = {key: h @ covariance @ h.T + np.diag(np.square(STD[key])) for key, h, _ in parts}
+        innovations = {
+            "innovation": [nu.get(key) for key in STD],
+            "innovation_covariance": [own.get(key) for key in STD],
+        }
+        return values | innovations | {"estimate_mean": self.mean, "estimate_covariance": self.covariance}
+
+
+class Half(Joint):
+    factor = 0.5
+
+
+class Certain(Boat):
+    """Reports and keeps the predicted covariance."""
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        values = super().__call__(observations=observations, controls=controls)
+        self.covariance = values["predicted_covariance"][0]
+        return values | {"estimate_covariance": self.covariance}
+
+
+@pytest.mark.parametrize("filter_", [Boat(), Boat(separate=True), Joint()])
+def test_updates_and_noise_are_those_of_the_filter(filter_: Boat) -> None:
+    """Q is the squares of 1 cm, 2 mrad and 0.1 mrad/s per step; one update after another and all at once."""
+    result = equations(filter_)
+    assert result.alarms == ()
+    assert result.covariance == pytest.approx(0.0, abs=0.01)
+    assert result.correction == pytest.approx(0.0, abs=0.01)
+    np.testing.assert_allclose(result.process_noise, [0.01, 0.01, 0.002, 0.0001], rtol=0.02)
+    np.testing.assert_allclose(result.measurement_noise, [STD["radar"], (*STD["compass"], np.nan)], rtol=0.05)
+
+
+def test_wrong_updates_are_named() -> None:
+    (half,), (certain,) = equations(Half()).alarms, equations(Certain()).alarms
+    text = "in updates with radar, compass, the correction of the mean differs from K times the innovation by 50 %"
+    assert half == text
+    assert certain == "in updates with radar, compass, the reduction of the covariance differs from K H P by 100 %"
+
+
+class Hidden(Joint):
+    """Reports innovations with covariances of a tenth."""
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        values = super().__call__(observations=observations, controls=controls)
+        small = [None if size is None else 0.1 * size for size in values["innovation_covariance"]]
+        return values | {"innovation_covariance": small}
+
+
+def test_covariances_that_are_too_small_are_named() -> None:
+    values = replace(equations(Joint()), measurement_lack=np.array([-0.5, 0.0]), process_lack=-0.1)
+    assert values.alarms == (
+        "the predicted covariance is smaller than F P F^T, as if Q were negative",
+        "S of radar is smaller than H P H^T, as if R were negative",
+    )
+    assert equations(Hidden()).alarms[0].startswith("the Jacobian of radar differs from finite differences by 90 %")

@@ -1,0 +1,104 @@
+"""The update that follows from a Kalman filter's prediction, innovations and their covariance, against its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+
+from beliefscope.inspect.diagnostics.repeated_steps import RepeatedSteps, inverse_std, relative
+from beliefscope.inspect.statistics.measures import Array
+
+MAX_ORDERS = 6
+"""Maximum number of orders of updates that are tried."""
+
+SMALLEST_UPDATE = 0.02
+"""Smallest update to which an error is relative: in standard deviations, and relative to the variances."""
+
+
+@dataclass(frozen=True)
+class Updates:
+    """Of J steps with K modalities of m channels.
+
+    Attributes:
+        noise: (J, K, m, m) measurement noise R that follows from S and H; 0 without a measurement.
+        covariance_error: (J, K) relative error of the reduction of the covariance, NaN without the measurement.
+        correction_error: (J, K) relative error of the correction of the mean, as before.
+    """
+
+    noise: Array
+    covariance_error: Array
+    correction_error: Array
+
+
+def expected_updates(steps: RepeatedSteps) -> Updates:
+    """Updates with the filter's own P and S, and the H of its innovations: all measurements at once, or in turn.
+
+    At once, ``K = P H^T S^-1`` with the cross-covariances ``H P H^T`` of the measurements; in turn, each measurement
+    starts at the belief after the one before. The kind and order with the smallest errors count.
+    """
+    results = [_together(steps), *(_in_turn(steps, order) for order in _orders(steps.size.shape[2]))]
+    return min(results, key=lambda r: _size(r.covariance_error) + _size(r.correction_error))
+
+
+def _size(errors: Array) -> float:
+    known = errors[np.isfinite(errors)]
+    return float(known.mean()) if len(known) else 0.0
+
+
+def _orders(count: int) -> Iterator[tuple[int, ...]]:
+    for number, order in enumerate(permutations(range(count))):
+        if number == MAX_ORDERS:
+            return
+        yield order
+
+
+def _together(steps: RepeatedSteps) -> Updates:
+    j, _, k, m, _ = steps.size.shape
+    prior, h = steps.covariance[:, 0], steps.measurement_jacobian
+    noise = steps.size[:, 0] - h @ prior[:, None] @ h.mT
+    rows = h.reshape(j, k * m, -1)
+    size = rows @ prior @ rows.mT
+    for i in range(k):
+        block = slice(i * m, (i + 1) * m)
+        size[:, block, block] = steps.size[:, 0, i]
+    gain = prior @ rows.mT @ np.linalg.inv(_invertible(size))
+    nu = np.nan_to_num(steps.innovation[:, 0]).reshape(j, -1, 1)
+    return _compared(steps, noise, prior - gain @ rows @ prior, (gain @ nu)[..., 0])
+
+
+def _in_turn(steps: RepeatedSteps, order: tuple[int, ...]) -> Updates:
+    prior, unit = steps.covariance[:, 0], np.eye(steps.covariance.shape[-1])
+    covariance, correction, noise = prior, np.zeros_like(prior[..., 0]), np.zeros_like(steps.size[:, 0])
+    change = np.broadcast_to(unit, prior.shape)  # of the mean by the prediction
+    for k in order:
+        size, nu = steps.size[:, 0, k], np.nan_to_num(steps.innovation[:, 0, k])
+        h = steps.measurement_jacobian[:, k] @ np.linalg.pinv(change)
+        noise[:, k] = size - h @ covariance @ h.mT
+        gain = covariance @ h.mT @ np.linalg.inv(_invertible(size))
+        correction = correction + (gain @ nu[..., None])[..., 0]
+        covariance = covariance - gain @ h @ covariance
+        change = (unit - gain @ h) @ change
+    return _compared(steps, noise, covariance, correction)
+
+
+def _invertible(size: Array) -> Array:
+    """Covariances of innovations with 1 on the diagonal of absent channels, which are 0."""
+    absent = np.diagonal(size, axis1=-2, axis2=-1) <= 0.0
+    return np.asarray(size + absent[..., None] * np.eye(size.shape[-1]))
+
+
+def _compared(steps: RepeatedSteps, noise: Array, covariance: Array, correction: Array) -> Updates:
+    """The errors of the filter's posterior, relative to the expected covariance and correction."""
+    prior, scale = steps.covariance[:, 0], inverse_std(steps.covariance[:, 0])
+    weights = scale[..., :, None] * scale[..., None, :]
+    used = np.isfinite(steps.innovation[:, 0]).any(-1)  # (J, K)
+    difference, reduction = weights * (steps.posterior - covariance), weights * (prior - covariance)
+    moved, expected = scale * (steps.correction - correction), scale * correction
+    return Updates(
+        noise,
+        np.where(used, relative(difference, reduction, (-2, -1), SMALLEST_UPDATE)[:, None], np.nan),
+        np.where(used, relative(moved, expected, (-1,), SMALLEST_UPDATE)[:, None], np.nan),
+    )
