@@ -14,6 +14,7 @@ from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.statistics.innovations import least_certain
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
@@ -45,6 +46,8 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     """One-line reason why the steps of a filter cannot be repeated from other beliefs, or None."""
     if not isinstance(checkpoint, ExternalFilter):
         return "the Jacobians of this project's filters are derivatives by construction"
+    if isinstance(checkpoint, UnavailableFilter):
+        return f"filter {trace.filter} is not available here, only its run"
     module = checkpoint.adapter.module
     if trace.particles is not None or trace.predicted_covariance is None or not trace.has_covariance:
         return f"filter {trace.filter} does not report covariances of its predictions and estimates"
