@@ -102,10 +102,10 @@ class KalmanEquations(Diagnostic):
     def _of_covariances(self) -> list[str]:
         texts = []
         if self.process_lack <= LACKING:
-            texts.append("the predicted covariance is smaller than F P F^T, as if Q were negative")
+            texts.append("the predicted covariance is smaller than F P Fᵀ, as if Q were negative")
         for name, lack in zip(self.modalities, self.measurement_lack, strict=True):
             if lack <= LACKING:
-                texts.append(f"S of {display_name(name)} is smaller than H P H^T, as if R were negative")
+                texts.append(f"S of {display_name(name)} is smaller than H P Hᵀ, as if R were negative")
         for errors, quantity, law in (
             (self.covariance, "reduction of the covariance", "K H P"),
             (self.correction, "correction of the mean", "K times the innovation"),
@@ -148,9 +148,9 @@ class KalmanEquations(Diagnostic):
         heads = ("Jacobian of", "error, %", *names, "together, %", "slope of corrections")
         note = (
             f"{plural(self.steps, 'step')} of {plural(self.trajectories, 'episode')}, repeated with a larger variance "
-            "of each component, and of all together: it adds F F^T to the predicted covariance, and H F F^T H^T to "
+            "of each component, and of all together: it adds F Fᵀ to the predicted covariance, and H F Fᵀ Hᵀ to "
             "that of the innovations. Errors are differences from these products by finite differences, relative to "
-            "them. A factor f in a Jacobian has the error |f^2 - 1|; exact ones have less than 2 %. "
+            "them. A factor f in a Jacobian has the error |f² - 1|; exact ones have less than 2 %. "
             "Corrections have a slope of about 1; if it is -1, their sign is wrong."
         )
         updates = tuple(
@@ -171,7 +171,7 @@ class KalmanEquations(Diagnostic):
             *(
                 [
                     Table(
-                        "Updates against K = P H^T S^-1",
+                        "Updates against K = P Hᵀ S⁻¹",
                         ("steps with", "covariance error, %", "mean error, %"),
                         updates,
                     )
@@ -183,7 +183,7 @@ class KalmanEquations(Diagnostic):
                 "Noise that the covariances contain",
                 ("noise", "standard deviation", "unit"),
                 known,
-                "Q = P - F P F^T per step, and R = S - H P H^T in units of the readings.",
+                "Q = P - F P Fᵀ per step, and R = S - H P Hᵀ in units of the readings.",
             ),
         ]
 

@@ -231,7 +231,7 @@ class Hidden(Joint):
 def test_covariances_that_are_too_small_are_named() -> None:
     values = replace(equations(Joint()), measurement_lack=np.array([-0.5, 0.0]), process_lack=-0.1)
     assert values.alarms == (
-        "the predicted covariance is smaller than F P F^T, as if Q were negative",
-        "S of radar is smaller than H P H^T, as if R were negative",
+        "the predicted covariance is smaller than F P Fᵀ, as if Q were negative",
+        "S of radar is smaller than H P Hᵀ, as if R were negative",
     )
     assert equations(Hidden()).alarms[0].startswith("the Jacobian of radar differs from finite differences by 90 %")
