@@ -6,6 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.app.api.test_diagnosis import BOATS
+from tests.inspect.diagnosis.test_innovation_checks import sail, task
+
+from beliefscope.datasets.store import write_dataset
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "04_own_filter.py"
 FILTERS = """
@@ -58,3 +62,21 @@ def test_missing_outputs_are_explained(open_page: Any, start_server: Any, tmp_pa
     page.page.keyboard.press("ArrowRight")
     page.settle(2)
     page.screenshot("external-filter-weights")
+
+
+@pytest.mark.long
+def test_wrong_equations_are_the_finding_of_a_filter_without_a_record(
+    open_page: Any, start_server: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "boats.py").write_text(BOATS)
+    write_dataset(tmp_path / "boats.h5", task(4), [sail(seed) for seed in range(3)])
+    options = ["--task", f"{tmp_path}/boats.py:TASK", "--data", str(tmp_path / "boats.h5")]
+    page = open_page(url=start_server(*options, "--filter", f"{tmp_path}/boats.py:wrong").url)
+    finding = page.page.locator("#finding")
+    assert finding.locator("strong").text_content().startswith("The Jacobian of radar differs from finite differences")
+    finding.get_by_role("button", name="Equations").click()
+    page.until(
+        "() => document.querySelector('#diagnostics').textContent.includes('Updates against')"
+    )
+    assert (page.state["tab"], page.state["diagnostic"]) == ("diagnostics", "equations")
+    page.screenshot("wrong-equations")

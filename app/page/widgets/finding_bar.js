@@ -33,7 +33,13 @@ export class FindingBar {
     html('.go-to-step', host).addEventListener('click', ({ timeStamp }) =>
       this.#retry ? this.#retry() : this.goToMoment(timeStamp),
     );
-    html('.why', host).addEventListener('click', () => store.set({ tab: 'diagnosis' }));
+    html('.why', host).addEventListener('click', () =>
+      store.set(
+        this.#hasDefect
+          ? { tab: 'diagnostics', diagnostic: 'equations', options: '' }
+          : { tab: 'diagnosis' },
+      ),
+    );
   }
 
   /**
@@ -76,6 +82,11 @@ export class FindingBar {
     this.#write({ tone: 'bad', headline, evidence: reason, step: null }, 'error', retry);
   }
 
+  /** Whether the finding is a defect in the equations of the filter, which the diagnosis does not have. */
+  get #hasDefect() {
+    return Boolean(this.#trace?.header.defects?.length);
+  }
+
   /** @param {number} inputTime */
   goToMoment(inputTime) {
     if (this.#step === null) return;
@@ -90,6 +101,7 @@ export class FindingBar {
   #draw(trace, diagnosis) {
     const { component } = this.#store.state;
     const index = trace.components.findIndex(({ name }) => name === component);
+    html('.why', this.#host).textContent = this.#hasDefect ? 'Equations' : 'Diagnosis';
     this.#write(finding(trace, Math.max(index, 0), diagnosis), diagnosis?.state ?? 'trace');
   }
 
