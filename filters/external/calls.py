@@ -55,15 +55,14 @@ def dtype_of(filter_: Any) -> torch.dtype:
     return next(types, torch.float32)
 
 
-def described(error: Exception, adapter: Adapter, is_first: bool) -> str:
-    """An exception of a filter in one line.
-
-    is_first: whether it is of the first step, where the shape of the inputs may be unexpected.
-    """
+def described(error: Exception, where: str, adapter: Adapter, task: Task) -> str:
+    """An exception of a filter in one line, with its location, such as ``step 0``."""
     message = (str(error).strip().splitlines() or ["no message"])[0]
-    text = f"{type(error).__name__}: {message}"
-    if is_first and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
+    text = f"fails at {where}: {type(error).__name__}: {message}"
+    if where == "step 0" and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
         text += "; the first axis of its inputs is that of N trajectories; Adapter(filter, batched=False) has none"
+    if isinstance(error, KeyError) and message.strip("'") not in task.observations:
+        text += f"; the observations are {', '.join(task.observations)}"
     return text
 
 

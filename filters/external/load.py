@@ -320,7 +320,7 @@ class ExternalFilter(Checkpoint):
 
     def _error(self, where: str, error: Exception) -> BadInput:
         """An exception of the module as BadInput with the location."""
-        return BadInput(f"{self.source} fails at {where}: {described(error, self.adapter, where == 'step 0')}")
+        return BadInput(f"{self.source} {described(error, where, self.adapter, self._task)}")
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)

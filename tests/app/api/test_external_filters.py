@@ -16,6 +16,7 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.cli.main import main
 from beliefscope.app.runs.settings import Settings
+from beliefscope.datasets.catalog import load_task
 from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
@@ -72,7 +73,10 @@ def test_error_is_one_line_and_leaves_no_file(command: str, name: str, tmp_path:
     output = ("-o", tmp_path / name) if name else ()
     code, out, err = run(command, "door", "--filter", f"{tmp_path}/own.py:Fails", *output)
     assert (code, out) == (2, "")
-    assert err.splitlines()[-1] == f"error: {tmp_path}/own.py:Fails fails at step 0: KeyError: 'touch'"
+    assert err.splitlines()[-1] == (
+        f"error: {tmp_path}/own.py:Fails fails at step 0: KeyError: 'touch'; "
+        f"the observations are {', '.join(load_task('door').observations)}"
+    )
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["own.py"]
 
 
