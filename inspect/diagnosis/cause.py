@@ -95,6 +95,11 @@ def probability_text(probability: float) -> str:
     return f"{probability:.2f}" if round(probability, 2) <= LARGEST else f"above {LARGEST}"
 
 
+def removes_error(share: float) -> bool:
+    """Whether an undo removes 1 % of the error or more, rounded."""
+    return round(100.0 * share) > 0
+
+
 @dataclass(frozen=True)
 class Evidence:
     """A deviation that supports a cause.
@@ -219,7 +224,10 @@ class Diagnosis:
         largest_table = [_evidence_table("Largest deviations", (), largest)] if largest else []
         if not causes:
             return [*largest_table, *missing]
-        ranked = tuple((c.cause.name, c.probability, _share(c.recovered), index_ranges(c.episodes)) for c in causes)
+        ranked = tuple(
+            (c.cause.name, probability_text(c.probability), _share(c.recovered), index_ranges(c.episodes))
+            for c in causes
+        )
         actions = tuple((c.cause.name, c.next) for c in causes)
         rows = [((c.cause.name,), e) for c in causes for e in c.evidence]
         return [
@@ -252,7 +260,7 @@ def _share(recovery: Recovery | None) -> str:
     """Recovered share of the error with its interval, empty without one."""
     if recovery is None or math.isnan(recovery.error):
         return ""
-    if recovery.error < 0.0:  # most undos of sensors remove them
+    if not removes_error(recovery.error):  # most undos of sensors remove them
         return "none"
     share = percent(recovery.error)
     if not math.isnan(recovery.low):  # a single episode has no interval

@@ -15,7 +15,7 @@ from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice, fault_slice
 from beliefscope.filters.finetuning.success import ERROR, Criterion, measures
-from beliefscope.inspect.diagnosis.cause import probability_text
+from beliefscope.inspect.diagnosis.cause import probability_text, removes_error
 from beliefscope.inspect.diagnosis.finetune_settings import training_for, training_on
 
 PROBABLE = 0.2
@@ -54,8 +54,9 @@ def diagnosed(diagnosis: Mapping[str, Any], filter_: Filter, faults: Faults, epi
             continue
         evidence = next(iter(cause["evidence"]), None) or {"text": "", "episode": None, "step": None}
         text = f"Probability {probability_text(cause['probability'])}: {evidence['text']}"
-        if (recovered := cause["recovered"]) and recovered["error"] is not None:
-            text += f"; undoing it removes {percent(recovered['error'], 'z.0f')} of the {recovered['measure']} error"
+        recovered = cause["recovered"]
+        if recovered and recovered["error"] is not None and removes_error(recovered["error"]):
+            text += f"; undoing it removes {percent(recovered['error'])} of the {recovered['measure']} error"
             settings = _measured_by(settings, recovered["measure"], filter_.task)
         title = diagnosis["headline"] if cause is diagnosis["causes"][0] else cause["title"]
         at = episode if evidence["episode"] is None else evidence["episode"]

@@ -101,6 +101,8 @@ test('the effect of undoing a cause has a direction and no sign', () => {
     recoveredText({ ...angle, error: -0.2 }),
     /^Undoing it increases the angle error by 20 %;/,
   );
+  for (const error of [-0.004, 0, 0.004])
+    assert.match(recoveredText({ ...angle, error }), /^Undoing it does not change the error; the/);
 });
 
 test('only a cause whose next action is a fine-tuning run offers one', () => {
