@@ -46,22 +46,31 @@ class SensorRecord:
     readings: tuple[ReadingModel, ...]
 
 
-def sensor_record(episodes: Sequence[Episode], reference: Reference | None = None) -> SensorRecord:
+def sensor_record(
+    episodes: Sequence[Episode], reference: Reference | None = None, progress: Progress | None = None
+) -> SensorRecord:
     """The statistics of the sensors of clean episodes, and their images.
 
-    reference: images of other clean episodes of the same camera; default: measured, which takes most of the time.
+    Args:
+        reference: images of other clean episodes of the same camera; default: measured, which takes most of the time.
+        progress: called with the completed fraction, 0..1.
     """
     keys = modelled_keys(episodes[0].task) if episodes else []
-    groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
-    models = fit_reading_models(episodes, keys)
+    report, parts = progress or (lambda share: None), FOLDS + 2
+    images, models = reference or measure_reference(episodes), fit_reading_models(episodes, keys)
+    report(1 / parts)
     by_channels = {(model.key, model.channels): model for model in models}
-    fold_models = [
-        [m.with_noise_of(by_channels.get((m.key, m.channels), m)) for m in fit_reading_models(group, keys)]
-        for group in groups
-    ]
-    references = [reference or measure_reference(group) for group in groups]
-    rows = [sensor_statistics(e, references[i % FOLDS], fold_models[i % FOLDS]) for i, e in enumerate(episodes)]
-    return SensorRecord(rows, reference or measure_reference(episodes), models)
+    folds = []
+    for fold in range(FOLDS):
+        group = [episode for i, episode in enumerate(episodes) if i % FOLDS != fold]
+        own = [m.with_noise_of(by_channels.get((m.key, m.channels), m)) for m in fit_reading_models(group, keys)]
+        folds.append((reference or measure_reference(group), own))
+        report((fold + 2) / parts)
+    rows = []
+    for i, episode in enumerate(episodes):
+        rows.append(sensor_statistics(episode, *folds[i % FOLDS]))
+        report((FOLDS + 1 + (i + 1) / len(episodes)) / parts)
+    return SensorRecord(rows, images, models)
 
 
 def profile_of(

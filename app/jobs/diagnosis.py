@@ -60,7 +60,7 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
         episodes = [data[index] for index in arguments["episodes"]]
         is_sample = arguments["data"] not in store.settings.data
         images = pretrained_reference(checkpoint.task) if is_sample else None  # of the same camera
-        sensors = sensor_record(episodes, images)
+        sensors = sensor_record(episodes, images, lambda share: report(0.5 * share, "measuring the sensors"))
         profile = profile_of(
             healthy_filter,
             episodes,

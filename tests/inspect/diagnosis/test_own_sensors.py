@@ -116,6 +116,14 @@ def record() -> SensorRecord:
     return sensor_record([slide(seed) for seed in range(30)])
 
 
+def test_progress_covers_the_whole_measurement() -> None:
+    shares: list[float] = []
+    sensor_record([slide(seed) for seed in range(5)], progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[0] < 0.2
+    assert shares[-1] == 1.0
+
+
 def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
     return np.zeros((*controls.shape[:-1], 3))
 
