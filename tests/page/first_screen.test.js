@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { finding, largest, outageFinding } from '../../app/page/step/finding.js';
+import { divergence, finding, largest, outageFinding } from '../../app/page/step/finding.js';
 import { STEPS as TOUR, placeBeside } from '../../app/page/widgets/tour.js';
 
 const STEPS = 20;
@@ -171,6 +171,30 @@ test('a fault comes first, then the outage, then the largest error', () => {
     'the record, which the diagnosis describes',
   );
   assert.match(healthy.evidence, /^Largest error at step 10\. /);
+});
+
+test('an error that grows to the end is a divergence, shown where it begins', () => {
+  const grows = series((t) => (t < 12 ? 0.5 : 0.5 * (t - 9)));
+  assert.equal(divergence(grows), 15, 'first step above five times the median of the first half');
+  const result = finding({ ...run(11), error: () => grows }, 0, null);
+  assert.equal(result.headline, 'The estimate diverges from step 15 on.');
+  assert.match(result.evidence, /^Largest error at step 19\. Fused estimate: error 5\.00 cm;/);
+  assert.deepEqual([result.tone, result.step], ['bad', 15]);
+  const predicted = { ...run(11), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
+  assert.match(finding({ ...predicted, error: () => grows }, 0, null).headline, /^Largest error/);
+});
+
+test('an error that stays, falls again or jumps at the last step is no divergence', () => {
+  for (const [name, value] of Object.entries({
+    constant: () => 0.5,
+    linear: (/** @type {number} */ t) => t,
+    recovers: (/** @type {number} */ t) => (t >= 12 && t < 18 ? 9 : 0.5),
+    falls: (/** @type {number} */ t) => (t >= 12 ? 30 - t : 0.5),
+    jumps: (/** @type {number} */ t) => (t === STEPS - 1 ? 9 : 0.5),
+    unknown: () => NaN,
+  }))
+    assert.equal(divergence(series(value)), null, name);
+  assert.equal(divergence([]), null);
 });
 
 test('a defect of a filter without a diagnosis comes before its largest error', () => {

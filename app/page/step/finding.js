@@ -12,6 +12,8 @@ const MIN_STEPS = 5; // of an outage
 const MIN_CHANGE = 0.05; // of a weight
 const MIN_RECOVERED = 0.05; // share of the error that an undo removes
 const BEFORE = 10; // steps that are compared with the outage
+const DIVERGED = 5; // times the median error of the first half of the run
+const END = 0.1; // share of the steps
 
 /**
  * @typedef {object} Finding
@@ -137,19 +139,42 @@ function injectedFinding(trace, component) {
 }
 
 /**
- * Describes the largest error of the fused estimate; no headline without truth.
+ * Describes the largest error of the fused estimate, or its divergence; no headline without truth.
  * @param {Trace} trace
  * @param {number} component
  * @returns {Finding}
  */
 function worstFinding(trace, component) {
-  const step = largest(trace.error('fused', 'main') ?? []);
+  const error = trace.error('fused', 'main') ?? [];
+  const step = largest(error);
   if (step === null) {
     const headline = 'The true state of this run is unknown.';
     return { tone: 'none', headline, evidence: '', step };
   }
   const { tone, text } = stepSummary(trace, step, component);
-  return { tone, headline: `Largest error at ${trace.stepLabel(step)}.`, evidence: text, step };
+  const headline = `Largest error at ${trace.stepLabel(step)}.`;
+  const start = tone === 'bad' || tone === 'none' ? divergence(error) : null; // not as predicted
+  if (start === null) return { tone, headline, evidence: text, step };
+  return {
+    tone,
+    headline: `The estimate diverges from ${trace.stepLabel(start)} on.`,
+    evidence: `${headline} ${text}`,
+    step: start,
+  };
+}
+
+/**
+ * First step from which an error is far above the median of its first half, to the end of the run, where it is largest.
+ * @param {ArrayLike<number>} error of each step
+ * @returns {number | null} null if the error does not grow like this
+ */
+export function divergence(error) {
+  const values = Array.from(error);
+  const first = values.slice(0, values.length / 2).filter(Number.isFinite);
+  const median = first.sort((a, b) => a - b)[Math.floor(first.length / 2)];
+  const start = values.map((value) => value > DIVERGED * median).lastIndexOf(false) + 1;
+  const end = (1 - END) * values.length;
+  return start <= end && (largest(values) ?? -1) >= end ? start : null;
 }
 
 /**
