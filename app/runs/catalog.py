@@ -161,7 +161,7 @@ def task_catalogs(
             checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source, tasks)
             _catalog_of(catalogs, checkpoint.task, saved, name).user_filters[name] = checkpoint
         except BadInput as error:
-            problems.append(str(error))
+            problems.append(str(error).removesuffix("."))
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
     for name, path in data.items():
         try:
@@ -177,7 +177,7 @@ def task_catalogs(
                     else:
                         other.close()
         except BadInput as error:
-            problems.append(str(error))
+            problems.append(str(error).removesuffix("."))
     displayed = {name for catalog in catalogs.values() if not catalog.problem for name in catalog.user_data}
     for catalog in catalogs.values():
         if catalog.problem and (catalog.user_filters or catalog.user_data.keys() - displayed):

@@ -86,7 +86,7 @@ class TraceStore:
                 try:
                     self._add_stored_filter(task, name)
                 except BadInput as error:
-                    problems.append(str(error))
+                    problems.append(str(error).removesuffix("."))
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
             return {"tasks": tasks, "problems": problems, "examples": list(map(asdict, self._examples()))}
 

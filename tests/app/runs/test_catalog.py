@@ -50,7 +50,7 @@ def test_each_unusable_input_is_reported_in_one_line(tmp_path: Path) -> None:
     _, problems = task_catalogs({"a": missing}, {"b": missing, "c": tmp_path / "bare.h5"})
     assert problems == [
         f"checkpoint {str(missing)!r} does not exist",
-        f"{missing} does not exist.",
+        f"{missing} does not exist",
         "task 'bare' has no trained filter; add one with --filter FILE",
     ]
     catalogs, problems = task_catalogs({"a": tmp_path / "bare.safetensors"}, {})

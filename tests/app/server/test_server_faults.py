@@ -253,7 +253,7 @@ def test_a_data_set_with_nan_in_its_first_episode_leaves_the_others_available(
     data_of = {"damaged": tmp_path / "damaged.h5", **settings.data}
     with open_client(replace(settings, data=data_of)) as client:
         catalog = client.get("/api/catalog").json()
-    message = "'observations/force' of trajectory0 is nan at step 17, expected finite numbers."
+    message = "'observations/force' of trajectory0 is nan at step 17, expected finite numbers"
     assert catalog["problems"] == [f"{tmp_path / 'damaged.h5'}: {message}"]
     assert next(entry["name"] for entry in catalog["tasks"][0]["data"]) == "mine"
 
