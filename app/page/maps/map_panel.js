@@ -110,6 +110,7 @@ export class MapPanel {
     [this.#maps, this.#trace] = [maps, trace];
     this.#panel.classList.toggle('no-expected', maps.expected === null);
     this.#panel.classList.toggle('curves', isCurve(maps));
+    this.#panel.classList.toggle('single', !trace.fuses || maps.layers.length === 1);
     // With a single measurement model the fused map equals that of the model.
     if (rebuild)
       this.#build(trace.fuses || maps.layers.length === 1 ? maps.layers : trace.modalities);
