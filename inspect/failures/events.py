@@ -157,7 +157,7 @@ class Failures(Diagnostic):
         where = f"{step_text(worst.step, worst.time)} of episode {worst.episode} ({worst.phase})"
         count = f"{plural(len(self.events), 'event')} {scope}, above {self.format(self.threshold)}"
         phases = "; ".join(
-            f"{p.name}, {percent(p.share)} of steps and {percent(p.event_share)} of events ({p.lift:.1f} x)"
+            f"{p.name}, {percent(p.share)} of steps and {percent(p.event_share)} of events (lift {p.lift:.1f})"
             for p in self.over_represented
         )
         sentences = [f"{count}; worst: {self.format(worst.score)} at {where}."]

@@ -253,7 +253,7 @@ export class Failures {
     /** @type {[string, string][]} */
     const options = phases.map(({ name, events, lift, over_represented: isOver }) => [
       name,
-      `${name} ${events}${isOver ? ` · ${fixed(lift)}×` : ''}`,
+      `${name} ${events}${isOver ? ` · lift ${fixed(lift)}` : ''}`,
     ]);
     choice(host, [['', `all ${score?.total ?? ''}`], ...options], selected, (phase) =>
       this.#store.set({ phase }),
