@@ -45,6 +45,11 @@ def display_name(name: str) -> str:
     return name.replace("_", " ")
 
 
+def axis_name(key: str, i: int, count: int) -> str:
+    """Name of a channel: ``force x``, or a number from 0 where there are more than three; of a scalar, the key."""
+    return key if count == 1 else f"{key} {'xyz'[i] if count <= 3 else i}"
+
+
 @dataclass(frozen=True)
 class Component:
     """A state component.

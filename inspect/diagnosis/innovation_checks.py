@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from beliefscope.inspect.diagnosis.vector_checks import angle_channels
-from beliefscope.inspect.statistics.innovations import innovations, prediction
+from beliefscope.inspect.statistics.innovations import channel_names, innovations, prediction
 from beliefscope.inspect.statistics.measures import Array, Mask, counted
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN
 from beliefscope.inspect.trace import Trace
@@ -36,6 +36,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     deviation = np.sqrt(np.where(used, variance, np.nan))
     accepted = accepted_channels(trace, np.isfinite(nu), keep)
     values: dict[str, float] = {}
+    names = channel_names(trace, pair[0])
     for k, modality in enumerate(trace.modalities):
         values[f"updates/{modality}/all"] = float(np.mean(accepted[:, k].any(-1)))
         channels = np.flatnonzero(used[:, k].sum(0) >= MIN_STEPS)
@@ -43,7 +44,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
             continue
         for i in channels:
             at = used[:, k, i]
-            values[f"innovation bias/{modality} {i + 1}/all"] = float((nu[at, k, i] / deviation[at, k, i]).mean())
+            values[f"innovation bias/{modality} {names[k][i]}/all"] = float((nu[at, k, i] / deviation[at, k, i]).mean())
         values[f"innovation std/{modality}/all"] = float(np.exp(np.nanmean(np.log(deviation[:, k, channels]))))
         angles = [i for i in _angles(trace, modality) if i in channels]
         turns = np.any(np.abs(np.abs(nu[:, k, angles]) - TURN) < NEAR_TURN, axis=-1)

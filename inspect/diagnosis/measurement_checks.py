@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
-from beliefscope.inspect.diagnosis.vector_checks import axis_name
 from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, axis_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
@@ -25,7 +25,7 @@ from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
-from beliefscope.inspect.diagnosis.vector_checks import axis_name, commands_hand
+from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import prediction

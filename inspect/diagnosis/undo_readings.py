@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
+from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.diagnosis.reading_checks import delayed_errors
 from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo
 from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
@@ -20,7 +21,6 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     CHANGE,
     FORCE,
     TORQUE,
-    axis_name,
     commands_hand,
     free_motion,
     in_contact,

@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, axis_name
 from beliefscope.inspect.statistics.contact_distance import contact_residual
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND, Reference, displacements_in_contact
 from beliefscope.inspect.statistics.signals import (
@@ -377,11 +377,6 @@ def saturated(values: Array) -> Mask:
     size = np.abs(values)
     at = size == size.max()
     return at if np.diff(at, prepend=False).sum() > 2 else np.zeros(len(values), dtype=bool)
-
-
-def axis_name(key: str, i: int, count: int) -> str:
-    """Display name of an axis: ``force x``, ``joints 4``; of a scalar, the key."""
-    return key if count == 1 else f"{key} {AXES[i] if count <= 3 else i}"
 
 
 def axis_index(axis: str) -> int:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from beliefscope.datasets.errors import check_name
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, axis_name
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.models.common_random_numbers import Common
@@ -41,9 +41,9 @@ def channel_names(task: Task, modalities: Iterable[str]) -> dict[str, tuple[Chan
         keys = {key: task.observations[key] for key in task.modalities[modality]}
         if all(len(shape) == 1 for shape in keys.values()):
             channels[modality] = tuple(
-                Channel(f"{key} {axis}".strip(), *CHANNEL_UNITS.get(key, ("", 1.0)))
+                Channel(axis_name(key, i, size), *CHANNEL_UNITS.get(key, ("", 1.0)))
                 for key, (size,) in keys.items()
-                for axis in ([""] if size == 1 else "xyz"[:size] if size <= 3 else map(str, range(size)))
+                for i in range(size)
             )
     return channels
 

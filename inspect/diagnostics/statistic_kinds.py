@@ -190,7 +190,8 @@ def label_of(statistic: str, has_contact: bool = True) -> str:
         return f"delay of the labels behind {display_name(axis) or 'all modalities'}"
     if (kind, name) == ("offset", "labels"):
         return f"offset of the labels ({display_name(axis)}) from what all modalities measure"
-    owner, axis = f" of {display_name(name)}" if name else "", f" ({display_name(axis)})" if axis else ""
+    owner = f" of {display_name(name)}" if name else ""
+    axis = f" ({display_name(axis)})" if axis and axis != name else ""
     title = title.format(of=owner + axis, axis=axis) if "{" in title else title + owner + axis
     before, after = PHASES.get(phase, ("", f" in {phase}"))
     return f"{before}{title}{after}"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.statistics.measures import Array, counted
@@ -162,11 +163,27 @@ def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
     ]
 
 
-def _names(trace: Trace, channels: int) -> list[tuple[str, str]]:
+def channel_names(trace: Trace, innovation: Array) -> list[list[str]]:
+    """(K, m) names of the channels of reported innovations (T, K, m).
+
+    They are those of the modality's sensors, such as ``gps x``, if these have as many, else numbers from 0.
+    """
+    result = []
+    for k, modality in enumerate(trace.modalities):
+        used = np.flatnonzero(np.isfinite(innovation[:, k]).any(0)).max(initial=-1) + 1
+        shapes = [(key, trace.task.observations[key]) for key in trace.task.modalities.get(modality, ())]
+        names = [axis_name(key, i, shape[0]) for key, shape in shapes if len(shape) == 1 for i in range(shape[0])]
+        names = names if len(names) == used else []
+        result.append([*names, *(f"channel {i}" for i in range(len(names), innovation.shape[-1]))])
+    return result
+
+
+def _names(trace: Trace, innovation: Array) -> list[tuple[str, str]]:
     """(modality, channel) of the K m series of innovations: components of the state, or channels of the measurement."""
     if trace.innovation is None:
         return [(modality, c.name) for modality in trace.modalities for c in trace.task.components]
-    return [(modality, f"channel {i + 1}") for modality in trace.modalities for i in range(channels)]
+    names = channel_names(trace, innovation)
+    return [(modality, name) for modality, own in zip(trace.modalities, names, strict=True) for name in own]
 
 
 def _ljung_box(trace: Trace) -> dict[tuple[str, str], tuple[float, float, int]]:
@@ -180,7 +197,7 @@ def _ljung_box(trace: Trace) -> dict[tuple[str, str], tuple[float, float, int]]:
     nu, s = pair
     variance = np.diagonal(s, axis1=-2, axis2=-1)
     normalised = (nu / np.sqrt(np.where(variance > 0.0, variance, np.nan)))[keep].reshape(keep.sum(), -1)
-    columns = dict(zip(_names(trace, nu.shape[-1]), normalised.T, strict=True))
+    columns = dict(zip(_names(trace, nu), normalised.T, strict=True))
     series = {name: column[np.isfinite(column)] for name, column in columns.items() if np.isfinite(column).any()}
     if not series or min(map(len, series.values())) <= 2 * LAGS:
         return {}

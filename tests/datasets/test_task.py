@@ -11,8 +11,14 @@ import pytest
 from beliefscope.datasets.catalog import TASKS, find_task, load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Component, Task, axis_name
 from beliefscope.datasets.task_json import check_definition, difference, task_from_json, task_to_json
+
+
+def test_channels_are_axes_up_to_three_and_numbers_from_0() -> None:
+    assert [axis_name("gps", i, 2) for i in range(2)] == ["gps x", "gps y"]
+    assert [axis_name("joints", i, 7) for i in (0, 6)] == ["joints 0", "joints 6"]
+    assert axis_name("speed", 0, 1) == "speed"
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))

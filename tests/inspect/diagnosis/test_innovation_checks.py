@@ -176,6 +176,11 @@ def test_measurement_noise_is_that_of_the_filter_whatever_its_measurement_functi
     assert values["measurement noise/compass/all"] == pytest.approx(math.sqrt(compass) * STD["compass"][0], rel=1e-3)
 
 
+def test_channels_are_named_as_those_of_the_sensors() -> None:
+    names = [name for name in innovation_statistics(run(Boat())) if name.startswith("innovation bias/")]
+    assert names == [f"innovation bias/{name}/all" for name in ("radar radar x", "radar radar y", "compass compass")]
+
+
 def test_modalities_that_are_always_used_together_have_a_mean_measurement_noise() -> None:
     values = innovation_statistics(run(Boat(), every=1))
     product = STD["radar"][0] * STD["radar"][1] * STD["compass"][0]

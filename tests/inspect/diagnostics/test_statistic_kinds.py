@@ -25,6 +25,8 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
         ("lag/image/all", "delay of image behind the other sensors"),
         ("lag/labels wrist_cam/all", "delay of the labels behind wrist cam"),
         ("reading scatter/gps x/all", "variation between episodes of the error of gps (x), relative to its noise,"),
+        ("innovation bias/gps gps_fix x/all", "mean of the innovations, in standard deviations, of gps (gps fix x)"),
+        ("innovation bias/baro baro/all", "mean of the innovations, in standard deviations, of baro"),
         ("lag/labels/all", "delay of the labels behind all modalities"),
         ("offset/labels x/all", "offset of the labels (x) from what all modalities measure"),
         ("offset/control x/all", "offset of control (x) from the measured hand"),

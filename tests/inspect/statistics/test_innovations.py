@@ -34,7 +34,7 @@ def with_variance(trace_: Trace, variance: float) -> Trace:
 
 def test_channels_have_the_names_of_their_modality(run: Trace) -> None:
     image, haptics = run.modalities
-    expected = [(image, "channel 1"), (image, "channel 2"), (haptics, "channel 1")]
+    expected = [(image, "channel 0"), (image, "channel 1"), (haptics, "channel 0")]
     assert [*autocorrelations(run)] == expected
     assert [(w.modality, w.component) for w in whiteness_of([run, run])] == expected
     assert max(map(abs, autocorrelations(run).values())) < 4.0 / np.sqrt(counted(run).sum())
@@ -44,9 +44,9 @@ def test_channels_without_a_valid_variance_or_a_counted_step_have_no_test(run: T
     """A filter that diverges can report negative variances; the others' results are unchanged."""
     invalid, others = with_variance(run, -1.0), autocorrelations(run)
     image, haptics = run.modalities
-    assert autocorrelations(invalid) == {name: r for name, r in others.items() if name != (image, "channel 2")}
+    assert autocorrelations(invalid) == {name: r for name, r in others.items() if name != (image, "channel 1")}
     assert run.innovation is not None
     early = run.innovation.copy()
     early[counted(run), 1] = np.nan
-    assert (haptics, "channel 1") not in autocorrelations(replace(run, innovation=early))
-    assert [w.component for w in whiteness_of([run, invalid])] == ["channel 1", "channel 1"]
+    assert (haptics, "channel 0") not in autocorrelations(replace(run, innovation=early))
+    assert [w.component for w in whiteness_of([run, invalid])] == ["channel 0", "channel 0"]
