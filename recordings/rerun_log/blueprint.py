@@ -100,15 +100,20 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
         origin="world",
         contents="world/plane/**",
         name=f"Belief: {', '.join(map(display_name, task.map_components))}",
-        eye_controls=_eye(anchor, anchor + np.array([0.0, 0.0, 3.4 * task.map_half_width]), (0, 1, 0)),
+        eye_controls=_eye(
+            anchor, anchor + np.array([0.0, 0.0, 3.4 * task.map_half_width]), (0, 1, 0), "world/plane/fused/mean"
+        ),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
     )
     return rrb.Horizontal(rrb.Tabs(scene, about, active_tab=0), above, column_shares=[5, 4])
 
 
-def _eye(target: NDArray[np.float64], position: NDArray[np.float64], up: tuple[int, int, int]) -> rrb.EyeControls3D:
-    return rrb.EyeControls3D(position=position, look_target=target, eye_up=up, kind="Orbital")
+def _eye(
+    target: NDArray[np.float64], position: NDArray[np.float64], up: tuple[int, int, int], tracked: str | None = None
+) -> rrb.EyeControls3D:
+    """tracked: entity that the eye follows."""
+    return rrb.EyeControls3D(position=position, look_target=target, eye_up=up, kind="Orbital", tracking_entity=tracked)
 
 
 def _camera(key: str) -> rrb.Spatial2DView:
