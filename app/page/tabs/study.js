@@ -13,6 +13,7 @@ import { permalink } from '../core/state.js';
 import { fixed, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { BarChart } from '../widgets/bar_chart.js';
+import { colourOf } from '../widgets/filter_colours.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
@@ -226,13 +227,15 @@ export class Study {
     const ofStart = results.rows.filter((row) => isOfFilter(row) && row.start === start);
     const blackouts = [...new Set(ofStart.map(({ blackout }) => blackout))];
     this.#targets.clear();
+    const names = results.filters.map(({ name }) => name);
     const filters = results.filters.map(({ name, trained }) => {
       const checkpoint =
         trained.find((seed) => seed.catalog_name) ?? trained.find(({ file }) => file) ?? null;
       const ofFilter = ofStart.filter(({ filter }) => filter === name);
       const rows = blackouts.flatMap((share) => ofFilter.filter((row) => row.blackout === share));
-      const bars = rows.map((row) => this.#bar(row, checkpoint, task, quantity));
-      return { name, checkpoint, rows, bars };
+      const colour = colourOf(name, names);
+      const bars = rows.map((row) => ({ ...this.#bar(row, checkpoint, task, quantity), colour }));
+      return { name, colour, checkpoint, rows, bars };
     });
     const level = referenceLevel(results.rows, start, quantity);
     return { task: task.name, quantity, start, blackouts, filters, level };
@@ -243,7 +246,7 @@ export class Study {
    * @param {FilterResults['checkpoint']} checkpoint
    * @param {Task} task
    * @param {Quantity} quantity
-   * @returns {Bar}
+   * @returns {Omit<Bar, 'colour'>}
    */
   #bar(
     { filter, blackout, mean: means, spread: spreads, by_seed, failed },

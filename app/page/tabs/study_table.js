@@ -15,6 +15,7 @@ import { blackoutLabel } from './study_quantities.js';
  * Results of a filter.
  * @typedef {object} FilterResults
  * @property {string} name
+ * @property {string} colour its property
  * @property {TrainedSeed | null} checkpoint opened by the links; null if no weights are available
  * @property {StudyRow[]} rows per share of image blackout
  * @property {Bar[]} bars of these rows
@@ -204,7 +205,7 @@ function studyColumns({ quantity, blackouts, filters }) {
 function tableRow(columns, filter) {
   const row = document.createElement('tr');
   row.dataset.filter = filter.name;
-  row.append(create('th', { scope: 'row' }, legendSample(filter.name), filter.name));
+  row.append(create('th', { scope: 'row' }, legendSample(filter.name, filter.colour), filter.name));
   for (const { content } of columns.slice(1)) {
     const cell = row.insertCell();
     cell.className = 'number';

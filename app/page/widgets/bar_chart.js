@@ -3,7 +3,7 @@
 import { svgElement } from '../core/dom.js';
 import { scaled } from '../core/colours.js';
 import { fixed } from '../core/units.js';
-import { colourOf, estimatorOf } from './filter_colours.js';
+import { estimatorOf } from './filter_colours.js';
 
 /** Texture by estimator. @type {Record<string, string>} */
 const TEXTURES = { pf: 'M-1 5 5-1M1 7 7 1', ukf: 'M1 2h2M4 5h2', lstm: 'M0 1.5h6M0 4.5h6' };
@@ -16,6 +16,7 @@ const TICKS = 5; // of the scale, about
 /**
  * @typedef {object} Bar
  * @property {string} filter
+ * @property {string} colour its property
  * @property {number | null} mean
  * @property {number | null} spread
  * @property {{value: number, here: boolean}[]} dots one per seed; here: whether the link opens this seed
@@ -91,7 +92,7 @@ export class BarChart {
     const svg = svgElement(
       'svg',
       { viewBox: `0 0 ${width} ${height}`, width, height, role: 'group', 'aria-label': label },
-      textureDefinitions(bars.map((bar) => bar.filter)),
+      textureDefinitions(bars),
       ...gridLines(scale, width),
       svgElement('text', { x: 2, y: scaled(10) }, unit),
     );
@@ -191,9 +192,9 @@ const missingMark = (x, bottom) =>
  * @param {number} slot px, width for the bar and its gaps
  * @param {Scale} scale
  */
-function barShapes({ filter, spread, dots }, mean, left, slot, { top, y }) {
+function barShapes({ filter, colour, spread, dots }, mean, left, slot, { top, y }) {
   const [x, width, middle] = [left + 0.06 * slot, 0.88 * slot, left + slot / 2];
-  const shape = { ...appearance(filter), x, y: y(mean), width, height: y(0) - y(mean) };
+  const shape = { ...appearance(filter, colour), x, y: y(mean), width, height: y(0) - y(mean) };
   /** @type {SVGElement[]} */
   const shapes = [svgElement('rect', shape)];
   if (mean > top) return [...shapes, ...cutMarks(mean, x, width, middle, slot)];
@@ -237,12 +238,13 @@ function cutMarks(mean, x, width, middle, slot) {
 /**
  * Returns the colour and texture of a filter, for a legend.
  * @param {string} filter
+ * @param {string} colour its property
  */
-export function legendSample(filter) {
+export function legendSample(filter, colour) {
   return svgElement(
     'svg',
     { class: 'patch', viewBox: '0 0 14 10', 'aria-hidden': 'true' },
-    svgElement('rect', { ...appearance(filter), x: 0.5, y: 0.5, width: 13, height: 9 }),
+    svgElement('rect', { ...appearance(filter, colour), x: 0.5, y: 0.5, width: 13, height: 9 }),
   );
 }
 
@@ -279,31 +281,32 @@ const texture = (filter) => estimatorOf(filter, Object.keys(TEXTURES));
 
 /**
  * @param {string} filter
+ * @param {string} colour
  * @returns {Record<string, string>}
  */
-function appearance(filter) {
+function appearance(filter, colour) {
   const kind = texture(filter);
   return {
     class: 'face',
-    style: `--line: var(${colourOf(filter)})`,
-    ...(kind ? { fill: `url(#bar${colourOf(filter)}-${kind})` } : {}),
+    style: `--line: var(${colour})`,
+    ...(kind ? { fill: `url(#bar${colour}-${kind})` } : {}),
   };
 }
 
 /**
  * Returns the textures of filters, which their bars refer to.
- * @param {string[]} filters
+ * @param {Bar[]} bars
  */
-function textureDefinitions(filters) {
-  const textured = filters.filter(texture);
-  const byId = new Map(textured.map((f) => [`bar${colourOf(f)}-${texture(f)}`, f]));
-  const patterns = [...byId].map(([id, filter]) =>
+function textureDefinitions(bars) {
+  const textured = bars.filter(({ filter }) => texture(filter));
+  const byId = new Map(textured.map((bar) => [`bar${bar.colour}-${texture(bar.filter)}`, bar]));
+  const patterns = [...byId].map(([id, { filter, colour }]) =>
     svgElement(
       'pattern',
       {
         id,
         class: 'texture',
-        style: `--line: var(${colourOf(filter)})`,
+        style: `--line: var(${colour})`,
         width: TEXTURE_SIZE,
         height: TEXTURE_SIZE,
         patternUnits: 'userSpaceOnUse',
