@@ -142,7 +142,7 @@ class Consistency(Diagnostic):
             return "Innovations are white."
         strongest = max(colored, key=lambda test: abs(test.autocorrelation))
         size = number(math.sqrt(self.entry(strongest.modality).nis))
-        subject = f"{display_name(strongest.modality)}, {display_name(strongest.component)}"
+        subject = ", ".join(dict.fromkeys(map(display_name, (strongest.modality, strongest.component))))
         where = f"{subject}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
         text = f"Innovations are not white ({where}) and {size} times as large as predicted"
         if strongest.autocorrelation > 0.2:
