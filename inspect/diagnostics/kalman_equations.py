@@ -24,6 +24,7 @@ from beliefscope.inspect.diagnostics.repeated_steps import (
     why_not,
 )
 from beliefscope.inspect.diagnostics.views import Array, Table
+from beliefscope.inspect.statistics.innovations import channel_names
 from beliefscope.inspect.trace import Trace
 
 EPISODES = 8
@@ -48,7 +49,7 @@ class KalmanEquations(Diagnostic):
 
     Attributes:
         task, filter, trajectories, steps: numbers of episodes and of steps that were repeated in all of them.
-        modalities: names; empty without innovations.
+        modalities: names; empty without innovations. channels: K times m names.
         dynamics: (n,) relative error, of the growth of the predicted covariance with the variance of a component.
         measurement: (K,) relative error, of the growth of the innovations' covariance.
         columns: (n + 1, K) errors as ``measurement`` with the variance of one component, and of all together.
@@ -66,6 +67,7 @@ class KalmanEquations(Diagnostic):
     trajectories: int
     steps: int
     modalities: tuple[str, ...]
+    channels: tuple[tuple[str, ...], ...]
     dynamics: Array
     measurement: Array
     columns: Array
@@ -161,31 +163,18 @@ class KalmanEquations(Diagnostic):
             (f"process, {display_name(c.name)}", c.conversion[1] * value, c.conversion[0])
             for c, value in zip(components, self.process_noise, strict=True)
         ] + [
-            (f"{display_name(name)}, channel {i + 1}", value, "")
-            for name, values in zip(self.modalities, self.measurement_noise, strict=True)
-            for i, value in enumerate(values)
+            (channel if channel.startswith(name) else f"{name}, {channel}", value, "")
+            for name, channels, values in zip(self.modalities, self.channels, self.measurement_noise, strict=True)
+            for channel, value in zip(channels, values, strict=True)
         ]
         known = tuple((name, float(value), unit) for name, value, unit in noise if not np.isnan(value))
-        return [
-            Table("Jacobians against finite differences", heads, tuple(rows), note),
-            *(
-                [
-                    Table(
-                        "Updates against K = P Hᵀ S⁻¹",
-                        ("steps with", "covariance error, %", "mean error, %"),
-                        updates,
-                    )
-                ]
-                if self.modalities
-                else []
-            ),
-            Table(
-                "Noise that the covariances contain",
-                ("noise", "standard deviation", "unit"),
-                known,
-                "Q = P - F P Fᵀ per step, and R = S - H P Hᵀ in units of the readings.",
-            ),
-        ]
+        tables = [Table("Jacobians against finite differences", heads, tuple(rows), note)]
+        if self.modalities:
+            heads = ("steps with", "covariance error, %", "mean error, %")
+            tables.append(Table("Updates against K = P Hᵀ S⁻¹", heads, updates))
+        note = "Q = P - F P Fᵀ per step, and R = S - H P Hᵀ in units of the readings."
+        heads = ("noise", "standard deviation", "unit")
+        return [*tables, Table("Noise that the covariances contain", heads, known, note)]
 
 
 def _number(value: float) -> float | None:
@@ -241,11 +230,12 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
     first, count = traces[0], len(traces[0].task.components)
     process = np.concatenate([steps.process_noise() for steps in repeated])
     values: dict[str, Any] = dict.fromkeys(("measurement", "slopes", "measurement_lack"), np.empty(0))
-    values |= {"covariance": np.empty(0), "correction": np.empty(0), "modalities": ()}
+    values |= {"covariance": np.empty(0), "correction": np.empty(0), "modalities": (), "channels": ()}
     values |= {"columns": np.empty((count + 1, 0)), "measurement_noise": np.empty((0, 0))}
     if first.innovation is not None:
         values = {
             "modalities": tuple(first.modalities),
+            "channels": tuple(map(tuple, channel_names(first, first.innovation))),
             "measurement": errors(RepeatedSteps.measurement_errors),
             "columns": errors(RepeatedSteps.measurement_errors_by_component),
             "slopes": known_median(np.stack([steps.slopes() for steps in repeated])),

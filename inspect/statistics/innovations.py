@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +164,7 @@ def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
     ]
 
 
-def channel_names(trace: Trace, innovation: Array) -> list[list[str]]:
+def channel_names(trace: Trace, innovation: NDArray[Any]) -> list[list[str]]:
     """(K, m) names of the channels of reported innovations (T, K, m).
 
     They are those of the modality's sensors, such as ``gps x``, if these have as many, else numbers from 0.
