@@ -75,8 +75,6 @@ def test_wrong_equations_are_the_finding_of_a_filter_without_a_record(
     finding = page.page.locator("#finding")
     assert finding.locator("strong").text_content().startswith("The Jacobian of radar differs from finite differences")
     finding.get_by_role("button", name="Equations").click()
-    page.until(
-        "() => document.querySelector('#diagnostics').textContent.includes('Updates against')"
-    )
+    page.until("() => document.querySelector('#diagnostics').textContent.includes('Updates against')")
     assert (page.state["tab"], page.state["diagnostic"]) == ("diagnostics", "equations")
     page.screenshot("wrong-equations")

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 Compare = Callable[[Trace, Trace], None]
 
 
-@pytest.fixture(scope="module", params=["door crossmodal-pf", "door crossmodal-ekf", "push image-ekf"])
+@pytest.fixture(scope="module", params=["door crossmodal-pf", "push image-ekf"])
 def run(request: pytest.FixtureRequest, short_episodes: Callable[..., list[Episode]]) -> Trace:
     task, name = request.param.split()
     (episode,) = short_episodes(task, [9], 50)

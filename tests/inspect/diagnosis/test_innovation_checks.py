@@ -214,13 +214,13 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
     ("filter_", "cause"),
     [
         (Boat(radar=0.1), "measurement_noise.radar.small"),
-        (Boat(compass=10.0), "measurement_noise.compass.large"),
+        pytest.param(Boat(compass=10.0), "measurement_noise.compass.large", marks=pytest.mark.long),
         (Boat(wraps=False), "innovation.compass.turns"),
         (Boat(has_bias=False), "dynamics.drift"),
-        (Boat(updates=0.5), "updates.compass.missing"),
+        pytest.param(Boat(updates=0.5), "updates.compass.missing", marks=pytest.mark.long),
         (Boat(turn=-1.0), "dynamics.inverted"),
         (Boat(turn=0.6), "dynamics.frozen"),
-        (Boat(turn=2.0), "dynamics.large"),
+        pytest.param(Boat(turn=2.0), "dynamics.large", marks=pytest.mark.long),
         (Boat(offset=0.5), "measurement.radar.function"),
         pytest.param(Boat(radar=0.1, separate=True), "measurement_noise.radar.small", marks=pytest.mark.long),
         (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),
@@ -238,7 +238,7 @@ def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:
 @pytest.mark.slow
 def test_innovations_that_are_not_wrapped_are_mentioned_although_the_record_has_them_too() -> None:
     unwrapped = loaded(Boat(wraps=False))
-    record = profile_of(unwrapped, [sail(seed) for seed in range(24)], "boat")
-    result = diagnose(unwrapped, {seed: sail(seed) for seed in range(46, 52)}, profile=record)
+    record = profile_of(unwrapped, [sail(seed) for seed in range(12)], "boat")
+    result = diagnose(unwrapped, {seed: sail(seed) for seed in range(47, 51)}, profile=record)
     assert (result.state, result.provenance["miscalibrated"]) == ("healthy", True)
     assert result.headline.startswith("Innovations of compass not wrapped in episodes 47, 49, 50; otherwise no ")

@@ -95,7 +95,7 @@ def inverted(filter_: Any) -> None:
         ("crossmodal-ekf", biased, "shift image"),
         ("crossmodal-ekf", overconfident, "rescale image"),
         ("crossmodal-ekf", noisy, "rescale process noise"),
-        ("crossmodal-pf", noisy, "rescale process noise"),
+        pytest.param("crossmodal-pf", noisy, "rescale process noise", marks=pytest.mark.long),
         ("crossmodal-ekf", inverted, "invert beta"),
         ("crossmodal-pf", inverted, "invert beta"),
     ],
