@@ -239,7 +239,7 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
             "measurement": errors(RepeatedSteps.measurement_errors),
             "columns": errors(RepeatedSteps.measurement_errors_by_component),
             "slopes": known_median(np.stack([steps.slopes() for steps in repeated])),
-            **_of_updates(repeated),
+            **_of_updates(repeated, has_weights=first.weights is not None),
         }
     return KalmanEquations(
         task=first.task,
@@ -253,16 +253,20 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
     )
 
 
-def _of_updates(repeated: Sequence[RepeatedSteps]) -> dict[str, Any]:
-    """The fields about updates."""
+def _of_updates(repeated: Sequence[RepeatedSteps], has_weights: bool) -> dict[str, Any]:
+    """The fields about updates. Those of filters with fusion weights are no Kalman updates."""
     updates = [expected_updates(steps) for steps in repeated]
     size = np.concatenate([steps.size[:, 0] for steps in repeated])
     noise = np.concatenate([update.noise for update in updates])
     variance, whole = (np.diagonal(x, axis1=-2, axis2=-1) for x in (noise, size))
     variance = np.where(whole > 0.0, np.maximum(variance, 0.0), np.nan)
+    covariance, correction = (
+        known_median(np.stack([np.fmin.reduce(errors) for errors in each]))
+        for each in zip(*((u.covariance_error, u.correction_error) for u in updates), strict=True)
+    )
     return {
-        "covariance": known_median(np.stack([np.fmin.reduce(update.covariance_error) for update in updates])),
-        "correction": known_median(np.stack([np.fmin.reduce(update.correction_error) for update in updates])),
+        "covariance": np.full_like(covariance, np.nan) if has_weights else covariance,
+        "correction": np.full_like(correction, np.nan) if has_weights else correction,
         "measurement_noise": np.sqrt(known_median(variance)),
         "measurement_lack": _lack(noise, size),
     }

@@ -64,7 +64,7 @@ def _together(steps: RepeatedSteps) -> Updates:
     for i in range(k):
         block = slice(i * m, (i + 1) * m)
         size[:, block, block] = steps.size[:, 0, i]
-    gain = prior @ rows.mT @ np.linalg.inv(_invertible(size))
+    gain = prior @ rows.mT @ np.linalg.pinv(_invertible(size))
     nu = np.nan_to_num(steps.innovation[:, 0]).reshape(j, -1, 1)
     return _compared(steps, noise, prior - gain @ rows @ prior, (gain @ nu)[..., 0])
 
@@ -77,7 +77,7 @@ def _in_turn(steps: RepeatedSteps, order: tuple[int, ...]) -> Updates:
         size, nu = steps.size[:, 0, k], np.nan_to_num(steps.innovation[:, 0, k])
         h = steps.measurement_jacobian[:, k] @ np.linalg.pinv(change)
         noise[:, k] = size - h @ covariance @ h.mT
-        gain = covariance @ h.mT @ np.linalg.inv(_invertible(size))
+        gain = covariance @ h.mT @ np.linalg.pinv(_invertible(size))
         correction = correction + (gain @ nu[..., None])[..., 0]
         covariance = covariance - gain @ h @ covariance
         change = (unit - gain @ h) @ change

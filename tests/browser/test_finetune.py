@@ -31,7 +31,7 @@ def test_filter_is_finetuned_promoted_and_discarded(
     assert panel.locator("select[name=preset]").input_value() == "reliability-only"
     assert panel.locator("select[name=slice]").input_value() == "image occluded"
     assert panel.locator("select[name=criterion]").input_value() == "image occluded"
-    assert "noise of each measurement" in panel.locator(".help").text_content()
+    assert "noise of the measurement models" in panel.locator(".help").text_content()
     panel.locator("select[name=preset]").select_option("haptics-only")
     assert "26,054 of 449,097" in panel.locator(".count").text_content()
     panel.get_by_label("Train virtual_sensors.haptics", exact=True).click()
