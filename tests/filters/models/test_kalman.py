@@ -56,6 +56,7 @@ def particle_error(particles: int, runs: int, resampling: Resampling = "systemat
     return float(np.sqrt(np.mean(squares)))
 
 
+@pytest.mark.slow
 def test_pf_error_decreases_with_the_square_root_of_the_particles() -> None:
     few, many = particle_error(100, 48), particle_error(10_000, 8)
     # The posterior standard deviation is about 0.3: with 10^4 particles 0.3 / 100, times three for resampling.

@@ -31,6 +31,7 @@ def alarms(healthy: np.ndarray, tested: np.ndarray) -> list[str]:
     return [d.statistic for d in with_critical_values(profile, comparison, RATE) if d.alarm]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 8])
 def test_healthy_samples_rarely_raise_an_alarm(count: int) -> None:
     rng = np.random.default_rng(count)

@@ -24,6 +24,8 @@ from beliefscope.inspect.traces.batch import trace_all
 sys.path.insert(0, str(Path(__file__).parent))
 import planted_traces as plant
 
+pytestmark = pytest.mark.slow
+
 EPISODES, STEPS = 6, 80
 MIRRORED = "sensor_gain=effector_position:factor=-1"
 
@@ -53,7 +55,6 @@ def of_mirrored_positions() -> Conventions:
     return conventions(traces(MIRRORED), filter_())
 
 
-@pytest.mark.slow
 def test_a_planted_sign_is_the_first_finding_and_its_share_that_of_the_clean_runs() -> None:
     result = of_mirrored_positions()
     change, error = result.relevant_removals[0]
@@ -66,7 +67,6 @@ def test_a_planted_sign_is_the_first_finding_and_its_share_that_of_the_clean_run
     assert result.alarms
 
 
-@pytest.mark.slow
 def test_sensors_without_influence_change_nothing() -> None:
     """The filter reads neither force nor torque."""
     result = of_mirrored_positions()
@@ -75,7 +75,6 @@ def test_sensors_without_influence_change_nothing() -> None:
     assert (result.share[rows] == 0.0).all()
 
 
-@pytest.mark.slow
 def test_clean_episodes_have_no_finding() -> None:
     result = conventions(traces(), filter_())
     assert (result.relevant_removals, result.alarms) == ([], ())

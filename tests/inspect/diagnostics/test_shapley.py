@@ -259,6 +259,7 @@ def test_offset_of_the_initial_state() -> None:
             shapley.shapley([run], checkpoint, offset=offset)
 
 
+@pytest.mark.slow
 def test_intervals_contain_the_values() -> None:
     checkpoint, _ = builtin("crossmodal-ekf")
     runs = [trace(checkpoint, episode(i, 36), i, seed=0) for i in (9, 19, 29, 39, 49)]

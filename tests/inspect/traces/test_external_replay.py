@@ -117,6 +117,7 @@ def test_runs_with_the_mean_of_a_removed_sensor_say_so() -> None:
             assert ('Adapter(absent="nan")' in verdict) == expected, name
 
 
+@pytest.mark.slow
 def test_shapley_values_add_up() -> None:
     filter_ = external(vehicle.NumpyKalman())
     runs = [trace(filter_, vehicle.drive(seed), seed) for seed in range(3)]
