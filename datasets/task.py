@@ -14,6 +14,7 @@ from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.simulation.camera import Camera
+from beliefscope.datasets.text import capitalised
 
 DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 """SI unit -> unit for display, and the factor."""
@@ -140,7 +141,7 @@ class MainError:
     @property
     def title(self) -> str:
         """Name at the start of a sentence."""
-        return self.name[0].upper() + self.name[1:]
+        return capitalised(self.name)
 
     def text(self, value: float, digits: int = 2) -> str:
         """A value as displayed: ``1.25 cm``."""

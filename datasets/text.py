@@ -6,6 +6,11 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def capitalised(text: str) -> str:
+    """The text with a capital first letter; the other letters stay as they are."""
+    return text[:1].upper() + text[1:]
+
+
 def percent(share: float, form: str = ".0f") -> str:
     """A share in percent: ``38 %``. form: format of the number."""
     return f"{100.0 * share:{form}} %"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import capitalised
 from beliefscope.filters.evaluate import BASELINES, nees_bounds
 from beliefscope.filters.start_offset import STUDY_OFFSET
 from beliefscope.filters.training.plan import evaluated_blackouts
@@ -258,7 +259,7 @@ def _modality_table(rows: Sequence[Row]) -> str:
     heads = [head for name in names for head in (f"{name}-only update", f"{name} standalone")]
     title = label(rows[0].main)
     lines = [
-        f"\n{title[0].upper()}{title[1:]} by modality: an update starts at every step from the fused prior, a "
+        f"\n{capitalised(title)} by modality: an update starts at every step from the fused prior, a "
         "standalone filter never uses the other modalities.\n",
         f"| filter | image blackout | fused | {' | '.join(heads)} |",
         "| --- |" + " ---: |" * (len(heads) + 2),

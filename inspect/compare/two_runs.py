@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
-from beliefscope.datasets.text import plural
+from beliefscope.datasets.text import capitalised, plural
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
@@ -186,7 +186,7 @@ class Comparison(Diagnostic):
         curves += both(main.factor * self.error, f"{main.title} error", main.unit)
         for i, component in enumerate(task.components):
             if i not in task.main_error.indices:
-                title = f"{component.label[0].upper()}{component.label[1:]} error"
+                title = f"{capitalised(component.label)} error"
                 curves += both(factors[i] * np.abs(self.component_error[:, i]), title, units[i])
         if np.isfinite(self.nees_at).any():
             curves += both(np.sqrt(self.nees_at), CONSISTENCY, "standard deviations")

@@ -11,6 +11,7 @@ import numpy as np
 
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.task import display_name
+from beliefscope.datasets.text import capitalised
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.names import PRETRAINED
@@ -86,9 +87,7 @@ def healthy(case: Case) -> Diagnosis:
             headline = f"Always {overconfident}, even in its healthy record; {text[:-1]}; try: {CONVENTIONS}."
     if defect := _turned(case) or _wrong_equations(case):
         headline = f"{defect}; otherwise {text}"
-    provenance = _provenance(case)
-    provenance["miscalibrated"] |= bool(defect)
-    return Diagnosis("healthy", False, headline, (), largest, provenance)
+    return Diagnosis("healthy", False, headline, (), largest, _provenance(case, defect))
 
 
 def _nees(profile: HealthyProfile) -> float:
@@ -116,8 +115,7 @@ def _turned(case: Case) -> str:
 
 def _wrong_equations(case: Case) -> str:
     """Wrong equations of an external Kalman filter, whatever the record, which may have them too; empty without any."""
-    text = "; ".join(wrong_equations(case.traces, case.inputs.checkpoint))
-    return text and f"{text[0].upper()}{text[1:]}"
+    return capitalised("; ".join(wrong_equations(case.traces, case.inputs.checkpoint)))
 
 
 def _is_miscalibrated(nees: float) -> bool:
@@ -208,7 +206,7 @@ def conclude(
     masked = is_effect_known and not is_visible(case.by_statistic, effect)
     headline = _headline(affected, candidates, masked, len(case.rows))
     deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
-    return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case))
+    return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case, _turned(case)))
 
 
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:
@@ -312,7 +310,7 @@ def search_action(checkpoint: Checkpoint, count: int, reports: bool = True) -> s
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
     external = isinstance(checkpoint, ExternalFilter)
-    start = f"{CONVENTIONS[0].upper()}{CONVENTIONS[1:]}, or search" if external else "Search"
+    start = f"{capitalised(CONVENTIONS)}, or search" if external else "Search"
     if external and not reports:
         start = f"Return its predictions and innovations, which show faults of its equations, {CONVENTIONS}, or search"
     return (
@@ -345,7 +343,8 @@ def _when(case: Case, candidate: Candidate) -> str:
     return f" from step {first} ({longest.times[first]:.1f} s)" if first > 0 else ""
 
 
-def _provenance(case: Case) -> dict[str, Any]:
+def _provenance(case: Case, defect: str) -> dict[str, Any]:
+    """defect: of the filter, whatever the record; empty if there is none."""
     checkpoint, numbers, new = case.inputs.checkpoint, statistics_by_subject(case), missing_statistics(case)
     return {
         "task": checkpoint.task.name,
@@ -354,7 +353,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "episodes": len(case.rows),
         "healthy_episodes": case.profile.episodes,
         "healthy_data": case.profile.data,
-        "miscalibrated": _is_miscalibrated(_nees(case.profile)),
+        "miscalibrated": _is_miscalibrated(_nees(case.profile)) or bool(defect),
         "statistics": numbers,
         "unmeasured": unmeasured(case, numbers, new),
         "outdated": new > 0,

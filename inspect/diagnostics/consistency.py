@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task, display_name, with_unit
-from beliefscope.datasets.text import plural
+from beliefscope.datasets.text import capitalised, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
@@ -365,7 +365,7 @@ def _known_mean(values: Array) -> float:
 
 
 def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:] + "."
+    return capitalised(text) + "."
 
 
 ENTRY = Entry(

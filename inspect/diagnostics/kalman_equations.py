@@ -11,16 +11,16 @@ import numpy as np
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
-from beliefscope.datasets.text import percent, plural
+from beliefscope.datasets.text import capitalised, percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.kalman_updates import expected_updates
 from beliefscope.inspect.diagnostics.repeated_steps import (
     RepeatedSteps,
-    inverse_std,
     known_median,
     repeat_steps,
+    weights_of,
     why_not,
 )
 from beliefscope.inspect.diagnostics.views import Array, Table
@@ -130,7 +130,7 @@ class KalmanEquations(Diagnostic):
     @property
     def verdict(self) -> str:
         if self.alarms:
-            return " ".join(f"{text[0].upper()}{text[1:]}." for text in self.alarms)
+            return " ".join(f"{capitalised(text)}." for text in self.alarms)
         errors = np.array([*self.dynamics, *self.measurement, *self.covariance, *self.correction])
         largest = f"{percent(np.nanmax(errors), '.2g')} or less" if np.isfinite(errors).any() else "unknown"
         return f"Jacobians and updates agree with finite differences of the filter's own functions (error {largest})."
@@ -227,29 +227,23 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
     def errors(measure: Callable[[RepeatedSteps], Array]) -> Array:
         return known_median(np.stack([np.fmin.reduce(measure(steps)) for steps in repeated]))
 
-    first, count = traces[0], len(traces[0].task.components)
+    first = traces[0]
     process = np.concatenate([steps.process_noise() for steps in repeated])
-    values: dict[str, Any] = dict.fromkeys(("measurement", "slopes", "measurement_lack"), np.empty(0))
-    values |= {"covariance": np.empty(0), "correction": np.empty(0), "modalities": (), "channels": ()}
-    values |= {"columns": np.empty((count + 1, 0)), "measurement_noise": np.empty((0, 0))}
-    if first.innovation is not None:
-        values = {
-            "modalities": tuple(first.modalities),
-            "channels": tuple(map(tuple, channel_names(first, first.innovation))),
-            "measurement": errors(RepeatedSteps.measurement_errors),
-            "columns": errors(RepeatedSteps.measurement_errors_by_component),
-            "slopes": known_median(np.stack([steps.slopes() for steps in repeated])),
-            **_of_updates(repeated, has_weights=first.weights is not None),
-        }
+    channels = [] if first.innovation is None else channel_names(first, first.innovation)
     return KalmanEquations(
         task=first.task,
         filter=first.filter,
         trajectories=len(repeated),
         steps=sum(len(steps.steps) for steps in repeated),
+        modalities=tuple(first.modalities[: len(channels)]),
+        channels=tuple(map(tuple, channels)),
+        measurement=errors(RepeatedSteps.measurement_errors),
+        columns=errors(RepeatedSteps.measurement_errors_by_component),
+        slopes=known_median(np.stack([steps.slopes() for steps in repeated])),
         dynamics=errors(RepeatedSteps.dynamics_errors),
         process_noise=np.sqrt(np.maximum(known_median(np.diagonal(process, axis1=-2, axis2=-1)), 0.0)),
         process_lack=float(_lack(process, np.concatenate([steps.covariance[:, 0] for steps in repeated]))),
-        **values,
+        **_of_updates(repeated, has_weights=first.weights is not None),
     )
 
 
@@ -274,10 +268,10 @@ def _of_updates(repeated: Sequence[RepeatedSteps], has_weights: bool) -> dict[st
 
 def _lack(noise: Array, whole: Array) -> Array:
     """(...,) median over the first axis of the smallest eigenvalue of covariances, relative to the whole ones."""
-    scale = inverse_std(whole)
-    scaled = scale[..., :, None] * scale[..., None, :] * noise
-    known = np.asarray(np.isfinite(scaled).all((-2, -1)) & (scale > 0.0).any(-1))
-    smallest = np.linalg.eigvalsh(np.where(known[..., None, None], scaled, 0.0))[..., 0]
+    weights = weights_of(whole)
+    scaled = weights * noise
+    known = np.asarray(np.isfinite(scaled).all((-2, -1)) & (weights > 0.0).any((-2, -1)))
+    smallest = np.linalg.eigvalsh(np.where(known[..., None, None], scaled, 0.0)).min(-1, initial=np.inf)
     return known_median(np.where(known, smallest, np.nan))
 
 

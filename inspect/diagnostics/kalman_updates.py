@@ -8,7 +8,7 @@ from itertools import permutations
 
 import numpy as np
 
-from beliefscope.inspect.diagnostics.repeated_steps import RepeatedSteps, inverse_std, relative
+from beliefscope.inspect.diagnostics.repeated_steps import RepeatedSteps, inverse_std, relative, weights_of
 from beliefscope.inspect.statistics.measures import Array
 
 MAX_ORDERS = 6
@@ -59,13 +59,13 @@ def _together(steps: RepeatedSteps) -> Updates:
     j, _, k, m, _ = steps.size.shape
     prior, h = steps.covariance[:, 0], steps.measurement_jacobian
     noise = steps.size[:, 0] - h @ prior[:, None] @ h.mT
-    rows = h.reshape(j, k * m, -1)
+    rows = h.reshape(j, k * m, h.shape[-1])
     size = rows @ prior @ rows.mT
     for i in range(k):
         block = slice(i * m, (i + 1) * m)
         size[:, block, block] = steps.size[:, 0, i]
     gain = prior @ rows.mT @ np.linalg.pinv(_invertible(size))
-    nu = np.nan_to_num(steps.innovation[:, 0]).reshape(j, -1, 1)
+    nu = np.nan_to_num(steps.innovation[:, 0]).reshape(j, k * m, 1)
     return _compared(steps, noise, prior - gain @ rows @ prior, (gain @ nu)[..., 0])
 
 
@@ -93,7 +93,7 @@ def _invertible(size: Array) -> Array:
 def _compared(steps: RepeatedSteps, noise: Array, covariance: Array, correction: Array) -> Updates:
     """The errors of the filter's posterior, relative to the expected covariance and correction."""
     prior, scale = steps.covariance[:, 0], inverse_std(steps.covariance[:, 0])
-    weights = scale[..., :, None] * scale[..., None, :]
+    weights = weights_of(prior)
     used = np.isfinite(steps.innovation[:, 0]).any(-1)  # (J, K)
     difference, reduction = weights * (steps.posterior - covariance), weights * (prior - covariance)
     moved, expected = scale * (steps.correction - correction), scale * correction

@@ -16,7 +16,7 @@ from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.statistics.innovations import least_certain
-from beliefscope.inspect.statistics.measures import Array, Mask
+from beliefscope.inspect.statistics.measures import Array, Mask, deviations
 from beliefscope.inspect.trace import Trace
 
 MOST, COST = 6, 0.5
@@ -137,8 +137,8 @@ class RepeatedSteps:
     def are_same(self, trace: Trace) -> Mask:
         """(J,) whether the filter's own beliefs give the trace's predictions, so that they are its whole state."""
         mean, covariance = _beliefs(trace, self.steps, False)
-        moved = np.abs(self.task.difference(mean, self.mean[:, 0])) <= SAME * _std(covariance)
-        grown = _weights(covariance) * (covariance - self.covariance[:, 0])
+        moved = np.abs(self.task.difference(mean, self.mean[:, 0])) <= SAME * deviations(covariance)
+        grown = weights_of(covariance) * (covariance - self.covariance[:, 0])
         return moved.all(-1) & (np.abs(grown).max((-2, -1)) < SAME)
 
     def linear(self) -> RepeatedSteps | None:
@@ -151,7 +151,7 @@ class RepeatedSteps:
         n = self.shift.shape[1]
         scaled = np.concatenate([mean, nu.reshape(*mean.shape[:2], -1)], axis=-1)
         larger, smaller = scaled[:, 1 : n + 1], scaled[:, n + 1 : 2 * n + 1]
-        shift = (self.shift / np.maximum(_std(self.before), self.shift))[..., None]  # in standard deviations
+        shift = (self.shift / np.maximum(deviations(self.before), self.shift))[..., None]  # in standard deviations
         first, second = (larger - smaller) / (2.0 * shift), (larger + smaller) / (2.0 * shift**2)
         keep = np.square(second).sum((1, 2)) <= CURVED**2 * np.square(first).sum((1, 2))
         if not keep.any():
@@ -165,9 +165,9 @@ class RepeatedSteps:
     def dynamics_errors(self) -> Array:
         """(J, n) of the columns of F, relative to their differences from constant states."""
         columns, unit = self.dynamics_jacobian.mT, np.eye(self.shift.shape[1])
-        weights = _weights(self.covariance[:, :1]) * self.growth[..., None, None]  # (J, i, n, n)
+        weights = weights_of(self.covariance[:, :1]) * self.growth[..., None, None]  # (J, i, n, n)
         expected = weights * columns[..., :, None] * columns[..., None, :]
-        growth = _weights(self.covariance[:, :1]) * self._growth(self.covariance)[:, :-1]
+        growth = weights_of(self.covariance[:, :1]) * self._growth(self.covariance)[:, :-1]
         change = expected - weights * unit[:, :, None] * unit[:, None, :]
         smallest = SMALLEST_CHANGE * np.sqrt(np.square(expected).sum((-2, -1)))
         return relative(growth - expected, change, (-2, -1), smallest)
@@ -188,7 +188,7 @@ class RepeatedSteps:
         noise, innovation = self.size[:, 0] - h @ prior @ h.mT, np.nan_to_num(self.innovation[:, 0])
         parts = (self.posterior[:, None] @ h.mT @ np.linalg.pinv(noise) @ innovation[..., None])[..., 0]  # (J, K, n)
         scale = inverse_std(prior[:, 0])
-        columns = (parts * scale[:, None]).swapaxes(1, 2).reshape(-1, parts.shape[1])
+        columns = (parts * scale[:, None]).swapaxes(1, 2).reshape(self.correction.size, -1)
         slopes = np.linalg.lstsq(columns, (self.correction * scale).ravel(), rcond=1e-9)[0]
         return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
@@ -211,7 +211,7 @@ class RepeatedSteps:
     @cached_property
     def _measured_growth(self) -> tuple[Array, Array]:
         """(J, n + 1, K, m, m) growth of the innovations' covariance less that by their derivatives, and the latter."""
-        h, weights = self.measurement_jacobian[:, None], _weights(self.size[:, :1])
+        h, weights = self.measurement_jacobian[:, None], weights_of(self.size[:, :1])
         expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT
         return weights * (self._growth(self.size) - expected), weights * expected
 
@@ -237,18 +237,13 @@ def _beliefs(trace: Trace, steps: NDArray[np.intp], is_updated: bool) -> tuple[A
     return mean[rows, first], covariance[rows, first]
 
 
-def _std(covariance: Array) -> Array:
-    """(..., n) standard deviations; 0 for a negative variance."""
-    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
-
-
 def inverse_std(covariance: Array) -> Array:
     """(..., n) inverse standard deviations; 0 for a variance of 0 or less."""
-    std = _std(covariance)
+    std = deviations(covariance)
     return np.divide(1.0, std, out=np.zeros_like(std), where=std > 0.0)
 
 
-def _weights(covariance: Array) -> Array:
+def weights_of(covariance: Array) -> Array:
     """(..., n, n) products of the inverse standard deviations."""
     inverse = inverse_std(covariance)
     return np.asarray(inverse[..., :, None] * inverse[..., None, :])

@@ -13,7 +13,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import with_unit
-from beliefscope.datasets.text import percent, plural
+from beliefscope.datasets.text import capitalised, percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
@@ -110,7 +110,7 @@ class ErrorSlices(Diagnostic):
         """``Position error is 2.3 times as large (1.8 to 2.9) where friction > 2.1: 14 of 60 episodes, ...``"""
         interval = f" ({slice_.low:.2g} to {slice_.high:.2g})" if np.isfinite(slice_.low) else ""
         size = f"{len(slice_.episodes)} of {self.episodes} episodes, {percent(slice_.share)} of steps"
-        title = self.title[0].upper() + self.title[1:]
+        title = capitalised(self.title)
         return f"{title} is {slice_.ratio:.2g} times as large{interval} where {slice_.where}: {size}."
 
     def to_dict(self) -> dict[str, Any]:

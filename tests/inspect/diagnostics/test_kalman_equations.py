@@ -237,3 +237,21 @@ def test_covariances_that_are_too_small_are_named() -> None:
         "S of radar is smaller than H P Hᵀ, as if R were negative",
     )
     assert equations(Hidden()).alarms[0].startswith("the Jacobian of radar differs from finite differences by 90 %")
+
+
+class Silent(Boat):
+    """Reports no innovations."""
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        values = super().__call__(observations=observations, controls=controls)
+        return {name: value for name, value in values.items() if not name.startswith("innovation")}
+
+
+def test_predictions_alone_are_checked_without_innovations() -> None:
+    result = equations(Silent(heading_jacobian=0.0))
+    assert (result.modalities, result.measurement.size, result.covariance.size) == ((), 0, 0)
+    assert result.alarms[0].startswith("the Jacobian of the dynamics differs from finite differences by ")
+    assert [table.title for table in result.tables()] == [
+        "Jacobians against finite differences",
+        "Noise that the covariances contain",
+    ]
