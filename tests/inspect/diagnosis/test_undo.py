@@ -93,11 +93,11 @@ def inverted(filter_: Any) -> None:
     ("name", "change", "action"),
     [
         ("crossmodal-ekf", biased, "shift image"),
-        ("crossmodal-ekf", overconfident, "rescale image"),
+        pytest.param("crossmodal-ekf", overconfident, "rescale image", marks=pytest.mark.long),
         ("crossmodal-ekf", noisy, "rescale process noise"),
         pytest.param("crossmodal-pf", noisy, "rescale process noise", marks=pytest.mark.long),
         ("crossmodal-ekf", inverted, "invert beta"),
-        ("crossmodal-pf", inverted, "invert beta"),
+        pytest.param("crossmodal-pf", inverted, "invert beta", marks=pytest.mark.long),
     ],
 )
 def test_the_replay_without_a_fault_of_the_model_is_the_original_run(
