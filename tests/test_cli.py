@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 
 from beliefscope.app.cli.main import COMMANDS, cli, command_group, main
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.conclusion import command_line
 
 pytestmark = pytest.mark.slow
 
@@ -68,8 +70,8 @@ def examples() -> list[str]:
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         if page.is_file():
             text += "\n" + "\n".join(re.findall(r"```(?:sh|bash)?\n(.*?)```", page.read_text(), re.DOTALL))
-    actions = "\n".join(cause.next.format(task="door", filter="crossmodal-ekf") for cause in CAUSES)
-    text += "\n" + "\n".join(re.findall("`(.*?)`", actions))
+    checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
+    text += "".join(f"\n{command_line(cause.command, checkpoint)}" for cause in CAUSES if cause.command is not None)
     return list(dict.fromkeys(re.findall(r"^ *(beliefscope (?:-|[a-z]+).*?)(?:   .*| +#.*)?$", text, re.MULTILINE)))
 
 

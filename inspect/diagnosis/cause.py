@@ -52,6 +52,19 @@ def _regex(patterns: str) -> re.Pattern[str]:
 
 
 @dataclass(frozen=True)
+class Command:
+    """A command that does the next action of a cause; its task, filter and data are added.
+
+    Attributes:
+        name: such as ``finetune``. options: its other options. train: preset of the modules that it trains.
+    """
+
+    name: str
+    options: str = ""
+    train: str = ""
+
+
+@dataclass(frozen=True)
 class Cause:
     """A cause of faults and its signature.
 
@@ -63,8 +76,10 @@ class Cause:
         lowers: patterns of statistics that it may decrease, but not increase.
         undo: names of interventions that undo it (``inspect/diagnosis/undo.py``), joined by ``|``: the first one
             that is possible does; empty if there is none.
-        next: next action; may have the placeholders ``{task}`` and ``{filter}``.
+        next: next action; without its full stop if a command follows.
         prior: added to the score; negative for a cause that would explain almost everything.
+        command: does the next action.
+        by_hand: next action for external filters that the command cannot change, such as those without parameters.
     """
 
     name: str
@@ -75,6 +90,8 @@ class Cause:
     undo: str = ""
     lowers: str = ""
     prior: float = 0.0
+    command: Command | None = None
+    by_hand: str = ""
 
     @property
     def component(self) -> str:

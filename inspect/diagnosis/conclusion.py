@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -21,13 +20,13 @@ from beliefscope.inspect.diagnosis.cause import (
     SHOWN,
     Candidate,
     Cause,
+    Command,
     Diagnosis,
     Evidence,
     index_ranges,
     matches,
     probability_text,
 )
-from beliefscope.inspect.diagnosis.causes.external_filters import CHECKS
 from beliefscope.inspect.diagnosis.deviations import (
     ALARM_RATE,
     Case,
@@ -228,19 +227,28 @@ def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
     if is_unused(cause, checkpoint):
         sensor = display_name(cause.component)
         return f"This filter does not use the {sensor} sensor and is unaffected; repair the sensor for other filters."
-    if isinstance(checkpoint, ExternalFilter) and cause.name == "particles.few":
-        return "Use more particles in the filter's own code."
-    text = cause.next.format(task=checkpoint.task.name, filter=_argument(checkpoint))
-    if "--data" not in text:
-        text = text.replace(" -o tuned", f"{_data(checkpoint)} -o tuned")
-    if not isinstance(checkpoint, ExternalFilter):
-        return text
-    if not any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)()):
-        if cause.name in CHECKS:
-            return CHECKS[cause.name]
-        text = re.sub(r"(, or train with noisy images| and fine-tune): `.*`", "", text)
-        return re.sub(r"(Fine-tune|Calibrate) (it|them): `.*`", r"Correct \2 in the filter's own code", text)
-    return re.sub(r" --train [\w-]+", "", text)  # its loss selects what is trained
+    if cause.command is None:
+        return cause.next
+    if isinstance(checkpoint, ExternalFilter) and not (cause.command.name == "finetune" and _is_trainable(checkpoint)):
+        return cause.by_hand
+    return f"{cause.next}: `{command_line(cause.command, checkpoint)}`."
+
+
+def command_line(command: Command, checkpoint: Checkpoint) -> str:
+    """The command with its task, filter and data."""
+    words = [f"beliefscope {command.name} {checkpoint.task.name} --filter {_argument(checkpoint)}"]
+    if command.train and not isinstance(checkpoint, ExternalFilter):  # its loss selects what is trained
+        words.append(f"--train {command.train}")
+    words.append(command.options)
+    if "--data" not in command.options:
+        words.append(_data(checkpoint))
+    if command.name == "finetune":
+        words.append("-o tuned.safetensors")
+    return " ".join(filter(None, words))
+
+
+def _is_trainable(checkpoint: ExternalFilter) -> bool:
+    return any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)())
 
 
 def _argument(checkpoint: Checkpoint) -> str:
@@ -253,7 +261,7 @@ def _argument(checkpoint: Checkpoint) -> str:
 
 def _data(checkpoint: Checkpoint) -> str:
     """The option for the data in a command; empty for a task with a sample set, which is the default."""
-    return "" if checkpoint.task.name in TASKS else " --data DATA"
+    return "" if checkpoint.task.name in TASKS else "--data DATA"
 
 
 def is_unused(cause: Cause, checkpoint: Checkpoint) -> bool:
@@ -313,11 +321,8 @@ def search_action(checkpoint: Checkpoint, count: int, reports: bool = True) -> s
     start = f"{capitalised(CONVENTIONS)}, or search" if external else "Search"
     if external and not reports:
         start = f"Return its predictions and innovations, which show faults of its equations, {CONVENTIONS}, or search"
-    return (
-        f"{start} for data slices with "
-        "large errors, in the tab Failures or with "
-        f"`beliefscope slices {checkpoint.task.name} --filter {_argument(checkpoint)}{_data(checkpoint)}`."
-    )
+    command = command_line(Command("slices"), checkpoint)
+    return f"{start} for data slices with large errors, in the tab Failures or with `{command}`."
 
 
 def _lower(title: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.cause import Cause, Command, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import CONTACT_DISTANCE, DYNAMICS, FILTER, LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
 
@@ -57,8 +57,9 @@ CAUSES = (
         f"{OBJECT}|object match/*|contact distance/*|contact distance error/*|sharpness/*|occlusion/*|shift/*"
         "|brightness/*|offset/*"
         f"|{CONTACTS}|{LABELS}|{MODULES}",
-        "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "
-        "-o tuned.safetensors`.",
+        "Collect data of these conditions and fine-tune",
         prior=-0.4,
+        command=Command("finetune", "--data NEW.h5"),
+        by_hand="Collect data of these conditions.",
     ),
 )

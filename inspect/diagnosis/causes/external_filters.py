@@ -48,15 +48,6 @@ LARGE = Cause(
 )
 """The opposite of ``dynamics.frozen``, such as with a time step that is too long."""
 
-CHECKS = {
-    "dynamics.bias": "Check the inputs, frames and constants of the dynamics.",
-    "dynamics.frozen": LARGE.next,
-    "dynamics.broken": "Check the equations of the dynamics.",
-    "process_noise.small": "Compare Q with the errors of the predictions.",
-    "process_noise.large": "Compare Q with the errors of the predictions.",
-}
-"""Cause -> next action for a filter without parameters, which cannot be fine-tuned."""
-
 
 def external_causes(task: Task) -> tuple[Cause, ...]:
     """Causes that show in the predictions and innovations of an external filter only."""

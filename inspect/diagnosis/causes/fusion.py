@@ -2,38 +2,52 @@
 
 from __future__ import annotations
 
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.cause import Cause, Command, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER, WEIGHTS
 
-RETRAIN = "Fine-tune them: `beliefscope finetune {task} --filter {filter} --train weights-only -o tuned.safetensors`."
+RETRAIN = Command("finetune", train="weights-only")
+CORRECT = "Correct them in the filter's own code."
 
 CAUSES = (
     Cause(
-        "weights.constant", "Fusion weights constant", (Symptom("beta spread/*", -1),), WEIGHTS, RETRAIN, "healthy beta"
+        "weights.constant",
+        "Fusion weights constant",
+        (Symptom("beta spread/*", -1),),
+        WEIGHTS,
+        "Fine-tune them",
+        "healthy beta",
+        command=RETRAIN,
+        by_hand=CORRECT,
     ),
     Cause(
         "weights.inverted",
         "Fusion weights inverted",
         (Symptom("beta logit/*|beta contact/*", target="mirrored"), Symptom("beta logit/*", 0)),
         WEIGHTS,
-        RETRAIN,
+        "Fine-tune them",
         "invert beta",
+        command=RETRAIN,
+        by_hand=CORRECT,
     ),
     Cause(
         "weights.ignores_image",
         "Fusion weights ignore the image",
         (Symptom("beta logit/image*", -1), Symptom("beta logit/*", target="shifted")),
         f"beta spread/*|{FILTER}",
-        RETRAIN,
+        "Fine-tune them",
         "healthy beta",
+        command=RETRAIN,
+        by_hand=CORRECT,
     ),
     Cause(
         "weights.ignores_haptics",
         "Fusion weights ignore haptics",
         (Symptom("beta logit/image*", 1), Symptom("beta logit/*", target="shifted")),
         f"beta spread/*|{FILTER}",
-        RETRAIN,
+        "Fine-tune them",
         "healthy beta",
+        command=RETRAIN,
+        by_hand=CORRECT,
     ),
     Cause(
         "weights.ignores_likelihood",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.cause import Cause, Command, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
 
 HAND = "hand offset/image*"
@@ -59,9 +59,10 @@ CAUSES = (
         "Image noisy",
         (Symptom("noise/image/*"),),
         f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{LANDMARKS}|{IMAGE}",
-        "Reduce the camera's gain, or train with noisy images: `beliefscope finetune {task} --filter {filter} "
-        "--faults image_noise=40 -o tuned.safetensors`.",
+        "Reduce the camera's gain, or train with noisy images",
         "drop image",
+        command=Command("finetune", "--faults image_noise=40"),
+        by_hand="Reduce the camera's gain.",
     ),
     Cause(
         "image.blur",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.cause import Cause, Command, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER, LABELS
 
 
@@ -14,17 +14,18 @@ def causes_of(modality: str, title: str, check: str = "", belief: str = FILTER) 
     """
     name = f"model.{modality}"
     module = f"*{modality}*"
-    finetune = "`beliefscope finetune {task} --filter {filter} --train"
-    retrain = f"{check}Fine-tune it: {finetune} {modality}-only -o tuned.safetensors`."
-    calibrate = f"{check}Calibrate it: {finetune} noise-only -o tuned.safetensors`."
+    retrain, calibrate = Command("finetune", train=f"{modality}-only"), Command("finetune", train="noise-only")
+    by_hand = f"{check}Correct it in the filter's own code."
     return (
         Cause(
             f"{name}.bias",
             f"{title} biased",
             (Symptom(f"module bias/{module}", 0), Symptom("module bias/*", 0, 0.3, "alone")),
             "|".join(f"module {kind}/{module}" for kind in ("error", "nis")) + f"|{LABELS}|{belief}",
-            retrain,
+            f"{check}Fine-tune it",
             f"shift {modality}",
+            command=retrain,
+            by_hand=by_hand,
             lowers=f"module spread/{module}|module scatter/{module}",
         ),
         Cause(
@@ -32,16 +33,20 @@ def causes_of(modality: str, title: str, check: str = "", belief: str = FILTER) 
             f"{title} overconfident",
             (Symptom(f"module power/{module}", 1),),
             f"module std/{module}|module nis/{module}|{LABELS}|{belief}",
-            calibrate,
+            f"{check}Calibrate it",
             f"rescale {modality}",
+            command=calibrate,
+            by_hand=by_hand,
         ),
         Cause(
             f"{name}.underconfident",
             f"{title} underconfident",
             (Symptom(f"module power/{module}", -1),),
             f"module std/{module}|module nis/{module}|{LABELS}|{belief}",
-            calibrate,
+            f"{check}Calibrate it",
             f"rescale {modality}",
+            command=calibrate,
+            by_hand=by_hand,
         ),
         Cause(
             f"{name}.broken",
@@ -51,8 +56,10 @@ def causes_of(modality: str, title: str, check: str = "", belief: str = FILTER) 
                 Symptom(f"module power/{module}", 0, 0.5),
             ),
             f"module */{module}|{LABELS}|{belief}",
-            retrain,
+            f"{check}Fine-tune it",
             f"restore {modality}",
+            command=retrain,
+            by_hand=by_hand,
         ),
     )
 

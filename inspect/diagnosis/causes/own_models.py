@@ -125,8 +125,10 @@ def _weights(task: Task) -> tuple[Cause, ...]:
                 Symptom("beta logit/*", target="shifted"),
             ),
             f"beta spread/*|{FILTER}",
-            fusion.RETRAIN,
+            "Fine-tune them",
             "healthy beta",
+            command=fusion.RETRAIN,
+            by_hand=fusion.CORRECT,
         )
         for name, other in zip(task.modalities, reversed([*task.modalities]), strict=True)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.cause import Cause, Command, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER
 
 CAUSES = (
@@ -11,8 +11,10 @@ CAUSES = (
         "Too few particles",
         (Symptom("particles/*", -1),),
         FILTER,
-        "Use more particles: `beliefscope evaluate {task} --filter {filter} --particles 1000`.",
+        "Use more particles",
         "healthy particles",
+        command=Command("evaluate", "--particles 1000"),
+        by_hand="Use more particles in the filter's own code.",
     ),
     Cause(
         "particles.deprived",

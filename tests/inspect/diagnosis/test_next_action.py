@@ -49,3 +49,9 @@ def test_of_a_filter_without_parameters() -> None:
     assert actions["model.touch.bias"].endswith("same symptoms. Correct it in the filter's own code.")
     assert actions["data.shift"] == "Collect data of these conditions."
     assert not [action for action in actions.values() if "finetune" in action or "`" in action]
+
+
+def test_a_command_follows_its_action_or_another_one_is_given() -> None:
+    for cause in causes_of(TASK):
+        assert cause.next.endswith(".") == (cause.command is None), cause.name
+        assert cause.by_hand.endswith(".") == (cause.command is not None), cause.name
