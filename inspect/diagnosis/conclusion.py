@@ -15,6 +15,14 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.filters.subsets import modalities_of
+from beliefscope.inspect.diagnosis.case import (
+    ALARM_RATE,
+    Case,
+    affected_episodes,
+    affected_steps,
+    checked_alarm_rate,
+    symptoms_of,
+)
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import (
     SHOWN,
@@ -26,14 +34,6 @@ from beliefscope.inspect.diagnosis.cause import (
     index_ranges,
     matches,
     probability_text,
-)
-from beliefscope.inspect.diagnosis.deviations import (
-    ALARM_RATE,
-    Case,
-    affected_episodes,
-    affected_steps,
-    checked_alarm_rate,
-    symptoms_of,
 )
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise

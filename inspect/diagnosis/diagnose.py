@@ -16,10 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnosis.catalog import causes_in
-from beliefscope.inspect.diagnosis.cause import Diagnosis
-from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.deviations import (
+from beliefscope.inspect.diagnosis.case import (
     Case,
     affected_episodes,
     affected_steps,
@@ -31,6 +28,9 @@ from beliefscope.inspect.diagnosis.deviations import (
     observe,
     symptoms_of,
 )
+from beliefscope.inspect.diagnosis.catalog import causes_in
+from beliefscope.inspect.diagnosis.cause import Diagnosis
+from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities

@@ -128,7 +128,7 @@ def _profile(
     ``diagnosed``: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
-    from beliefscope.inspect.diagnosis.deviations import checked_alarm_rate
+    from beliefscope.inspect.diagnosis.case import checked_alarm_rate
     from beliefscope.inspect.diagnosis.diagnose import required_profile
     from beliefscope.inspect.healthy import overlap_warning, profile_of, sensor_record
 

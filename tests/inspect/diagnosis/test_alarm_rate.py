@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beliefscope.app.cli.commands.diagnose import diagnose as command
-from beliefscope.inspect.diagnosis.deviations import ALARM_RATE, checked_alarm_rate
+from beliefscope.inspect.diagnosis.case import ALARM_RATE, checked_alarm_rate
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnostics.healthy_comparison import compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile

@@ -22,9 +22,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.open_filter import open_filter
-from beliefscope.inspect.diagnosis.cause import SHOWN
-from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.deviations import (
+from beliefscope.inspect.diagnosis.case import (
     Case,
     affected_episodes,
     checked_alarm_rate,
@@ -33,6 +31,8 @@ from beliefscope.inspect.diagnosis.deviations import (
     focus,
     observe,
 )
+from beliefscope.inspect.diagnosis.cause import SHOWN
+from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
