@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +15,11 @@ from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.simulation.camera import Camera
+from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.text import capitalised
+
+UNITS = {"force": "N", "torque": "N m", "effector_position": "m"}
+"""Observation key -> unit of its channels, for sensors that several tasks have."""
 
 DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 """SI unit -> unit for display, and the factor."""
@@ -53,7 +58,7 @@ def axis_name(key: str, i: int, count: int) -> str:
 
 @dataclass(frozen=True)
 class Component:
-    """A state component.
+    """A state component, or a channel of a sensor.
 
     Attributes:
         unit: of its values: ``rad`` for an angle, ``m``, or any other text, such as ``m/s``.
@@ -162,22 +167,9 @@ class Ingredient:
     units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
 
-@dataclass(frozen=True)
-class Outline:
-    """Outline of the object at true or estimated states, for drawing.
-
-    Attributes:
-        position: (..., 3) m, world: centre of the object. wxyz: (..., 4) orientation, quaternion.
-        size: (3,) m, along the object's axes.
-        anchor: (..., 3) m, world: visible point whose x and y are the map components (the hinge).
-        shape: a cylinder's axis is z and its first two sizes are the diameter.
-    """
-
-    position: Array
-    wxyz: Array
-    size: tuple[float, float, float]
-    anchor: Array
-    shape: Literal["box", "cylinder"] = "box"
+def _in_metres(components: Iterable[Component]) -> tuple[Component, ...]:
+    """Lengths in m, which are displayed in m unless they have a unit for display."""
+    return tuple(replace(c, display=c.display or ("m", 1.0)) if c.unit == "m" else c for c in components)
 
 
 @dataclass(frozen=True)
@@ -216,6 +208,8 @@ class Task:
             beams are equally spaced, from x towards y of the sensor's frame.
         clouds: observation keys of point clouds (P, 2) or (P, 3), in m, which may have more columns. Points at zero are
             absent, as are ranges of scans that are not above 0.
+        channels: observation key of a vector (d,) or ``control`` -> names and units of its d channels, such as
+            ``(Component("range", "m"), Component("bearing", "rad"))``. Default: x, y and z, or numbers, without a unit.
         periods: observation key -> s between the readings of a sensor that is slower than the steps and repeats its
             last reading, so that these repetitions are no fault.
         masks: observation key -> boolean covariate that is 1 at the steps with a reading, of a sensor whose readings
@@ -246,10 +240,11 @@ class Task:
     masks: Mapping[str, str] = field(default_factory=dict)
     scans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     clouds: tuple[str, ...] = ()
+    channels: Mapping[str, tuple[Component, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Fill in the default map, and the unit for display of lengths in a large space."""
-        if wrong := [part for part in self.components if not isinstance(part, Component)]:
+        if wrong := [c for c in chain(self.components, *self.channels.values()) if not isinstance(c, Component)]:
             raise BadInput(f'task {self.name!r:.200}: component {wrong[0]!r:.200}, expected Component("x", "m").')
         if not self.map_components:
             first = self.components[:2]
@@ -261,8 +256,8 @@ class Task:
         if self.map_half_width >= LARGE and any(
             c.unit == "m" and c.name in self.map_components for c in self.components
         ):
-            in_metres = (replace(c, display=c.display or ("m", 1.0)) if c.unit == "m" else c for c in self.components)
-            object.__setattr__(self, "components", tuple(in_metres))
+            object.__setattr__(self, "components", _in_metres(self.components))
+            object.__setattr__(self, "channels", {key: _in_metres(each) for key, each in self.channels.items()})
 
     def __hash__(self) -> int:
         return hash(self.name)
@@ -275,6 +270,19 @@ class Task:
         """Type of an observation's values: uint8 for images, else float32."""
         is_array = len(self.observations[key]) == 1 or key in (*self.arrays, *self.clouds)
         return np.float32 if is_array else np.uint8
+
+    def channel(self, key: str, i: int) -> Component:
+        """Channel i of a vector observation or the controls, with its unit; its name starts with the key."""
+        size = self.control_size if key == "control" else self.observations[key][0]
+        if key not in self.channels:
+            return Component(axis_name(key, i, size), UNITS.get(key, ""))
+        channel = self.channels[key][i]
+        return replace(channel, name=key if size == 1 else f"{key} {channel.name}")
+
+    def vector_channels(self) -> list[Component]:
+        """All channels of vector observations."""
+        sizes = {key: shape[0] for key, shape in self.observations.items() if len(shape) == 1}
+        return [self.channel(key, i) for key, size in sizes.items() for i in range(size)]
 
     @property
     def images(self) -> tuple[str, ...]:

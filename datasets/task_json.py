@@ -56,6 +56,7 @@ def task_from_json(values: Any) -> Task:
             masks=dict(values.get("masks", {})),
             scans=_tuples(values.get("scans", {})),
             clouds=tuple(values.get("clouds", ())),
+            channels={key: tuple(map(_component, each)) for key, each in values.get("channels", {}).items()},
             **_covariates(values),
         )
         if not values["map_components"]:  # ``Task`` has chosen them; a stored definition names them
@@ -141,16 +142,8 @@ def check_definition(task: Task, where: str = "") -> None:
     if not names or len(set(map(repr, names))) < len(names):
         raise BadInput(f"{place} has the components {names!r:.200}, expected one or more with different names.")
     for component in task.components:
-        about = f"{place}: component {component.name!r:.200}"
-        if not isinstance(component.name, str) or component.static not in (0, 1):
-            raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
-        if not isinstance(component.unit, str) or len(component.unit) > 40:
-            raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
-        if component.wraps not in (0, 1) or (component.wraps and (component.unit != "rad" or component.rotation)):
-            raise BadInput(f"{about} has wraps {component.wraps!r:.200}, expected true for an angle in rad only.")
-        unit, factor = component.conversion
-        if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
-            raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")
+        _check_component(component, f"{place}: component {component.name!r:.200}")
+    _check_channels(task, place)
     for name in dict.fromkeys(component.rotation for component in task.components):
         parts = [i for i, component in enumerate(task.components) if name and component.rotation == name]
         alike = {task.components[i].unit for i in parts} == {"rad"} and [*np.diff(parts)] == [1, 1]
@@ -196,6 +189,34 @@ def check_definition(task: Task, where: str = "") -> None:
     for unit, ends in task.start_distance.items():
         if unit not in {c.unit for c in task.components} or len(ends) != 2 or not all(_number(end) for end in ends):
             raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
+
+
+def _check_component(component: Component, about: str) -> None:
+    """about: start of the message."""
+    if not isinstance(component.name, str) or component.static not in (0, 1):
+        raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
+    if not isinstance(component.unit, str) or len(component.unit) > 40:
+        raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
+    if component.wraps not in (0, 1) or (component.wraps and (component.unit != "rad" or component.rotation)):
+        raise BadInput(f"{about} has wraps {component.wraps!r:.200}, expected true for an angle in rad only.")
+    unit, factor = component.conversion
+    if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
+        raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")
+
+
+def _check_channels(task: Task, place: str) -> None:
+    """Names and units of the channels of vectors and controls."""
+    for key, channels in task.channels.items():
+        shape = (task.control_size,) if key == "control" else task.observations.get(key, ())
+        if len(shape) != 1 or len(channels) != shape[0]:
+            expected = f"{shape[0]} names" if len(shape) == 1 else "an observation (d,) or control"
+            raise BadInput(f"{place}: channels of {key!r:.200} are {len(channels)}, expected {expected}.")
+        for channel in channels:
+            _check_component(channel, f"{place}: channel {channel.name!r:.200} of {key!r:.200}")
+            if "/" in channel.name:
+                raise BadInput(f"{place}: channel {channel.name!r:.200} of {key!r:.200} has a slash in its name.")
+        if len({channel.name for channel in channels}) < len(channels):
+            raise BadInput(f"{place}: channels of {key!r:.200} have equal names.")
 
 
 def _check_points(task: Task, place: str) -> None:

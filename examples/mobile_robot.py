@@ -20,6 +20,10 @@ TASK = bs.Task(
     control_size=2,
     dt=DT,
     map_half_width=0.5,
+    channels={
+        "compass": (bs.Component("cosine", ""), bs.Component("sine", "")),
+        "control": (bs.Component("speed", "m/s"), bs.Component("turn_rate", "rad/s")),
+    },
 )
 
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import Task, axis_name, display_name
+from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Statistics
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
@@ -81,14 +81,11 @@ class Finding:
 def channels(task: Task) -> list[Channel]:
     """All vector channels, in the order of ``_values``."""
     result = [Channel("state", "state", c.label, c.unit) for c in task.components]
-    result += [
-        Channel("control", "control", axis_name("control", i, task.control_size)) for i in range(task.control_size)
-    ]
+    result += [Channel("control", "control", task.channel("control", i).label) for i in range(task.control_size)]
     for modality, keys in task.modalities.items():
         for key in keys:
             size, *others = task.observations[key]
-            names = [] if others else [axis_name(display_name(key), i, size) for i in range(size)]
-            result += [Channel(modality, key, name) for name in names]
+            result += [Channel(modality, key, task.channel(key, i).label) for i in range(0 if others else size)]
     return result
 
 

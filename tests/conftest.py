@@ -56,7 +56,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Excludes the imported modules and the collected tests from garbage collections: 7 % of the CPU time."""
-    gc.collect()
     gc.freeze()
 
 

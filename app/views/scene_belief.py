@@ -19,8 +19,9 @@ from beliefscope.app.views.scene_context import (
     RobotScene,
     add_grid,
 )
+from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.replay import replay
-from beliefscope.datasets.task import Outline, Task
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.scene_belief import DISC_SPACING, DrawnBelief, rgb
 from beliefscope.inspect.figures.scene_shapes import DISC, FAN, OUTLINE_EDGES, RGB, UP, Array, dashed
 from beliefscope.inspect.maps.map_engine import LikelihoodMap

@@ -16,7 +16,8 @@ from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
 from beliefscope.datasets.simulation.ingredients import SENSOR_INGREDIENTS, camera_pose, start_ingredient
-from beliefscope.datasets.task import Component, Outline, Task
+from beliefscope.datasets.simulation.outline import Outline
+from beliefscope.datasets.task import Component, Task
 
 Array = NDArray[np.float64]
 

@@ -24,11 +24,12 @@ from beliefscope.datasets.simulation.door_physics import (
     DoorPhysics,
 )
 from beliefscope.datasets.simulation.door_policies import POLICIES
+from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, Sleeve, add_panda, new_spec
 from beliefscope.datasets.simulation.panda_visual import add_appearance
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, first_free_start, quantise, simulate
-from beliefscope.datasets.task import Array, Component, Outline, Task
+from beliefscope.datasets.task import Array, Component, Task
 
 PANEL_SIZE = (0.04, PANEL_WIDTH, 0.86)  # thickness, width, height; m
 PANEL_BOTTOM = 0.02  # m above the floor

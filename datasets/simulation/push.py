@@ -17,6 +17,7 @@ from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.controller import DOWN, Impedance, add_controller
+from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.panda import ROBOT_BIT, WORLD_BIT, Sleeve, add_panda, new_spec
 from beliefscope.datasets.simulation.panda_visual import add_appearance
 from beliefscope.datasets.simulation.sensors import add_touch
@@ -33,7 +34,7 @@ from beliefscope.datasets.simulation.simulate import (
     random_wait,
     simulate,
 )
-from beliefscope.datasets.task import Component, Outline, Task
+from beliefscope.datasets.task import Component, Task
 
 Vector = NDArray[np.float64]
 Size = tuple[float, float, float]

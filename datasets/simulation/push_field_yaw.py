@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.ingredients import draw, start_ingredient
+from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.push import HEIGHT, BlockPhysics, push_model
 from beliefscope.datasets.simulation.push_field import (
     PUCK,
@@ -22,7 +23,7 @@ from beliefscope.datasets.simulation.push_field import (
     simulate_draws,
 )
 from beliefscope.datasets.simulation.simulate import first_free_start
-from beliefscope.datasets.task import Component, Ingredient, Outline
+from beliefscope.datasets.task import Component, Ingredient
 
 BLOCK = BlockPhysics()
 QUATERNION = slice(PUCK.stop + 1, PUCK.stop + 5)

@@ -41,7 +41,7 @@ from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
-from beliefscope.inspect.diagnostics.statistic_kinds import is_contact_known, label_of
+from beliefscope.inspect.diagnostics.statistic_kinds import label_of
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -150,7 +150,7 @@ def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
     sensors = [display_name(key) for key in case.inputs.checkpoint.task.observations if key not in numbers]
     of_sensors, compared = _of_sensors(case), case.by_statistic
     absent = [
-        label_of(name, is_contact_known(case.inputs.checkpoint.task))
+        label_of(name, case.inputs.checkpoint.task)
         for name, values in case.profile.statistics.items()
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]

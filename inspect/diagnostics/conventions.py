@@ -156,26 +156,35 @@ def changes_of(task: Task, modalities: Sequence[str], episode: Episode) -> tuple
         for key in task.modalities[modality]:
             readings = episode.observations.get(key)
             if readings is not None and key not in task.images and not np.isin(readings, (0, 1)).all():  # no flags
-                result += _of_sensor(key, modality, readings[0].size)
+                result += _of_sensor(task, key, modality, readings[0].size)
         text = f"{display_name(modality)} delayed by {DELAY} steps"
         result.append(Change(text, f"delay={modality}:steps={DELAY}", modality))
     channels = episode.controls.shape[-1]
     if channels > 1 and not has_position(channels):
         for i in range(min(channels, MAX_AXES)):
-            result.append(Change(f"the opposite sign of channel {i} of the controls", f"control_scale=-1:channel={i}"))
+            (name,) = _channel_names(task, "control", (i,))
+            text = f"the opposite sign of {name} of the controls"
+            result.append(Change(text, f"control_scale=-1:channel={i}"))
     if channels:
         result.append(Change(f"controls delayed by {DELAY} steps", f"control_delay={DELAY}"))
         result += [Change(f"controls times {f:g}", f"control_scale={f:g}") for f in (-1.0, *SCALES)]
     return tuple(change for change in result if apply_to(change.faults, task))
 
 
-def _of_sensor(key: str, modality: str, channels: int) -> list[Change]:
+def _channel_names(task: Task, key: str, indices: Sequence[int]) -> list[str]:
+    """Names of channels within a sentence; without own ones, ``channel 0``, or ``channels 0`` and ``1``."""
+    if key in task.channels:
+        return [display_name(task.channels[key][i].name) for i in indices]
+    return [f"channel{'s' * (len(indices) > 1)} {indices[0]}", *map(str, indices[1:])]
+
+
+def _of_sensor(task: Task, key: str, modality: str, channels: int) -> list[Change]:
     """Changes of a vector sensor."""
     name = display_name(key)
     result = [Change(f"the opposite sign of {name}", f"sensor_gain={key}:factor=-1", modality)]
     result += [Change(f"{name} times {f:g}", f"sensor_gain={key}:factor={f:g}", modality) for f in SCALES]
     for i, j in combinations(range(min(channels, MAX_AXES)), 2):
-        text = f"channels {i} and {j} of {name} exchanged"
+        text = f"{' and '.join(_channel_names(task, key, (i, j)))} of {name} exchanged"
         result.append(Change(text, f"sensor_swapped={key}:first={i}:second={j}", modality))
     return result
 

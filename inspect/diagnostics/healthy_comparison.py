@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -24,7 +24,6 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
     LEVER,
     LOST,
     RISING,
-    is_contact_known,
     label_of,
     unit_of,
 )
@@ -81,8 +80,7 @@ class Deviation:
         p_value: probability of a deviation of this size in any statistic, if the episodes are healthy.
         alarm: whether it is significant and at least ``MIN_EFFECT``.
         t: difference of the means over its standard error; of ``with_critical_values``, relative to its critical value.
-        unit, factor: for display, and the factor from the unit of the values.
-        has_contact: whether contact is measured or labelled in the task.
+        task: gives the unit and the names for display; without one, there is no unit.
     """
 
     statistic: str
@@ -93,14 +91,17 @@ class Deviation:
     p_value: float
     alarm: bool
     t: float
-    unit: str = ""
-    factor: float = 1.0
-    has_contact: bool = True
+    task: Task | None = field(default=None, repr=False)
 
     @property
     def label(self) -> str:
         """Display name of the statistic."""
-        return label_of(self.statistic, self.has_contact)
+        return label_of(self.statistic, self.task)
+
+    @property
+    def conversion(self) -> tuple[str, float]:
+        """Unit for display, and the factor from the unit of the values."""
+        return ("", 1.0) if self.task is None else unit_of(self.statistic, self.task)
 
     @property
     def text(self) -> str:
@@ -108,17 +109,13 @@ class Deviation:
 
         The healthy mean is within the range, from which a few values may move it.
         """
-        width = abs(self.factor * (self.high - self.low))
+        unit, factor = self.conversion
+        width = abs(factor * (self.high - self.low))
         digits = 1 - math.floor(math.log10(width)) if 0.0 < width < math.inf else 12
         mean = min(max(self.healthy, self.low), self.high)
-        numbers = (round(self.factor * x, digits) + 0.0 for x in (self.value, mean, self.low, self.high))
+        numbers = (round(factor * x, digits) + 0.0 for x in (self.value, mean, self.low, self.high))
         value, healthy, low, high = map(_number, numbers)
-        return f"{self.label} is {self._amount(value)}, healthy {self._amount(healthy)} ({low} to {high})"
-
-    def _amount(self, number: str) -> str:
-        """The number with its unit: ``1 step``, ``3 steps``."""
-        unit = self.unit.removesuffix("s") if number in ("1", "-1") and self.unit in COUNTED else self.unit
-        return f"{number} {unit}".rstrip()
+        return f"{self.label} is {_amount(value, unit)}, healthy {_amount(healthy, unit)} ({low} to {high})"
 
 
 @dataclass(frozen=True)
@@ -166,8 +163,8 @@ class Comparison:
         columns = ("statistic", "value", "healthy", "95 % range from", "to", "p-value", verdict)
         rows = tuple(
             (
-                with_unit(d.label, d.unit),
-                *(d.factor * value for value in (d.value, d.healthy, d.low, d.high)),
+                with_unit(d.label, d.conversion[0]),
+                *(d.conversion[1] * value for value in (d.value, d.healthy, d.low, d.high)),
                 d.p_value,
                 "yes" if d.alarm else "",
             )
@@ -185,7 +182,7 @@ def compare(
     t-value, the difference of the means over its standard error, with the spread of the others. ``p_value`` is the
     share of divisions whose largest absolute t is at least that of the statistic.
 
-    task: gives the units of the deviations.
+    task: gives the units and names of the deviations.
     """
     names = [name for name in profile.statistics if any(name in values for values in trajectories)]
     count = len(trajectories)
@@ -210,9 +207,8 @@ def compare(
     low, high = _ranges(values[count:], count, seed)
     mean, healthy = np.nanmean(values[:count], axis=0), np.nanmean(values[count:], axis=0)
     columns = [column.tolist() for column in (mean, healthy, low, high, p_value, alarm, t[0])]
-    rows: Iterable[tuple[Any, ...]] = zip(names, *columns, strict=True)
-    of_task = [(*unit_of(name, task), is_contact_known(task)) if task else () for name in names]
-    deviations = [Deviation(*row, *more) for row, more in zip(rows, of_task, strict=True)]
+    rows: Iterable[tuple[Any, ...]] = zip(names, *columns, [task] * len(names), strict=True)
+    deviations = [Deviation(*row) for row in rows]
     order = np.argsort(-np.abs(t[0]), kind="stable")
     relative = (np.abs(t) / _own_scale(t[1:], t, count == 1)).max(1)
     extreme = int((relative[1:] * (1.0 + 1e-9) >= relative[0]).sum())
@@ -322,6 +318,11 @@ def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
 
 def _number(value: float) -> str:
     return f"{value:.0f}" if 10 <= abs(value) < LARGE else f"{value:.2g}"
+
+
+def _amount(number: str, unit: str) -> str:
+    """A number with its unit: ``1 step``, ``3 steps``."""
+    return f"{number} {unit.removesuffix('s') if number in ('1', '-1') and unit in COUNTED else unit}".rstrip()
 
 
 def no_diagnosis(checkpoint: Checkpoint) -> str | None:

@@ -136,7 +136,7 @@ class KalmanEquations(Diagnostic):
         return f"Jacobians and updates agree with finite differences of the filter's own functions (error {largest})."
 
     def tables(self) -> list[Table]:
-        components = self.task.components
+        components, units = self.task.components, {c.name: c.conversion for c in self.task.vector_channels()}
         rows = [
             ("dynamics", None, *map(_percent, self.dynamics), None, None),
             *(
@@ -160,14 +160,14 @@ class KalmanEquations(Diagnostic):
             for name, covariance, correction in zip(self.modalities, self.covariance, self.correction, strict=True)
         )
         noise = [
-            (f"process, {display_name(c.name)}", c.conversion[1] * value, c.conversion[0])
+            (f"process, {display_name(c.name)}", value, c.conversion)
             for c, value in zip(components, self.process_noise, strict=True)
         ] + [
-            (channel if channel.startswith(name) else f"{name}, {channel}", value, "")
+            (channel if channel.startswith(name) else f"{name}, {channel}", value, units.get(channel, ("", 1.0)))
             for name, channels, values in zip(self.modalities, self.channels, self.measurement_noise, strict=True)
             for channel, value in zip(channels, values, strict=True)
         ]
-        known = tuple((name, float(value), unit) for name, value, unit in noise if not np.isnan(value))
+        known = tuple((name, float(factor * value), unit) for name, value, (unit, factor) in noise if value == value)
         tables = [Table("Jacobians against finite differences", heads, tuple(rows), note)]
         if self.modalities:
             heads = ("steps with", "covariance error, %", "mean error, %")

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from beliefscope.datasets.errors import check_name
-from beliefscope.datasets.task import Task, axis_name
+from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.models.common_random_numbers import Common
@@ -20,9 +20,6 @@ from beliefscope.filters.models.sequence import SequenceModel
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.traces.replay import Intervention, Replay, repeat_belief
-
-CHANNEL_UNITS = {"effector_position": ("cm", 100.0), "force": ("N", 1.0), "torque": ("N m", 1.0)}
-"""Observation key -> display unit of its channels and the conversion factor."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +38,9 @@ def channel_names(task: Task, modalities: Iterable[str]) -> dict[str, tuple[Chan
         keys = {key: task.observations[key] for key in task.modalities[modality]}
         if all(len(shape) == 1 for shape in keys.values()):
             channels[modality] = tuple(
-                Channel(axis_name(key, i, size), *CHANNEL_UNITS.get(key, ("", 1.0)))
+                Channel(channel.name, *channel.conversion)
                 for key, (size,) in keys.items()
-                for i in range(size)
+                for channel in (task.channel(key, i) for i in range(size))
             )
     return channels
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beliefscope.datasets.task import Task, display_name, display_unit
+from beliefscope.datasets.task import Component, Task, axis_name, display_name, display_unit
 
 KINDS = {
     "nees": ("NEES/n", True, 0.05),
@@ -106,9 +106,6 @@ KINDS = {
 standard deviation between episodes, below which differences are irrelevant. A name may have a place ``{of}`` for
 the statistic's subject, or ``{axis}`` for its axis only, if they are not at its end."""
 
-UNITS = {"force": "N", "torque": "N m", "image": "gray levels"}
-"""Units of the readings of sensors that all simulated tasks have."""
-
 OF_READINGS = {"level": "", "drift": "/s", "change": "", "noise": "", "size": ""}
 """Kinds of statistics in the unit of the readings -> what follows it."""
 
@@ -177,13 +174,13 @@ def is_contact_known(task: Task) -> bool:
     return "contact" in task.observations or "contact" in task.covariates
 
 
-def label_of(statistic: str, has_contact: bool = True) -> str:
-    """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``.
-
-    has_contact: of the task.
-    """
+def label_of(statistic: str, task: Task | None = None) -> str:
+    """Display name of a statistic, such as ``effective weight of image (hinge x) in contact``."""
     kind, subject, phase = statistic.split("/")
-    phase = phase if has_contact or phase not in ("contact", "free motion") else "all"
+    if task is not None:
+        phase = phase if is_contact_known(task) or phase not in ("contact", "free motion") else "all"
+        if channel := channel_of(subject, task):
+            subject = subject.removesuffix(channel[0]) + channel[1].name
     title = KINDS[kind][0] if kind in KINDS else kind
     name, _, axis = subject.partition(" ")
     if (kind, name) == ("lag", "labels"):
@@ -205,6 +202,19 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
     if kind in OF_COMPONENTS:
         name = subject.rpartition(" ")[2]
         return next((c.conversion for c in task.components if c.name == name), display_unit("m"))
-    if kind in OF_READINGS and (unit := UNITS.get(subject.partition(" ")[0])):
-        return f"{unit}{OF_READINGS[kind]}", 1.0
+    if kind in OF_READINGS:
+        channel = channel_of(subject, task)
+        unit, factor = channel[1].conversion if channel else ("gray levels" if subject == "image" else "", 1.0)
+        return f"{unit}{OF_READINGS[kind]}" if unit else "", factor
     return OF_KINDS.get(kind, ("", 1.0))
+
+
+def channel_of(subject: str, task: Task) -> tuple[str, Component] | None:
+    """Name (``axis_name``) and channel of a statistic's subject, which may start with the modality; None without."""
+    owners = {key: f"{modality} " for modality, keys in task.modalities.items() for key in keys}
+    for key, shape in {**task.observations, "control": (task.control_size,)}.items():
+        for i in range(shape[0] if len(shape) == 1 and key in subject else 0):
+            name = axis_name(key, i, shape[0])
+            if subject in (name, owners.get(key, "") + name):
+                return name, task.channel(key, i)
+    return None

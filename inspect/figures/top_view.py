@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
-from beliefscope.datasets.task import Outline, Task, display_name
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.palette import COLOURS, colour, colour_table

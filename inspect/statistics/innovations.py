@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.statistics.measures import Array, counted
@@ -173,7 +172,7 @@ def channel_names(trace: Trace, innovation: NDArray[Any]) -> list[list[str]]:
     for k, modality in enumerate(trace.modalities):
         used = np.flatnonzero(np.isfinite(innovation[:, k]).any(0)).max(initial=-1) + 1
         shapes = [(key, trace.task.observations[key]) for key in trace.task.modalities.get(modality, ())]
-        names = [axis_name(key, i, shape[0]) for key, shape in shapes if len(shape) == 1 for i in range(shape[0])]
+        names = [trace.task.channel(key, i).name for key, shape in shapes if len(shape) == 1 for i in range(shape[0])]
         names = names if len(names) == used else []
         result.append([*names, *(f"channel {i}" for i in range(len(names), innovation.shape[-1]))])
     return result

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.point_clouds import point_sensors, points_of
-from beliefscope.datasets.task import Component, Outline, Task, with_unit
+from beliefscope.datasets.simulation.outline import Outline
+from beliefscope.datasets.task import Component, Task, with_unit
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,44 @@ def test_channels_are_axes_up_to_three_and_numbers_from_0() -> None:
     assert [axis_name("gps", i, 2) for i in range(2)] == ["gps x", "gps y"]
     assert [axis_name("joints", i, 7) for i in (0, 6)] == ["joints 0", "joints 6"]
     assert axis_name("speed", 0, 1) == "speed"
+    assert DOOR.channel("force", 2) == Component("force z", "N")
+
+
+RADAR = replace(
+    DOOR,
+    observations={**DOOR.observations, "radar": (2,), "speed": (1,)},
+    modalities={**DOOR.modalities, "radar": ("radar", "speed")},
+    channels={"radar": (Component("range", "m"), Component("bearing", "rad")), "speed": (Component("v", "m/s"),)},
+)
+
+
+def test_channels_have_names_and_units() -> None:
+    assert RADAR.channel("radar", 1) == Component("radar bearing", "rad")
+    assert RADAR.channel("speed", 0) == Component("speed", "m/s")
+    assert [channel.name for channel in RADAR.vector_channels()][-3:] == ["radar range", "radar bearing", "speed"]
+    check_definition(RADAR)
+    definition = json.loads(json.dumps(task_to_json(RADAR)))
+    assert task_from_json(definition).channels == RADAR.channels
+    del definition["channels"]  # as in files of earlier versions
+    assert task_from_json(definition).channels == {}
+    outdoors = replace(RADAR, map_half_width=50.0)
+    assert outdoors.channel("radar", 0).conversion == ("m", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("channels", "message"),
+    [
+        ({"radar": ("range", "bearing")}, r"component 'range', expected Component\("),
+        ({"radar": (Component("range", "m"),)}, "channels of 'radar' are 1, expected 2 names"),
+        ({"image": (Component("gray", ""),)}, r"channels of 'image' are 1, expected an observation \(d,\) or control"),
+        ({"lidar": (Component("range", "m"),)}, r"expected an observation \(d,\) or control"),
+        ({"radar": 2 * (Component("range", "m"),)}, "channels of 'radar' have equal names"),
+        ({"speed": (Component("m/s", "m/s"),)}, "channel 'm/s' of 'speed' has a slash in its name"),
+    ],
+)
+def test_invalid_channels_are_refused(channels: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        check_definition(replace(RADAR, channels=channels))
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from beliefscope.datasets.catalog import TASKS
+from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
@@ -37,10 +40,38 @@ def test_label(statistic: str, label: str) -> None:
     assert label_of(statistic) == label
 
 
+GPS = Task("field", (Component("x", "m"),), {"gps": (2,)}, {"gps": ("gps",)}, 0, 0.1)
+
+
 def test_without_contact_statistics_are_those_of_whole_episodes() -> None:
-    assert label_of("size/gps x/contact", has_contact=False) == "standard deviation of gps (x)"
-    assert label_of("level/gps x/free motion", has_contact=False) == "level of gps (x)"
-    assert label_of("noise/gps x/extreme", has_contact=False) == label_of("noise/gps x/extreme")
+    assert label_of("size/gps x/contact", GPS) == "standard deviation of gps (x)"
+    assert label_of("level/gps x/free motion", GPS) == "level of gps (x)"
+    assert label_of("noise/gps x/extreme", GPS) == label_of("noise/gps x/extreme")
+
+
+def test_channels_have_the_names_and_units_of_the_task() -> None:
+    channels = {
+        "radar": (Component("range", "m"), Component("bearing", "rad")),
+        "speed": (Component("v", "m/s"),),
+        "control": (Component("thrust", "N"), Component("rudder", "rad")),
+    }
+    task = replace(
+        GPS,
+        observations={"radar": (2,), "speed": (1,)},
+        modalities={"sonar": ("radar", "speed")},
+        control_size=2,
+        channels=channels,
+    )
+    assert label_of("level/radar y/all", task) == "level of radar (bearing)"
+    assert unit_of("level/radar y/all", task) == ("deg", pytest.approx(57.29577951308232))
+    assert unit_of("drift/radar x/all", task) == ("cm/s", 100.0)
+    assert unit_of("noise/speed/extreme", task) == ("m/s", 1.0)
+    assert label_of("noise/speed/all", task) == "noise of speed"
+    assert label_of("innovation bias/sonar radar x/all", task).endswith("of sonar (radar range)")
+    assert label_of("innovation bias/sonar speed/all", task).endswith("of sonar (speed)")
+    assert label_of("reading gain/control y/all", task).startswith("slope of control (rudder) on")
+    assert unit_of("reading gain/control y/all", task) == ("", 1.0)  # a ratio
+    assert label_of("module bias/sonar x/all", task) == "bias of the measurement model of sonar (x)"  # of the state
 
 
 @pytest.mark.parametrize(
@@ -78,12 +109,10 @@ def test_kinds_with_units_exist_and_each_component_of_a_profile_has_a_unit() -> 
 
 
 def test_a_deviation_is_written_in_its_unit() -> None:
-    unit, factor = unit_of("error//all", TASKS["door"])
-    deviation = Deviation("error//all", 0.05, 0.017, 0.015, 0.021, 0.01, True, 3.0, unit, factor)
+    deviation = Deviation("error//all", 0.05, 0.017, 0.015, 0.021, 0.01, True, 3.0, TASKS["door"])
     assert deviation.text == "RMS position error is 5 cm, healthy 1.7 cm (1.5 to 2.1)"
 
 
 def test_the_numbers_of_a_filter_that_diverges_have_an_exponent() -> None:
-    unit, factor = unit_of("error//all", TASKS["door"])
-    deviation = Deviation("error//all", 1.8e17, 0.017, 0.015, 0.021, 0.01, True, 3.0, unit, factor)
+    deviation = Deviation("error//all", 1.8e17, 0.017, 0.015, 0.021, 0.01, True, 3.0, TASKS["door"])
     assert deviation.text == "RMS position error is 1.8e+19 cm, healthy 1.7 cm (1.5 to 2.1)"
