@@ -172,7 +172,7 @@ class KalmanEquations(Diagnostic):
         if self.modalities:
             heads = ("steps with", "covariance error, %", "mean error, %")
             tables.append(Table("Updates against K = P Hᵀ S⁻¹", heads, updates))
-        note = "Q = P - F P Fᵀ per step, and R = S - H P Hᵀ in units of the readings."
+        note = "Q = P - F P Fᵀ per step, and R = S - H P Hᵀ. Readings have the units of the task's channels."
         heads = ("noise", "standard deviation", "unit")
         return [*tables, Table("Noise that the covariances contain", heads, known, note)]
 
