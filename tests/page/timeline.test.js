@@ -290,6 +290,9 @@ test('injected faults are labelled, below the labels of outages', () => {
   );
   assert.deepEqual([...run.faulty], [0, 1]);
   assert.equal(run.faultLabel, 'injected: image frozen, force bias');
+  const faults = 'sensor_bias=radar_2:offset=0.2,drop=haptics,blackout=0.4';
+  const label = 'injected: sensor bias (radar 2), drop (haptics), blackout';
+  assert.equal(makeTrace(FUSION, { faults }).faultLabel, label);
   assert.deepEqual([...makeTrace(FUSION).faulty], [0, 0]);
   const fault = { faulty: [[30, 99]], faultLabel: run.faultLabel };
   const { texts, rows } = shaded(fault);

@@ -444,9 +444,12 @@ export class Trace {
     return this.#cache.get(key);
   }
 
-  /** Names of the injected faults: `injected: image frozen`. */
+  /** Names of the injected faults and their sensors: `injected: image frozen, sensor bias (radar)`. */
   get faultLabel() {
-    const names = this.header.faults.split(',').map((fault) => fault.split(/[:=]/)[0]);
+    const names = this.header.faults.split(',').map((fault) => {
+      const [name, value = ''] = fault.split(':')[0].split('=');
+      return Number.isNaN(Number(value)) ? `${name} (${value})` : name;
+    });
     return `injected: ${names.join(', ').replaceAll('_', ' ')}`;
   }
 
