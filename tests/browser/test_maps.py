@@ -219,6 +219,7 @@ def check_tiles(page: Any) -> None:
     assert heads.nth(1).get_attribute("aria-label") == "Step 12, contact"
     content = "[...document.querySelectorAll('#map-tiles canvas')].map((c) => c.toDataURL())"
     page.until(f"() => new Set({content}).size === 24")
+    page.until("() => document.querySelectorAll('#map-tiles [data-cells=\"135\"]').length === 24")  # fine ones follow
     page.screenshot("maps-tiles")
     page.page.locator("#map-tiles canvas").nth(8 + 1).click()  # haptics at the first contact
     page.settle(12)

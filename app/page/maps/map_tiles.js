@@ -78,7 +78,7 @@ export class MapTiles {
     if (maps.size === MAP_SIZE.fine && !(trace.live && follow)) this.#load();
   }
 
-  /** Requests the missing maps, one after the other, until the cursor moves. */
+  /** Requests the missing maps, one after the other, coarse and then fine ones, until the cursor moves. */
   async #load() {
     if (this.#loading || !this.#displayed) return;
     this.#loading = true;
@@ -87,10 +87,13 @@ export class MapTiles {
     // The nearest step comes last, because the server then computes maps around it ahead of the cursor.
     const steps = tileSteps(trace.contact, maps.step).map(({ step }) => step);
     steps.sort((a, b) => Math.abs(b - maps.step) - Math.abs(a - maps.step));
-    for (const step of steps) {
-      if (this.#kept.has(step) || this.#host.hidden) continue;
+    const requests = [MAP_SIZE.coarse, MAP_SIZE.fine].flatMap((size) =>
+      steps.map((step) => ({ step, size })),
+    );
+    for (const { step, size } of requests) {
+      if ((this.#kept.get(step)?.size ?? 0) >= size || this.#host.hidden) continue;
       const cursor = { ...trace.selection, step, angle: state.angle, ...mapChoices(state, trace) };
-      const tile = await this.#requestMaps(cursor, MAP_SIZE.coarse);
+      const tile = await this.#requestMaps(cursor, size);
       if (!tile || key !== this.#key || state.step !== maps.step) break;
       this.#kept.set(step, tile);
       this.redraw();
@@ -179,6 +182,7 @@ export class MapTiles {
     const context = context2d(canvas);
     context.clearRect(0, 0, pixels, pixels);
     if (!maps || !this.#displayed) return;
+    tile.dataset.cells = String(maps.size);
     const layer = maps.layers.indexOf(this.#displayed.layers[row]);
     const { zoom } = this.#displayed;
     paintCells(
