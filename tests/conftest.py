@@ -60,7 +60,8 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_sessionfinish() -> None:
-    gc.unfreeze()  # at exit, DuckDB reports objects that are never freed
+    if "duckdb" in sys.modules:
+        gc.unfreeze()  # at exit, DuckDB reports objects that are never freed
 
 
 @pytest.fixture(scope="session", autouse=True)
