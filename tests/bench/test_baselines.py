@@ -36,6 +36,7 @@ def test_learned_baselines_recognise_the_cases_they_were_fitted_to(folders: list
         assert tree["state"] in ("healthy", "fault")
 
 
+@pytest.mark.slow
 def test_first_alarm(folders: list[Path]) -> None:
     assert first_alarm(load_case(folders[2]))["causes"][0]["cause"].startswith("weights.")
 

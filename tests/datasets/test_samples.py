@@ -28,6 +28,7 @@ def test_file_size() -> None:
     assert sample_path("door").stat().st_size <= 4_100_000
 
 
+@pytest.mark.slow
 def test_splits_and_policies(episodes: list[Episode]) -> None:
     assert len(episodes) == 190
     assert {len(e) for e in episodes} == {100}

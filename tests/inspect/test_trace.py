@@ -54,6 +54,7 @@ def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(pretrained_path("door", request.param))
 
 
+@pytest.mark.slow
 def test_runs_over_one_episode_use_one_thread(checkpoint: Checkpoint, traced: Trace, episode: Episode) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)

@@ -26,6 +26,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_wrapped_filter_is_calibrated(run: Run, data: Path, tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
     line = ["calibrate", "door", "--filter", FILTER, "--data", data]

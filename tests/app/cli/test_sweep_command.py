@@ -6,10 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import pretrained_path
 
 
+@pytest.mark.slow
 def test_checkpoints_without_data_of_their_task_are_named(run: Callable[..., Any], tmp_path: Path) -> None:
     with open_dataset(sample_path("push")) as data:
         write_dataset(tmp_path / "push.h5", data.task, [data[9]])

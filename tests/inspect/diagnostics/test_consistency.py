@@ -175,6 +175,7 @@ def test_exact_particle_set_is_calibrated() -> None:
         np.testing.assert_allclose(entry.crps, plant.SCALE / math.sqrt(math.pi), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_crps_of_a_gaussian() -> None:
     from scipy.stats import norm
     from uncertainty_toolbox.metrics_scoring_rule import crps_gaussian

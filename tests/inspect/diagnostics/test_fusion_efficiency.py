@@ -190,6 +190,7 @@ def doors() -> tuple[Checkpoint, list[Trace]]:
         return filter_, [trace(filter_, data[index], index) for index in (9, 11)]
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_separate_runs(doors: tuple[Checkpoint, list[Trace]]) -> None:
     filter_, traces = doors
     shares: list[float] = []
