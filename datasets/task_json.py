@@ -138,12 +138,30 @@ def check_definition(task: Task, where: str = "") -> None:
     place = where or f"task {task.name!r:.200}"
     if not isinstance(task.name, str) or not task.name or len(task.name) > 100 or set(task.name) & set("/\\: "):
         raise BadInput(f"{place} is named {task.name!r:.200}, expected a name without spaces, colons and slashes.")
+    _check_components(task, place)
+    _check_sensors(task, place)
+    _check_channels(task, place)
+    _check_points(task, place)
+    _check_covariates(task, place)
+    for name, value in (("control_size", task.control_size), ("warmup", task.warmup)):
+        if not _whole(value, 0):
+            raise BadInput(f"{place}: {name} is {value!r:.200}, expected a whole number.")
+    if not (_positive(task.dt) and _positive(task.map_half_width)):
+        raise BadInput(
+            f"{place}: dt is {task.dt!r} s and map_half_width {task.map_half_width!r}, expected more than 0."
+        )
+    for unit, ends in task.start_distance.items():
+        if unit not in {c.unit for c in task.components} or len(ends) != 2 or not all(_number(end) for end in ends):
+            raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
+
+
+def _check_components(task: Task, place: str) -> None:
+    """Components, their rotations, and those of the map and of positions."""
     names = [component.name for component in task.components]
     if not names or len(set(map(repr, names))) < len(names):
         raise BadInput(f"{place} has the components {names!r:.200}, expected one or more with different names.")
     for component in task.components:
         _check_component(component, f"{place}: component {component.name!r:.200}")
-    _check_channels(task, place)
     for name in dict.fromkeys(component.rotation for component in task.components):
         parts = [i for i, component in enumerate(task.components) if name and component.rotation == name]
         alike = {task.components[i].unit for i in parts} == {"rad"} and [*np.diff(parts)] == [1, 1]
@@ -151,6 +169,15 @@ def check_definition(task: Task, where: str = "") -> None:
             raise BadInput(f"{place}: rotation {name!r:.200} has {plural(len(parts), 'component')}, not 3 of unit rad.")
     if len(set(task.map_indices)) != len(task.map_components) or len(task.map_components) not in (1, 2):
         raise BadInput(f"{place}: map components are {list(task.map_components)!r:.200}, expected one or two names.")
+    if task.positions and len(task.main_error.indices) != 2:
+        raise BadInput(f"{place}: positions {list(task.positions)!r:.200} need two map components of one unit.")
+    for key, channels in task.positions.items():
+        if len(channels) != 2 or not all(_whole(channel, 0) for channel in channels):
+            raise BadInput(f"{place}: positions of {key!r} are {channels!r:.200}, expected two channels.")
+
+
+def _check_sensors(task: Task, place: str) -> None:
+    """Observations, their shapes and periods, and the modalities that have them."""
     for key, shape in task.observations.items():
         if not shape or not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
@@ -161,7 +188,6 @@ def check_definition(task: Task, where: str = "") -> None:
             )
     if unknown := [key for key in task.arrays if key not in task.observations]:
         raise BadInput(f"{place}: arrays has {unknown[0]!r:.200}, which is not an observation.")
-    _check_points(task, place)
     for key, period in task.periods.items():
         if key not in task.observations or not _positive(period):
             raise BadInput(
@@ -173,22 +199,6 @@ def check_definition(task: Task, where: str = "") -> None:
             raise BadInput(f"{place}: modality {modality!r} has {missing[0]!r}, which is not an observation.")
         if not keys:
             raise BadInput(f"{place}: modality {modality!r} has no observations.")
-    for name, value in (("control_size", task.control_size), ("warmup", task.warmup)):
-        if not _whole(value, 0):
-            raise BadInput(f"{place}: {name} is {value!r:.200}, expected a whole number.")
-    if not (_positive(task.dt) and _positive(task.map_half_width)):
-        raise BadInput(
-            f"{place}: dt is {task.dt!r} s and map_half_width {task.map_half_width!r}, expected more than 0."
-        )
-    if task.positions and len(task.main_error.indices) != 2:
-        raise BadInput(f"{place}: positions {list(task.positions)!r:.200} need two map components of one unit.")
-    for key, channels in task.positions.items():
-        if len(channels) != 2 or not all(_whole(channel, 0) for channel in channels):
-            raise BadInput(f"{place}: positions of {key!r} are {channels!r:.200}, expected two channels.")
-    _check_covariates(task, place)
-    for unit, ends in task.start_distance.items():
-        if unit not in {c.unit for c in task.components} or len(ends) != 2 or not all(_number(end) for end in ends):
-            raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
 
 
 def _check_component(component: Component, about: str) -> None:
