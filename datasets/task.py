@@ -18,7 +18,7 @@ from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.text import capitalised
 
-UNITS = {"force": "N", "torque": "N m", "effector_position": "m"}
+SENSOR_UNITS = {"force": "N", "torque": "N m", "effector_position": "m"}
 """Observation key -> unit of its channels, for sensors that several tasks have."""
 
 DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
@@ -275,7 +275,7 @@ class Task:
         """Channel i of a vector observation or the controls, with its unit; its name starts with the key."""
         size = self.control_size if key == "control" else self.observations[key][0]
         if key not in self.channels:
-            return Component(axis_name(key, i, size), UNITS.get(key, ""))
+            return Component(axis_name(key, i, size), SENSOR_UNITS.get(key, ""))
         channel = self.channels[key][i]
         return replace(channel, name=key if size == 1 else f"{key} {channel.name}")
 

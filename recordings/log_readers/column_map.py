@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.errors import BadInput, check_name
-from beliefscope.datasets.task import DISPLAY_UNITS, Component, rotation
+from beliefscope.datasets.task import DISPLAY_UNITS, SENSOR_UNITS, Component, rotation
 
 QUATERNION = "quaternion_yaw"
 """Unit of a component whose column is a quaternion (x, y, z, w): the angle about z, in rad."""
@@ -53,6 +53,13 @@ def base_name(reference: str) -> str:
 
 def listed(references: References) -> list[str]:
     return [references] if isinstance(references, str) else references
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Names without the part that all begin with, up to its last separator; slashes are points."""
+    starts = [names[0][: match.end()] for match in re.finditer(r"[._/ ]", names[0])]
+    shared = max((len(start) for start in starts if all(name.startswith(start) for name in names)), default=0)
+    return [name[shared:].replace("/", ".") for name in names]
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,16 @@ class ColumnMap:
             for name, entry in self.state.items()
         ]
         return tuple(component for part in parts for component in part)
+
+    def channels(self, sizes: Mapping[str, int]) -> dict[str, tuple[Component, ...]]:
+        """Names of channels that are columns of their own, after what all begin with: ``lat`` of ``gps_lat``.
+
+        sizes: number of channels of vector sensors and of ``control``.
+        """
+        references = {**self.sensors, "control": self.control}
+        names = {key: _distinct(listed(references[key])) for key, size in sizes.items() if size > 1}
+        own = {key: each for key, each in names.items() if len({*each} - {""}) == sizes[key]}
+        return {key: tuple(Component(name, SENSOR_UNITS.get(key, "")) for name in each) for key, each in own.items()}
 
     @property
     def truth(self) -> set[str]:

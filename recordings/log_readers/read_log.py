@@ -39,14 +39,12 @@ Array = NDArray[np.float64]
 IRREGULAR = 0.01
 """Deviation of a time from a constant step, relative to the step, above which the times are kept."""
 
-LARGE, SMALL = 5.0, 0.05
-"""m, span of the positions above which they are displayed in m, and below which in mm."""
+LARGE, SMALL = 5.0, 0.05  # m, span of the positions above which they are displayed in m, and below which in mm
 
 AUTO = {8: "val", 9: "test"}
 """Last digit of an episode's number -> its split; the others are for training."""
 
-MARGIN = 1.2
-"""Half width of maps relative to the largest half range of the map components."""
+MARGIN = 1.2  # half width of maps relative to the largest half range of the map components
 
 
 def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "test") -> list[Episode]:
@@ -381,9 +379,11 @@ def _task(
         for component, span in zip(mapping.components, spans, strict=True)
     )
     extent = max(span for span, unit in zip(spans[:2], units, strict=False) if unit == units[0]) / 2.0
+    sizes = {"control": controls} | {name: array.shape[1] for name, array in sensors.items() if array.ndim == 2}
     task = Task(
         name=mapping.task,
         components=components,
+        channels=mapping.channels(sizes),
         observations={name: array.shape[1:] for name, array in sensors.items()},
         modalities=mapping.modalities,
         control_size=controls,
