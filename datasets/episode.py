@@ -46,6 +46,7 @@ class Episode:
         covariates: name -> (T,) float32, values of the task's covariates except contact; NaN where unknown.
         provenance: JSON values: origin and replay parameters (hinge position, policy, versions).
         time: (T,) float64 s since the first step, ascending; None: steps times ``dt``.
+        first_duration: s since the step before the first one, of a part of an episode with ``time``; 0: ``dt``.
     """
 
     task: Task
@@ -60,6 +61,7 @@ class Episode:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
     time: NDArray[np.float64] | None = None
+    first_duration: float = 0.0
 
     def __post_init__(self) -> None:
         """Fill in the defaults, and convert floating-point arrays to float32."""
@@ -100,10 +102,10 @@ class Episode:
 
     @property
     def durations(self) -> NDArray[np.float64]:
-        """(T,) s since the previous step; of the first step, ``dt``."""
+        """(T,) s since the previous step; of the first step of an episode, ``dt``."""
         if self.time is None:
             return np.full(len(self), self.dt, np.float64)
-        return np.concatenate([[self.dt], np.diff(self.time)])[: len(self)]
+        return np.concatenate([[self.first_duration or self.dt], np.diff(self.time)])[: len(self)]
 
     @property
     def positions(self) -> NDArray[np.float64]:
@@ -130,7 +132,10 @@ class Episode:
         arrays: dict[str, Any] = {n: getattr(self, n)[first:last] for n in ("states", "controls", "contact", "qpos")}
         for name in ("observations", "covariates"):
             arrays[name] = {key: array[first:last] for key, array in getattr(self, name).items()}
-        return replace(self, **arrays, time=None if self.time is None else self.time[first:last])
+        if self.time is not None:
+            arrays["time"] = self.time[first:last]
+            arrays["first_duration"] = float(self.durations[first]) if first < len(self) else 0.0
+        return replace(self, **arrays)
 
     def digest(self) -> str:
         """SHA-256 over the names, shapes, types and bytes of the arrays, independent of the file format."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import (
     consistency,
@@ -57,7 +58,9 @@ def run_diagnostics(
         options: names of the diagnostics -> their options; default: all. slow: whether to run slow ones.
 
     Returns:
-        Results by name, and the reason for each diagnostic that was not run.
+        Results by name, and the reason for each diagnostic without one.
+
+    Raises BadInput for an invalid value of an option.
     """
     options = {name: {} for name in DIAGNOSTICS} if options is None else options
     results: dict[str, Diagnostic] = {}
@@ -71,15 +74,16 @@ def run_diagnostics(
             reasons[name] = reason
         else:
             share = {"progress": lambda part, index=index: progress((index + part) / len(options))}
-            results[name] = entry(traces, checkpoint, **values, **(share if entry.takes_progress else {}))
+            try:
+                results[name] = entry(traces, checkpoint, **values, **(share if entry.takes_progress else {}))
+            except BadInput as error:  # which only the attempt shows
+                if values:
+                    raise
+                reasons[name] = str(error)
         progress((index + 1) / len(options))
     return results, reasons
 
 
 def quick(trace: Trace, checkpoint: Checkpoint | None = None) -> dict[str, Diagnostic]:
     """Compute all applicable diagnostics of a trace that are not slow, by name."""
-    return {
-        name: entry([trace], checkpoint)
-        for name, entry in DIAGNOSTICS.items()
-        if not entry.slow and entry.refusal(trace, checkpoint) is None
-    }
+    return run_diagnostics([trace], checkpoint)[0]

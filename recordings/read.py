@@ -72,7 +72,9 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows, given: Iterable[Task]
     observations = {
         name.removeprefix("observations/"): array for name, array in arrays.items() if name.startswith("observations/")
     }
-    stored = {current_array(name.removeprefix("trace/")): a for name, a in arrays.items() if name.startswith("trace/")}
+    stored: dict[str, Any] = {
+        current_array(name.removeprefix("trace/")): a for name, a in arrays.items() if name.startswith("trace/")
+    }
     episode_fields = {field.name for field in fields(Episode)} & stored.keys()
     episode = Episode(
         task=stored_task(_parsed(header, "definition").get("definition", header["task"]), given),

@@ -50,7 +50,7 @@ def inspect(
     with console.progress("Inspecting") as advance:
         results, reasons = run_diagnostics(traces, checkpoint, parsed, bool(every or only), advance)
     if not results:
-        raise BadInput("; ".join(reasons.values()))
+        raise BadInput("; ".join(dict.fromkeys(reasons.values())))
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         for name, result in results.items():

@@ -12,7 +12,7 @@ from tests.inspect.diagnosis.test_innovation_checks import FLIPPED, STD, Array, 
 
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnostics.kalman_equations import KalmanEquations, check_equations, jacobian_statistics
 from beliefscope.inspect.healthy import profile_of
@@ -150,6 +150,26 @@ def test_a_filter_without_finite_differences_is_refused() -> None:
     with pytest.raises(BadInput, match="they depend on more than its belief and its inputs"):
         entry([trace], loaded(Widening()))
     assert entry.refusal(replace(trace, predicted_covariance=None), loaded(Widening())) is not None
+
+
+def test_a_filter_without_finite_differences_has_other_diagnostics() -> None:
+    results, reasons = run_diagnostics([run(Widening())], loaded(Widening()))
+    assert "consistency" in results
+    assert "they depend on more than its belief and its inputs" in reasons["equations"]
+
+
+class Timed(Boat):
+    """Moves for the duration of each step."""
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        return super().__call__(observations=observations, controls=controls * observations["dt"] / 0.1)
+
+
+def test_repeated_steps_have_the_durations_of_irregular_steps() -> None:
+    checkpoint, times = loaded(Timed()), np.cumsum(np.random.default_rng(0).uniform(0.05, 0.5, 100))
+    trace = bs.trace(checkpoint, [replace(sail(0), time=times - times[0])])
+    result = check_equations([trace], checkpoint)
+    assert result.alarms == ()
 
 
 @pytest.mark.long
