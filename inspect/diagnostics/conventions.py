@@ -156,7 +156,7 @@ def changes_of(task: Task, modalities: Sequence[str], episode: Episode) -> tuple
         for key in task.modalities[modality]:
             readings = episode.observations.get(key)
             if readings is not None and key not in task.images and not np.isin(readings, (0, 1)).all():  # no flags
-                result += _of_sensor(task, key, modality, readings[0].size)
+                result += _of_sensor(task, key, modality, readings.shape[1] if readings.ndim == 2 else 1)
         text = f"{display_name(modality)} delayed by {DELAY} steps"
         result.append(Change(text, f"delay={modality}:steps={DELAY}", modality))
     channels = episode.controls.shape[-1]
@@ -179,7 +179,7 @@ def _channel_names(task: Task, key: str, indices: Sequence[int]) -> list[str]:
 
 
 def _of_sensor(task: Task, key: str, modality: str, channels: int) -> list[Change]:
-    """Changes of a vector sensor."""
+    """Changes of a sensor with a number of channels; that of an array is 1."""
     name = display_name(key)
     result = [Change(f"the opposite sign of {name}", f"sensor_gain={key}:factor=-1", modality)]
     result += [Change(f"{name} times {f:g}", f"sensor_gain={key}:factor={f:g}", modality) for f in SCALES]

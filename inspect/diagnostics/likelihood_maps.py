@@ -69,7 +69,7 @@ class MapSurvey(Diagnostic):
 
     @property
     def quantity(self) -> str:
-        return self.title.split(".", 1)[0].lower()
+        return self.title[:1].lower() + self.title[1:].split(".", 1)[0]
 
     @property
     def verdict(self) -> str:

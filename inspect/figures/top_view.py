@@ -22,7 +22,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.palette import COLOURS, colour, colour_table
@@ -113,7 +113,8 @@ def _draw_scene(
         axes.add_patch(Rectangle(square[0], 2 * half, 2 * half, fill=False, ec="0.6", lw=0.5, zorder=0.5))
         corners = np.concatenate([corners, square])
     low, high = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (cm)", ylabel="y (cm)")
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    _label_axes(axes, task, ["x", "y"])
     axes.set_title("from above", loc="left")
 
 
@@ -138,10 +139,19 @@ def _draw_belief(axes: Axes, trace: Trace, task: Task, step: int, map_: Likeliho
         reach = max(reach, float(np.abs(at - centre).max()) + spread)
     _draw_positions(axes, trace, task, step, size=5.0)
     half = min(1.25 * reach, 100.0 * task.map_half_width)
-    x_name, y_name = (f"{display_name(name)} (cm)" for name in task.map_components)
     axes.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
-    axes.set(xlabel=x_name, ylabel=y_name)
+    _label_axes(axes, task, [task.components[i].label for i in plane])
     axes.set_title("belief" if map_ is None else f"belief, on the {map_.layers[-1]} {map_.quantity}", loc="left")
+
+
+def _label_axes(axes: Axes, task: Task, names: list[str]) -> None:
+    """Label axes in cm with the units for display of the map components."""
+    for axis, name, i in zip((axes.xaxis, axes.yaxis), names, task.map_indices, strict=True):
+        unit, factor = task.components[i].conversion
+        axis.set_label_text(with_unit(name, unit))
+        if factor != 100.0:
+            share = factor / 100.0
+            axis.set_major_formatter(lambda value, _, share=share: f"{share * value:.10g}".replace("-", "\N{MINUS SIGN}"))
 
 
 def _draw_map(axes: Axes, map_: LikelihoodMap | None) -> None:

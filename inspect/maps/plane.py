@@ -22,6 +22,9 @@ OTHERS: tuple[Others, ...] = get_args(Others)
 DEVIATIONS, MARGIN = 3.0, 2.0
 """Extent of an axis: MARGIN times an error plus DEVIATIONS standard deviations, exceeded in 5 % of the steps."""
 
+COARSE = 20.0
+"""Extent of the task's map, relative to that of a run, from which beliefs are smaller than its cells."""
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -49,8 +52,8 @@ class Plane:
 def plane_of(trace: Trace, components: tuple[str, ...] = ()) -> Plane:
     """The plane of one or two components of a trace's task; by default the task's own map.
 
-    The components of the task's map have its extent. That of others covers errors and deviations of the estimates of
-    all steps, as a round number in units for display. Two components of one unit share an extent, so that directions
+    The components of the task's map have its extent, unless its cells are larger than the beliefs. That of others
+    covers errors and deviations of the estimates of all steps, as a round number in units for display. Two components of one unit share an extent, so that directions
     and distances on the map are those of the state.
 
     Raises:
@@ -97,11 +100,11 @@ def describe_others(trace: Trace, plane: Plane, others: Others) -> str:
 
 def _half_width(trace: Trace, index: int) -> float:
     task = trace.task
-    if index in task.main_error.indices:
-        return task.map_half_width
     error = np.abs(task.difference(trace.estimate_mean, trace.anchors)[:, index])
     deviation = np.sqrt(np.maximum(trace.estimate_covariance[:, index, index].astype(np.float64), 0.0))
     reach = MARGIN * float(np.quantile(error + DEVIATIONS * np.nan_to_num(deviation), 0.95))
+    if index in task.main_error.indices and not 0.0 < COARSE * reach < task.map_half_width:
+        return task.map_half_width
     _, factor = task.components[index].conversion
     width = round_up(max(factor * reach, 1e-6)) / factor
     return min(width, np.pi) if task.components[index].unit == "rad" else width

@@ -12,11 +12,12 @@ import pytest
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.hand_on_arc import HandOnArc
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostics.conventions import RELEVANT, Conventions, conventions
+from beliefscope.inspect.diagnostics.conventions import RELEVANT, Conventions, changes_of, conventions
 from beliefscope.inspect.statistics.measures import squared_errors
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -112,3 +113,12 @@ def test_a_run_without_truth_is_refused() -> None:
     assert entry.refusal(run, filter_()) is None
     run.episode.states[3] = np.nan
     assert entry.refusal(run, filter_()) == "the episode has no ground truth at some steps"
+
+
+def test_all_changes_of_an_array_can_be_made() -> None:
+    task = Task("cart", (Component("x", "m"),), {"depth": (4, 6)}, {"depth": ("depth",)}, 0, 0.1, arrays=("depth",))
+    episode = Episode(task, np.zeros((5, 1)), observations={"depth": np.random.default_rng(0).normal(size=(5, 4, 6))})
+    changes = changes_of(task, ["depth"], episode)
+    assert len(changes) > 1
+    for change in changes:
+        Faults.parse(change.faults).apply(episode)

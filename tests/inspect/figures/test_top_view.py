@@ -123,6 +123,14 @@ def test_true_and_estimated_object_and_contact_force(run: Trace) -> None:
     assert not draw_step(run, free).axes[0].texts
 
 
+def test_axes_have_the_units_for_display(run: Trace) -> None:
+    metres = tuple(replace(c, display=("m", 1.0)) if c.unit == "m" else c for c in DOOR.components)
+    far = replace(run, episode=replace(run.episode, task=replace(DOOR, components=metres)))
+    for plain, axes in zip(draw_step(run, STEP).axes, draw_step(far, STEP).axes, strict=True):
+        assert axes.get_xlabel() == plain.get_xlabel().replace("(cm)", "(m)")
+        assert axes.xaxis.get_major_formatter()(-12.0, 0) == "\N{MINUS SIGN}0.12"
+
+
 def test_unavailable_values_are_omitted(run: Trace, tmp_path: Path) -> None:
     estimates_only = replace(
         run,

@@ -156,6 +156,17 @@ def test_extents_are_round_in_display_units_and_equal_for_equal_units() -> None:
     assert [round_up(value) for value in (0.011, 0.02, 3.0, 6.0)] == pytest.approx([0.02, 0.02, 5.0, 10.0])
 
 
+def test_extent_of_a_map_whose_cells_are_larger_than_the_beliefs_is_that_of_the_run() -> None:
+    run = make_trace()
+    task = replace(TASK, map_half_width=1000.0)
+    wide = replace(run, episode=replace(run.episode, task=task))
+    spread = np.abs(run.estimate_mean) + 3.0 * np.sqrt(np.diagonal(run.estimate_covariance, axis1=1, axis2=2))
+    half, _ = plane_of(wide).half_widths
+    assert spread[:, :2].max() < half < 10.0
+    still = replace(wide, estimate_mean=wide.anchors, estimate_covariance=0.0 * wide.estimate_covariance)
+    assert plane_of(still).half_widths == (1000.0, 1000.0)
+
+
 def test_invalid_choices_are_rejected() -> None:
     maps = engine(make_trace())
     with pytest.raises(BadInput, match="component 'vz' of task 'vehicle' does not exist"):
