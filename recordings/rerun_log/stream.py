@@ -15,8 +15,13 @@ from beliefscope.recordings.schema import APPLICATION
 BLOCK = 1 << 16  # bytes in a pipe
 
 
+def entity_path(path: str) -> str:
+    """A path whose names have Rerun's escapes of special characters, such as spaces."""
+    return "/".join(map(rr.escape_entity_path_part, path.split("/")))
+
+
 class FileStream(rr.RecordingStream):
-    """A Rerun stream that writes its file itself.
+    """A Rerun stream that writes its file itself, at paths whose names it escapes.
 
     When Rerun cannot write, it logs an error and stops writing, and a flush at that moment waits forever. Here Rerun
     writes to a pipe, which is always read, and a thread copies it to the file. ``flush`` and ``disconnect`` raise the
@@ -51,6 +56,12 @@ class FileStream(rr.RecordingStream):
                         rest = rest[target.write(rest) :]
                 except OSError as error:
                     self._error = error  # and read on: Rerun must never wait
+
+    def log(self, path: Any, *args: Any, **options: Any) -> None:
+        super().log(entity_path(path), *args, **options)
+
+    def send_columns(self, path: Any, *args: Any, **options: Any) -> None:
+        super().send_columns(entity_path(path), *args, **options)
 
     def flush(self, *, timeout_sec: float = 1e38) -> None:
         super().flush(timeout_sec=timeout_sec)

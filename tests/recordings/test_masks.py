@@ -180,3 +180,28 @@ def test_import_finds_absent_readings(tmp_path: Path) -> None:
 def test_invalid_masks_are_refused(masks: dict[str, str]) -> None:
     with pytest.raises(BadInput, match="expected an observation and a boolean covariate of its own: fix, image"):
         check_definition(replace(TASK, masks=masks))
+
+
+def test_a_recording_keeps_names_with_spaces_and_signs(
+    episode: Episode, assert_same: Callable[..., None], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    names = {"gps": "GPS [rover]", "camera": "caméra n° 2"}
+    task = replace(
+        TASK,
+        components=(Component("Ort ψ", "m"),),
+        map_components=("Ort ψ",),
+        observations={names[key]: shape for key, shape in TASK.observations.items()},
+        modalities={names[key]: (names[key],) for key in TASK.modalities},
+        covariates={"GPS [rover] reading": Covariate("boolean")},
+        masks={"GPS [rover]": "GPS [rover] reading"},
+    )
+    named = replace(
+        episode,
+        task=task,
+        observations={names[key]: readings for key, readings in episode.observations.items()},
+        covariates={"GPS [rover] reading": episode.covariates["fix"]},
+    )
+    still = Adapter(lambda observations, controls: (controls, np.ones((STEPS, 1, 1, 1))), task=task)
+    run = trace(as_external(still, "still"), named)
+    assert_same(read_recording(write_recording(run, tmp_path / "run.rrd")), run)
+    assert "entity path" not in capfd.readouterr().err
