@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -169,6 +169,15 @@ def digest_of(like: Episode, steps: int, blocks: Callable[[str], Iterable[NDArra
 def step_text(step: int, time: float | None) -> str:
     """A step, and its time where the data have timestamps: ``step 12``, ``step 12 (3.40 s)``."""
     return f"step {step}" if time is None else f"step {step} ({time:.2f} s)"
+
+
+def durations_text(episodes: Sequence[Episode]) -> str:
+    """Duration of the steps of episodes: ``0.1 s each``, ``0.1 s each (0.08 to 3.2 s)``."""
+    typical = f"{episodes[0].dt:.4g} s each"
+    steps = np.concatenate([np.diff(episode.times) for episode in episodes])
+    if not len(steps) or steps.max() < 1.05 * steps.min():
+        return typical
+    return f"{typical} ({steps.min():.3g} to {steps.max():.3g} s)"
 
 
 def hold(readings: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:

@@ -6,6 +6,7 @@ World axes as on the maps: x to the right, y upwards. Needs neither a GPU nor a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -150,8 +151,12 @@ def _label_axes(axes: Axes, task: Task, names: list[str]) -> None:
         unit, factor = task.components[i].conversion
         axis.set_label_text(with_unit(name, unit))
         if factor != 100.0:
-            share = factor / 100.0
-            axis.set_major_formatter(lambda value, _, share=share: f"{share * value:.10g}".replace("-", "\N{MINUS SIGN}"))
+            axis.set_major_formatter(partial(_scaled, factor / 100.0))
+
+
+def _scaled(factor: float, value: float, _: int | None = None) -> str:
+    """Text of a tick whose value has another unit."""
+    return f"{factor * value:.10g}".replace("-", "\N{MINUS SIGN}")
 
 
 def _draw_map(axes: Axes, map_: LikelihoodMap | None) -> None:

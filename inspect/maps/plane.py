@@ -53,8 +53,8 @@ def plane_of(trace: Trace, components: tuple[str, ...] = ()) -> Plane:
     """The plane of one or two components of a trace's task; by default the task's own map.
 
     The components of the task's map have its extent, unless its cells are larger than the beliefs. That of others
-    covers errors and deviations of the estimates of all steps, as a round number in units for display. Two components of one unit share an extent, so that directions
-    and distances on the map are those of the state.
+    covers errors and deviations of the estimates of all steps, as a round number in units for display. Two components
+    of one unit share an extent, so that directions and distances on the map are those of the state.
 
     Raises:
         BadInput: unknown components, or not one or two different ones.

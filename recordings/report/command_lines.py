@@ -25,9 +25,13 @@ def report_command(files: Sequence[str], events: Sequence[object], slow: bool, t
 
 
 def trace_command(trace: Trace, file: str, filter_: str, data: Path | None) -> str:
-    """The command that reproduces a trace. filter_: as given on a command line; empty for the trace's filter name."""
+    """The command that reproduces a trace, or a comment. filter_: as given on a command line; default: its name."""
     if trace.settings.get("edits"):
         return f"# {file} contains interventions: see its settings in manifest.json"
+    source = str(trace.settings.get("source", ""))
+    if not trace.checkpoint_hash:  # of a log, or of a loop of the user
+        imported = ["beliefscope", "import", source, "--map", "MAP.toml", "--episode", str(trace.episode_index)]
+        return shlex.join([*imported, "-o", file]) if source else f"# {file} was recorded while its filter ran"
     particles = trace.settings.get("particles", 300)
     words = ["beliefscope", "trace", trace.task.name, "--filter", filter_ or trace.filter]
     words += ["--episode", str(trace.episode_index), *_options("--data", [data] if data else [])]

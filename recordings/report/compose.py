@@ -33,14 +33,14 @@ from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
 from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
-from beliefscope.inspect.figures.top_view import draw_step, draws_force
+from beliefscope.inspect.figures.top_view import draw_step, draws_force, scene_footprints
 from beliefscope.inspect.maps.map_engine import FINE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.report.diagnosis import report_diagnosis
-from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
+from beliefscope.recordings.report.figures import error_figure, event_figure, shown_sensors, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
 from beliefscope.recordings.report.page import page
 from beliefscope.recordings.report.pdf import print_page
@@ -56,7 +56,7 @@ from beliefscope.recordings.report.sections import (
 )
 
 MAP_CAPTION = (
-    "Inputs of the filter, and maps over offsets from the true position, each relative to its maximum. "
+    "{} over offsets from the true position, each relative to its maximum. "
     "Cross hairs: true position. Rings: estimate of each layer, which also depends on the prediction."
 )
 SLICES = ("Slices", "Under which conditions is the error larger?")
@@ -258,10 +258,13 @@ class Writer:
                 caption += f" Centre of the map, magnified {zoom} times."
                 zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:
-            caption = f"Inputs of the filter, and estimates as offsets from the true position. No maps: {self.no_maps}."
+            caption = f"Estimates as offsets from the true position. No maps: {self.no_maps}."
+        if shown_sensors(trace):
+            caption = f"Inputs of the filter. {caption}"
         scene = [] if trace.task.floor is None else [draw_step(trace, step, zoomed)]
+        has_map = zoomed is not None
         items = (
-            *(self.figure(f"{name}-scene", scene_caption(trace, step), figure) for figure in scene),
+            *(self.figure(f"{name}-scene", scene_caption(trace, step, has_map), figure) for figure in scene),
             self.figure(name, caption, event_figure(trace, step, zoomed, zoom), *data),
             self.table(name, event_table(trace, step, map_)),
         )
@@ -349,12 +352,16 @@ def _json(document: Mapping[str, Any]) -> bytes:
     return json.dumps(as_json(document), indent=1, allow_nan=False, ensure_ascii=False).encode()
 
 
-def scene_caption(trace: Trace, step: int) -> str:
-    """Caption of the scene from above, with the parts that its figure has."""
+def scene_caption(trace: Trace, step: int, has_map: bool) -> str:
+    """Caption of ``draw_step``, with the parts that its figure has."""
+    contents = ["2 sigma contours"] if trace.has_covariance else []
+    contents += ["particles coloured by weight"] if trace.particles is not None else []
+    belief = "; ".join(filter(None, [f"belief{' over the fused map' * has_map}", " and ".join(contents)]))
+    if not scene_footprints(trace, trace.task, step):
+        return f"From above: the true and the estimated position, and the {belief}"
     has_outline = trace.task.outline is not None
     objects = "the object at its true state (solid) and at its estimated state (dashed)"
     parts = [f"The scene from above with {objects if has_outline else 'the true and the estimated position'}."]
     if draws_force(trace, step):
         parts.append("Arrow: force on the end effector, 4 cm per 10 N.")
-    parts.append("Right: the belief over the fused map; 2 sigma contours, and particles coloured by weight")
-    return " ".join(parts)
+    return " ".join([*parts, f"Right: the {belief}"])

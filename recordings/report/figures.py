@@ -10,6 +10,7 @@ from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import with_unit
@@ -79,14 +80,22 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
     return figure
 
 
+def shown_sensors(trace: Trace) -> dict[str, NDArray[Any]]:
+    """Images (T, H, W) or (T, H, W, 3), and arrays of numbers (T, H, W), by sensor."""
+    readings = trace.episode.observations
+    return {k: v for k, v in readings.items() if is_image(v) or (k in trace.task.arrays and v.ndim == 3)}
+
+
 def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int = 1) -> Figure:
-    """Input images and likelihood maps at a step, with estimates, as offsets from the true position.
+    """Inputs of the filter (``shown_sensors``), and maps and estimates at a step as offsets from the true position.
+
+    Arrays are in colours over the range of the run.
 
     Args:
         map_: None to show the estimates only.
         zoom: magnification of the map.
     """
-    images = {key: readings[step] for key, readings in trace.episode.observations.items() if is_image(readings)}
+    images = shown_sensors(trace)
     layers = map_.layers if map_ is not None else ("estimates",)
     count = len(images) + len(layers)
     columns = min(COLUMNS, count)
@@ -96,10 +105,14 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
         figure = Figure(figsize=(WIDTH * columns / COLUMNS + beside, 2.05 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes, (key, image) in zip(grid, images.items(), strict=False):
-            axes.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        for axes, (key, readings) in zip(grid, images.items(), strict=False):
+            levels = {"cmap": "gray", "vmin": 0, "vmax": 255}
+            if not is_image(readings):
+                levels = {"cmap": "viridis", "vmin": readings.min(), "vmax": readings.max()}
+            axes.imshow(readings[step], interpolation="nearest", **levels)
             axes.set(xticks=[], yticks=[])
-            axes.set_title(key + (", blackout" if not image.any() else ""), loc="left", fontsize=7.5)
+            lost = is_image(readings) and not readings[step].any()
+            axes.set_title(key + (", blackout" if lost else ""), loc="left", fontsize=7.5)
         for i, layer in enumerate(layers):
             index = len(images) + i
             _draw_layer(grid[index], trace, step, map_, layer, zoom)

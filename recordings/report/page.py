@@ -14,6 +14,7 @@ from latex2mathml.converter import convert
 from markupsafe import Markup, escape
 
 from beliefscope import __version__
+from beliefscope.datasets.episode import durations_text
 from beliefscope.datasets.text import plural
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Table, Value
@@ -94,12 +95,13 @@ def inline_svg(item: Item, prefix: str) -> Markup:
 def _header(report: Report, summary: Section) -> dict[str, str]:
     first = report.traces[0]
     episodes = ", ".join(str(trace.episode_index) for trace in report.traces)
-    steps = sum(map(len, report.traces))
+    steps = plural(sum(map(len, report.traces)), "step")
+    durations = durations_text([trace.episode for trace in report.traces])
     facts = {
         "Filter": f"{first.filter} ({first.kind if first.kind == 'external' else first.kind.upper()})",
         "Task": first.task.name,
         "Modalities": ", ".join(first.modalities) or "not distinguished",
-        "Episodes": f"{episodes} ({plural(steps, 'step')} in total, {first.episode.dt:g} s each)",
+        "Episodes": f"{episodes}: {steps} in total, {durations}",
         "Sensor faults": "; ".join(dict.fromkeys(str(trace.faults) or "none" for trace in report.traces)),
     }
     if first.particle_count is not None:
@@ -113,7 +115,8 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
 
 
 def _provenance(report: Report) -> dict[str, str]:
-    facts = {"Checkpoint": f"SHA-256 {report.traces[0].checkpoint_hash}"}
+    hash_ = report.traces[0].checkpoint_hash
+    facts = {"Checkpoint": f"SHA-256 {hash_}" if hash_ else "none: recorded estimates"}
     if report.checkpoint is not None:
         if isinstance(report.checkpoint, ExternalFilter):
             facts["Source"] = report.checkpoint.source

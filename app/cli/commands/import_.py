@@ -109,10 +109,11 @@ def _data_set(episodes: list[Episode], output: Path) -> console.Result:
 def _values(episodes: list[Episode]) -> tuple[dict[str, Any], str]:
     """Duration of a step and ranges of the components, as JSON values and as text."""
     from beliefscope.datasets.dataset_statistics import component_ranges
+    from beliefscope.datasets.episode import durations_text
 
     dt, ranges = episodes[0].dt, component_ranges(episodes)
     parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in ranges.items()]
-    return {"dt": dt, "ranges": ranges}, "; ".join([f"{dt:.4g} s each", *parts])
+    return {"dt": dt, "ranges": ranges}, "; ".join([durations_text(episodes), *parts])
 
 
 def _written(trace: Trace, output: Path) -> console.Result:

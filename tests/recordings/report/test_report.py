@@ -268,11 +268,11 @@ def test_captions_of_scenes_name_what_is_drawn(run_: Trace) -> None:
     contact = run_.episode.contact.astype(bool)
     touching, free = int(contact.argmax()), int(contact.argmin())
     assert contact[touching] and not contact[free]  # noqa: PT018
-    assert "Arrow: force on the end effector" in scene_caption(run_, touching)
-    assert "Arrow" not in scene_caption(run_, free)
-    assert "object at its true state (solid)" in scene_caption(run_, free)
+    assert "Arrow: force on the end effector" in scene_caption(run_, touching, True)
+    assert "Arrow" not in scene_caption(run_, free, True)
+    assert "object at its true state (solid)" in scene_caption(run_, free, True)
     plain = replace(run_, episode=replace(run_.episode, task=replace(run_.task, outline=None)))
-    assert "the true and the estimated position. Right" in scene_caption(plain, free)
+    assert "the true and the estimated position. Right" in scene_caption(plain, free, True)
 
 
 def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
