@@ -343,14 +343,17 @@ class Task:
         return change
 
     def near(self, states: NDArray[Any], reference: NDArray[Any]) -> NDArray[Any]:
-        """States (..., n) to display beside a reference, whose rotation vectors are the reference plus the difference.
+        """States (..., n) to display beside a reference: angles of the same turn, rotation vectors plus the difference.
 
-        Rotation vectors jump at an angle of pi; these do not, and their errors are those of ``difference``. Where the
-        reference is unknown, and without rotations, states are unchanged.
+        So states do not jump where the reference does not, and their errors are those of ``difference``. Where the
+        reference is unknown, and without angles, states are unchanged.
         """
-        if not self.rotations:
+        if not self.angles:
             return states
+        angles = [i for i in self.angles if not self.components[i].rotation]
         result = np.array(states)
+        turns = np.nan_to_num(np.rint((reference[..., angles] - result[..., angles]) / (2.0 * np.pi)))
+        result[..., angles] += 2.0 * np.pi * turns
         for where in self.rotations:
             base = np.broadcast_to(reference[..., where], result[..., where].shape)
             moved = base + rotations.difference(result[..., where], base)

@@ -21,7 +21,7 @@ from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.file import current_array, current_kind, stored_faults
 from beliefscope.inspect.traces.validate import validate_trace
 from beliefscope.recordings.rerun_log.metadata import properties_of, reading
-from beliefscope.recordings.rerun_log.stream import entity_path
+from beliefscope.recordings.rerun_log.stream import escaped_path
 from beliefscope.recordings.schema import (
     APPLICATION,
     FORMAT_VERSION,
@@ -68,7 +68,7 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows, given: Iterable[Task]
     steps, shapes = int(header["steps"]), json.loads(header["shapes"])
     if steps == GROWING:
         steps = _complete(path, shapes, rows)
-    arrays = {name: _assemble(path, name, rows[entity_path(name)], steps, entry) for name, entry in shapes.items()}
+    arrays = {name: _assemble(path, name, rows[escaped_path(name)], steps, entry) for name, entry in shapes.items()}
     origin, settings = json.loads(header["episode"]), json.loads(header["settings"])
     observations = {
         name.removeprefix("observations/"): array for name, array in arrays.items() if name.startswith("observations/")
@@ -154,7 +154,7 @@ def _values(batch: pa.RecordBatch) -> list[tuple[NDArray[np.int64] | None, NDArr
 
 def _complete(path: Path, shapes: dict[str, Any], rows: Rows) -> int:
     """Number of complete steps of an unfinished live run. Drops rows of incomplete steps."""
-    over_steps = [entity_path(name) for name, (shape, _) in shapes.items() if 0 not in shape]
+    over_steps = [escaped_path(name) for name, (shape, _) in shapes.items() if 0 not in shape]
     over_steps = [name for name in over_steps if not rows[name] or any(index is not None for index, _ in rows[name])]
     steps = min(sum(len(index) for index, _ in rows[name] if index is not None) for name in over_steps)
     if not steps:

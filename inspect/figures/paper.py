@@ -264,7 +264,8 @@ def weights_figure(trace: Trace) -> Figure:
 def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
     steps = _step_axis(trace).positions
     factor = trace.task.components[component].conversion[1]
-    *unimodal, fused = factor * measures.means(trace)[..., component].T
+    means = trace.task.near(measures.means(trace), trace.episode.states[:, None])
+    *unimodal, fused = factor * means[..., component].T
     axes.plot(
         steps, fused, label="fused", color=COLOURS["fused"], lw=2.4
     )  # wide, so that a dominant modality on top leaves it visible

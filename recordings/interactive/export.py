@@ -15,7 +15,6 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from beliefscope import __version__
-from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint
@@ -27,6 +26,7 @@ from beliefscope.inspect.palette import colour, colour_table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.provenance import describe
+from beliefscope.inspect.traces.sensors import displayed_sensors, sensor_pixels
 
 FOLDER = Path(__file__).parent
 
@@ -143,7 +143,8 @@ def _layer(trace: Trace, name: str) -> dict[str, str]:
 
 def _components(trace: Trace) -> list[dict[str, Any]]:
     """Truth, and mean and standard deviation (T, L) of each component, in units for display."""
-    means, covariances = measures.means(trace), measures.covariances(trace)
+    means = trace.task.near(measures.means(trace), trace.episode.states[:, None])
+    covariances = measures.covariances(trace)
     std = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     return [
         {
@@ -174,13 +175,13 @@ def _weights(trace: Trace) -> dict[str, Any] | None:
 
 
 def _images(trace: Trace) -> list[dict[str, Any]]:
-    """Images as the filter received them, gray or RGB, T x H x W x channels."""
+    """Images as the filter received them, gray or RGB, and arrays as gray levels, T x H x W x channels."""
     images = []
-    for key, values in trace.episode.observations.items():
-        if is_image(values):
-            channels = values.shape[3] if values.ndim == 4 else 1
-            size = {"height": values.shape[1], "width": values.shape[2], "channels": channels}
-            images.append({"name": key, **size, "data": _packed(values)})
+    for sensor in displayed_sensors(trace):
+        if not sensor.points:
+            size = {"height": sensor.height, "width": sensor.width, "channels": sensor.channels}
+            name = sensor.name if sensor.low is None else f"{sensor.name}, {sensor.low:.3g} to {sensor.high:.3g}"
+            images.append({"name": name, **size, "data": _packed(sensor_pixels(trace, sensor.name))})
     return images
 
 

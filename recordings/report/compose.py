@@ -39,8 +39,9 @@ from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.sensors import displayed_sensors
 from beliefscope.recordings.report.diagnosis import report_diagnosis
-from beliefscope.recordings.report.figures import error_figure, event_figure, shown_sensors, zoom_of
+from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
 from beliefscope.recordings.report.page import page
 from beliefscope.recordings.report.pdf import print_page
@@ -259,7 +260,7 @@ class Writer:
                 zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:
             caption = f"Estimates as offsets from the true position. No maps: {self.no_maps}."
-        if shown_sensors(trace):
+        if any(not sensor.points for sensor in displayed_sensors(trace)):
             caption = f"Inputs of the filter. {caption}"
         scene = [] if trace.task.floor is None else [draw_step(trace, step, zoomed)]
         has_map = zoomed is not None

@@ -10,9 +10,7 @@ from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import with_unit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
@@ -20,6 +18,7 @@ from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.sensors import displayed_sensors
 
 COLUMNS = 4
 """Maximum number of panels per row."""
@@ -80,14 +79,8 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
     return figure
 
 
-def shown_sensors(trace: Trace) -> dict[str, NDArray[Any]]:
-    """Images (T, H, W) or (T, H, W, 3), and arrays of numbers (T, H, W), by sensor."""
-    readings = trace.episode.observations
-    return {k: v for k, v in readings.items() if is_image(v) or (k in trace.task.arrays and v.ndim == 3)}
-
-
 def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int = 1) -> Figure:
-    """Inputs of the filter (``shown_sensors``), and maps and estimates at a step as offsets from the true position.
+    """Inputs of the filter (``displayed_sensors``), and maps and estimates at a step as offsets from the true position.
 
     Arrays are in colours over the range of the run.
 
@@ -95,7 +88,7 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
         map_: None to show the estimates only.
         zoom: magnification of the map.
     """
-    images = shown_sensors(trace)
+    images = [sensor for sensor in displayed_sensors(trace) if not sensor.points]
     layers = map_.layers if map_ is not None else ("estimates",)
     count = len(images) + len(layers)
     columns = min(COLUMNS, count)
@@ -105,14 +98,14 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
         figure = Figure(figsize=(WIDTH * columns / COLUMNS + beside, 2.05 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes, (key, readings) in zip(grid, images.items(), strict=False):
-            levels = {"cmap": "gray", "vmin": 0, "vmax": 255}
-            if not is_image(readings):
-                levels = {"cmap": "viridis", "vmin": readings.min(), "vmax": readings.max()}
-            axes.imshow(readings[step], interpolation="nearest", **levels)
+        for axes, sensor in zip(grid, images, strict=False):
+            image, levels = trace.episode.observations[sensor.name][step], {"cmap": "gray", "vmin": 0, "vmax": 255}
+            if sensor.low is not None:
+                levels = {"cmap": "viridis", "vmin": sensor.low, "vmax": sensor.high}
+            axes.imshow(image, interpolation="nearest", **levels)
             axes.set(xticks=[], yticks=[])
-            lost = is_image(readings) and not readings[step].any()
-            axes.set_title(key + (", blackout" if lost else ""), loc="left", fontsize=7.5)
+            lost = sensor.low is None and not image.any()
+            axes.set_title(sensor.name + (", blackout" if lost else ""), loc="left", fontsize=7.5)
         for i, layer in enumerate(layers):
             index = len(images) + i
             _draw_layer(grid[index], trace, step, map_, layer, zoom)

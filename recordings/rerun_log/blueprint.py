@@ -18,7 +18,7 @@ from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab
 from beliefscope.recordings.rerun_log.entities import SIGMAS, angles, plane_height, positions
-from beliefscope.recordings.rerun_log.stream import entity_path
+from beliefscope.recordings.rerun_log.stream import escaped_path
 from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
@@ -118,14 +118,14 @@ def _eye(
 
 
 def _camera(key: str) -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(origin=entity_path(f"observations/{key}"), name="Camera")
+    return rrb.Spatial2DView(origin=escaped_path(f"observations/{key}"), name="Camera")
 
 
 def _points(key: str, trace: Trace) -> rrb.Spatial3DView:
     """A scan or point cloud from above, x upwards."""
     extent = extent_of(points_of(trace.task, key, trace.episode.observations[key]))
     return rrb.Spatial3DView(
-        origin=entity_path(f"points/{key}"),
+        origin=escaped_path(f"points/{key}"),
         name=display_name(key),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         eye_controls=_eye(np.zeros(3), np.array([0.0, 0.0, EYE_HEIGHT * extent]), (1, 0, 0)),
@@ -137,7 +137,7 @@ def _map(layer: str, first: LikelihoodMap) -> rrb.View:
     name = layer if first.quantity == "likelihood" else f"{layer} {first.quantity}"  # long titles are cut
     # Without bounds, the view would zoom out to include estimates outside the map.
     bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
-    return rrb.Spatial2DView(origin=entity_path(f"maps/{layer}"), name=name, visual_bounds=bounds)
+    return rrb.Spatial2DView(origin=escaped_path(f"maps/{layer}"), name=name, visual_bounds=bounds)
 
 
 def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
@@ -200,7 +200,7 @@ def _linked() -> rrb.TimeAxis:
 def _plot(origin: str, name: str, limits: tuple[float, float] | None = None, legend: bool = True) -> rrb.TimeSeriesView:
     axis = None if limits is None else rrb.ScalarAxis(range=limits)
     return rrb.TimeSeriesView(
-        origin=entity_path(origin),
+        origin=escaped_path(origin),
         name=name,
         axis_x=_linked(),
         axis_y=axis,

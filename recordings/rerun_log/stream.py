@@ -15,7 +15,7 @@ from beliefscope.recordings.schema import APPLICATION
 BLOCK = 1 << 16  # bytes in a pipe
 
 
-def entity_path(path: str) -> str:
+def escaped_path(path: str) -> str:
     """A path whose names have Rerun's escapes of special characters, such as spaces."""
     return "/".join(map(rr.escape_entity_path_part, path.split("/")))
 
@@ -57,11 +57,11 @@ class FileStream(rr.RecordingStream):
                 except OSError as error:
                     self._error = error  # and read on: Rerun must never wait
 
-    def log(self, path: Any, *args: Any, **options: Any) -> None:
-        super().log(entity_path(path), *args, **options)
+    def log(self, entity_path: Any, *args: Any, **options: Any) -> None:
+        super().log(escaped_path(entity_path), *args, **options)
 
-    def send_columns(self, path: Any, *args: Any, **options: Any) -> None:
-        super().send_columns(entity_path(path), *args, **options)
+    def send_columns(self, entity_path: Any, *args: Any, **options: Any) -> None:
+        super().send_columns(escaped_path(entity_path), *args, **options)
 
     def flush(self, *, timeout_sec: float = 1e38) -> None:
         super().flush(timeout_sec=timeout_sec)

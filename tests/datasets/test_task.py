@@ -122,3 +122,12 @@ def test_lengths_of_a_large_map_are_in_metres(half_width: float, key: str) -> No
     assert [component.key for component in task.components][::2] == [key, "height_mm"]
     assert task.main_error.key == f"position_{key.partition('_')[2]}"
     assert not difference(task_from_json(task_to_json(task)), task)
+
+
+def test_angles_are_displayed_in_the_turn_of_the_reference() -> None:
+    task = Task("cart", (Component("x", "m"), Component("yaw", "rad")), {"gps": (1,)}, {"gps": ("gps",)}, 0, 0.1)
+    states = np.array([[50.0, -3.1], [50.0, 0.2], [50.0, 0.1]], np.float32)
+    reference = np.array([[0.0, 3.1], [0.0, 6.4], [0.0, np.nan]], np.float32)
+    near = task.near(states, reference)
+    np.testing.assert_allclose(near, [[50.0, 2 * np.pi - 3.1], [50.0, 0.2 + 2 * np.pi], [50.0, 0.1]], rtol=1e-6)
+    assert np.array_equal(task.near(states, states), states)
