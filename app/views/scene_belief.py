@@ -3,6 +3,7 @@
 Axes: x away from the robot, y to its left, z up, in m. Colors are those of the recordings (``recordings.schema``).
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from beliefscope.inspect.trace import Trace
 
 POLE_RADIUS = 0.005  # m
 FLOOR_MAP_HEIGHT = 0.003  # m above the floor
+NEAR, FAR = 0.01, 1000.0  # m, smallest and largest distance that is drawn, viser's defaults
 AMBIENT_LIGHT = 1.0  # intensity, in place of the environment map
 EDGE_OFFSET = 0.002  # m from the surfaces of an object to the edges of its outline
 
@@ -114,6 +116,7 @@ class BeliefScene:
         camera = server.initial_camera
         camera.position, camera.look_at = self.viewpoints["first"]
         camera.fov = np.deg2rad(45.0)
+        camera.near, camera.far = drawn_distances(self.viewpoints.values())
 
     def set_trace(self, trace: Trace) -> None:
         """Use another part of the run: later steps of ``move`` refer to it."""
@@ -222,6 +225,12 @@ class BeliefScene:
                 else:
                     scene.add_box(path, color, (x, y, z), opacity=0.25, **SHADING)
         return frames
+
+
+def drawn_distances(viewpoints: Iterable[tuple[Array, Array]]) -> tuple[float, float]:
+    """Smallest and largest distance from the eye that are drawn, m: more than the defaults in a scene of kilometres."""
+    factor = max(1.0, *(3.0 * float(np.linalg.norm(eye - target)) / FAR for eye, target in viewpoints))
+    return factor * NEAR, factor * FAR
 
 
 class ComparisonEstimate:

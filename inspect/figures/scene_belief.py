@@ -13,6 +13,7 @@ from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.scene_shapes import RGB, grid, on_floor
 from beliefscope.inspect.maps.modality_shares import modality_shares
+from beliefscope.inspect.maps.plane import plane_of
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace
@@ -23,6 +24,7 @@ SIGMAS = 2.0  # size of the contours
 BELIEF_HEIGHT = 0.10  # m from the anchor to the plane of particles and contours
 POLE_STEP = 0.06  # m, height difference between poles, so that their labels do not overlap
 DISC_SPACING = 0.002  # m between contours; discs in the same plane would flicker
+LARGE = 2.0  # m, extent of the true positions above which poles, points and spacings are larger in proportion
 FULL_SIZE = 0.1  # m, half width of a map below which poles, points and spacings are smaller in proportion
 MIN_AXIS = 1e-6  # m, half axis of a contour
 GRAY_LEVEL = 130.0  # gray value of a particle without weight
@@ -62,7 +64,10 @@ class DrawnBelief:
         self.outline = None if task.outline is None else task.outline(states)
         flat = np.concatenate([on_floor(task, states), np.zeros_like(states[..., :1])], axis=-1)
         self.anchors: Array = flat if self.outline is None else self.outline.anchor
-        self.scale = min(1.0, task.map_half_width / FULL_SIZE) if task.floor is not None else 1.0
+        half_width = plane_of(trace).half_widths[0]
+        extent = float(np.ptp(on_floor(task, trace.anchors), axis=0).max())
+        self._half_width = max(half_width, extent / 2.0)
+        self.scale = max(min(1.0, half_width / FULL_SIZE), extent / LARGE) if task.floor is not None else 1.0
         self.above = 0.0 if self.outline is None else BELIEF_HEIGHT
         self.level = float(self.anchors[0, 0, 2]) + self.above
 
@@ -116,7 +121,7 @@ class DrawnBelief:
         # Not vertically above, where the up direction of the view would be undefined.
         viewpoints = {
             "first": (target + eye, target),
-            "above": (center + EYE_ABOVE * self._task.map_half_width, center),
+            "above": (center + EYE_ABOVE * self._half_width, center),
         }
         if self._task.camera is not None:
             position, target = camera_axis(self._task.camera)

@@ -13,6 +13,7 @@ from beliefscope.datasets.simulation.shapes import Shape, shapes
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.meshes import mesh_of
 from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap
+from beliefscope.inspect.maps.plane import plane_of
 from beliefscope.inspect.palette import colour_table
 from beliefscope.inspect.trace import Trace
 
@@ -23,7 +24,9 @@ UP = np.array([0.0, 0.0, 1.0])
 DASHES = 5  # per edge, with gaps of the same length
 SHORT_EDGE = 0.03  # m: of shorter edges, every second one is drawn without gaps
 LOG_RANGE = 40.0  # nats below the peak at the lower end of a map's colors, as on the page
-GRID_CELLS = (0.002, 0.005, 0.01, 0.05, 0.1, 0.25, 1.0)  # m, candidate cell sizes of the grid
+GRID_CELLS = (0.002, 0.005, 0.01, 0.05, 0.1, 0.25, *np.outer(10.0 ** np.arange(6), (1.0, 5.0)).ravel())
+"""Candidate cell sizes of the grid, m."""
+
 MAX_GRID_CELLS = 14  # per side
 
 # A unit disc in the plane z = 0: vertices on its rim, then its center; and the triangles between them.
@@ -97,7 +100,7 @@ def on_floor(task: Task, values: Array) -> Array:
 
 def grid(task: Task, trace: Trace) -> Grid:
     """The grid of whole cells that contains the truth and its maps."""
-    truth, margin = on_floor(task, trace.anchors), 1.0 if task.floor is None else task.map_half_width
+    truth, margin = on_floor(task, trace.anchors), 1.0 if task.floor is None else plane_of(trace).half_widths[0]
     low, high = truth.min(axis=0) - margin, truth.max(axis=0) + margin
     cell = next((size for size in GRID_CELLS if (high - low).max() <= MAX_GRID_CELLS * size), GRID_CELLS[-1])
     low, high = np.floor(low / cell) * cell, np.ceil(high / cell) * cell

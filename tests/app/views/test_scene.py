@@ -9,6 +9,7 @@ import pytest
 
 from beliefscope.app.protocol.messages import LAYERS
 from beliefscope.app.protocol.trace_format import scene_layers
+from beliefscope.app.views.scene_belief import drawn_distances
 from beliefscope.app.views.scene_context import IMAGE_DISTANCE
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
@@ -166,3 +167,11 @@ def test_the_start_view_contains_the_robot_and_the_camera_with_its_image(task: s
     assert depths.min() > 0.0
     assert np.abs((points - eye) @ np.cross(aside, ahead) / depths).max() < 1.0
     assert np.abs((points - eye) @ aside / depths).max() < 4.0 / 3.0, "also in a panel of 4:3"
+
+
+def test_all_of_a_scene_of_kilometres_is_drawn() -> None:
+    target = np.zeros(3)
+    assert drawn_distances([(np.array([0.0, 0.0, 5.0]), target)]) == (0.01, 1000.0)
+    near, far = drawn_distances([(np.array([0.0, 0.0, 5.0]), target), (np.array([0.0, 0.0, 4000.0]), target)])
+    assert far == 12_000.0
+    assert near == pytest.approx(0.12)

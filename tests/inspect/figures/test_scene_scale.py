@@ -36,3 +36,14 @@ def test_poles_and_grid_are_as_small_as_the_map(half_width: float) -> None:
 def test_scenes_of_full_size_are_not_scaled() -> None:
     full = run(0.135)
     assert DrawnBelief(full.task, full).scale == 1.0
+
+
+def test_scenes_of_long_paths_have_a_coarse_grid_and_high_poles() -> None:
+    still = run(20.0)
+    states = np.linspace([0.0, 0.0], [1000.0, 300.0], 30, dtype=np.float32)
+    path = replace(still, episode=replace(still.episode, states=states), estimate_mean=states)
+    small, large = DrawnBelief(still.task, still), DrawnBelief(path.task, path)
+    assert len(grid(path.task, path).lines) < 32
+    assert large.pole_height(0) == pytest.approx(500.0 * small.pole_height(0))
+    eye, target = large.viewpoints(None)["above"]
+    assert np.linalg.norm(eye - target) > 1000.0
