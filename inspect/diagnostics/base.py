@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import find_profile
 from beliefscope.inspect.diagnostics.views import Views
@@ -60,7 +61,7 @@ class Entry:
         run: (traces, checkpoint) -> result. The traces are of one filter; with several, results have bounds and
             intervals over episodes. ``options`` are passed by name.
         why_not: (trace, checkpoint or None) -> one-line reason why the diagnostic does not apply, or None.
-        needs: ``trace`` only, or the ``checkpoint`` too.
+        needs: ``trace`` only, the ``checkpoint`` too, or a ``filter`` that can be run, unlike that of a live run.
         slow: takes more than two seconds; computed on request only.
         options: option -> description.
         statistics: trace -> statistics of a healthy profile (``HealthyProfile``). Such a diagnostic takes the
@@ -72,7 +73,7 @@ class Entry:
     question: str
     run: Callable[..., Diagnostic]
     why_not: Callable[[Trace, Checkpoint | None], str | None] = lambda trace, checkpoint: None
-    needs: Literal["trace", "checkpoint"] = "trace"
+    needs: Literal["trace", "checkpoint", "filter"] = "trace"
     slow: bool = False
     options: Mapping[str, str] = field(default_factory=dict)
     statistics: Callable[[Trace], dict[str, float]] | None = None
@@ -113,8 +114,8 @@ class Entry:
 
     def refusal(self, trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         """One-line reason why the diagnostic cannot be computed, or None."""
-        if self.needs == "checkpoint":
-            if checkpoint is None:
+        if self.needs != "trace":
+            if checkpoint is None or (self.needs == "filter" and isinstance(checkpoint, UnavailableFilter)):
                 return f"{self.name} needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
             if checkpoint.hash != trace.checkpoint_hash:
                 return f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"
@@ -137,7 +138,7 @@ class Entry:
                 )
         if self.statistics is not None:
             options["healthy"] = self.compare(traces, checkpoint)
-        return self.run(traces, checkpoint, **options) if self.needs == "checkpoint" else self.run(traces, **options)
+        return self.run(traces, checkpoint, **options) if self.needs != "trace" else self.run(traces, **options)
 
     def compare(self, traces: Sequence[Trace], checkpoint: Checkpoint | None) -> Comparison | None:
         """Compare the traces with the filter's healthy profile; None without one."""

@@ -243,6 +243,6 @@ ENTRY = Entry(
     question="Does the error fall with another sign, scale, delay or order of axes of a sensor or of the controls?",
     run=conventions,
     why_not=why_not,
-    needs="checkpoint",
+    needs="filter",
     slow=True,
 )

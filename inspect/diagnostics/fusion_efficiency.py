@@ -255,6 +255,6 @@ ENTRY = Entry(
     question="How close is the fused error to the best that the modalities allow, and which property causes the gap?",
     run=fusion_efficiency,
     why_not=why_not,
-    needs="checkpoint",
+    needs="filter",
     slow=True,
 )

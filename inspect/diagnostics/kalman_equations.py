@@ -290,5 +290,5 @@ ENTRY = Entry(
     question="Do the Jacobians and updates of an external Kalman filter follow from its own functions?",
     run=check_equations,
     why_not=why_not,
-    needs="checkpoint",
+    needs="filter",
 )

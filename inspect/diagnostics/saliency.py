@@ -345,7 +345,7 @@ ENTRY = Entry(
     question="Which pixels and which channels of the other sensors determined the result of a step?",
     run=saliency,
     why_not=why_not,
-    needs="checkpoint",
+    needs="filter",
     slow=True,
     options={
         "step": "step of the episode; by default the one with the largest position error",

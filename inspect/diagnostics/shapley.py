@@ -361,7 +361,7 @@ ENTRY = Entry(
     question="How much does each modality lower or raise the error, overall and by phase?",
     run=shapley,
     why_not=why_not,
-    needs="checkpoint",
+    needs="filter",
     slow=True,
     options={
         "offset": "initial error in standard deviations of the initial belief, 0 by default; direction by seed and "

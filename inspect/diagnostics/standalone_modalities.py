@@ -220,6 +220,6 @@ ENTRY = Entry(
     question="How accurate is each modality by itself, and is fusion more accurate?",
     run=standalone_modalities,
     why_not=why_not,
-    needs="checkpoint",
+    needs="filter",
     slow=True,
 )

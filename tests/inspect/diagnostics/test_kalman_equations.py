@@ -12,6 +12,7 @@ from tests.inspect.diagnosis.test_innovation_checks import FLIPPED, STD, Array, 
 
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnostics.kalman_equations import KalmanEquations, check_equations, jacobian_statistics
@@ -156,6 +157,15 @@ def test_a_filter_without_finite_differences_has_other_diagnostics() -> None:
     results, reasons = run_diagnostics([run(Widening())], loaded(Widening()))
     assert "consistency" in results
     assert "they depend on more than its belief and its inputs" in reasons["equations"]
+
+
+def test_without_a_filter_to_run_a_live_run_has_the_diagnostics_of_its_trace() -> None:
+    trace = run(Boat())
+    unavailable = UnavailableFilter(trace.filter, trace.checkpoint_hash, trace.task)
+    results, reasons = run_diagnostics([trace], unavailable, slow=True)
+    assert {"consistency", "innovations", "errors"} <= set(results)
+    for name in ("standalone", "efficiency", "equations", "shapley", "saliency", "conventions"):
+        assert "needs the filter, not only its trace" in reasons[name]
 
 
 class Timed(Boat):
