@@ -11,9 +11,11 @@ import numpy as np
 from beliefscope.recordings.log_readers.arrays import Columns
 from beliefscope.recordings.log_readers.column_map import QUATERNION, base_name
 from beliefscope.recordings.log_readers.messages import Preview
+from beliefscope.recordings.log_readers.table_folder import FILE
 
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
-ESTIMATE = r"est|mean|pred|filter|posterior|belief"
+ESTIMATE = r"(?<![a-z])est|mean|pred|filter|posterior|belief"
+STD = r"std|sigma|σ|(^|_)sd(_|$)"
 POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
@@ -51,11 +53,13 @@ def _table(columns: Columns) -> list[str]:
     rows = {n: values for n, values in columns.items() if values.ndim > 1}
     time = _named(r"^(t|time|timestamp|stamp)(_s)?$", flat)
     episode = _named(r"^episode(_index|_id)?$", [*columns])
-    counters = _named(r"^(frame_|task_)?index$", flat)
+    counters = _named(r"^(frame_|task_)?index$|^__index_level_\d+__$", flat)
+    dates = [n for n, values in columns.items() if values.ndim == 1 and values.dtype.kind == "M"]
+    time = time or dates[:1]
     state = _components(_named(TRUTH, flat), rows, _named(TRUTH, [*rows]))
-    std = _named(r"std|sigma|(^|_)sd(_|$)", flat)
+    std = _named(STD, flat) or [n for n in _named(STD, [*rows]) if rows[n].ndim == 2][:1]
     mean = [n for n in _named(ESTIMATE, flat) if n not in std] or [
-        n for n in _named(ESTIMATE, [*rows]) if rows[n].ndim == 2
+        n for n in _named(ESTIMATE, [*rows]) if rows[n].ndim == 2 and n not in std
     ][:1]
     ensemble = _named(r"ensemble|particle|sample", [n for n in rows if rows[n].ndim == 3])[:1]
     square = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]]
@@ -67,6 +71,7 @@ def _table(columns: Columns) -> list[str]:
     used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control, *flags}
     used |= {n.partition("[")[0] for n in state.values()}
     sensors = _sensors([n for n in columns if n not in used and (n in flat or n in rows)], flat)
+    texts = [n for n, values in columns.items() if n not in used and n not in flat and n not in rows and n != FILE]
     lines = [f"time = {_text(time[0])}" if time else f"dt = {DT}  # s per row"]
     lines += [f"episode = {_text(episode[0])}"] if episode else []
     lines += [f"control = {_text(control[0])}"] if control else []
@@ -79,7 +84,7 @@ def _table(columns: Columns) -> list[str]:
         deviations = std if complete and not covariance else []
         columns_of = {"mean": mean, "std": deviations, "covariance": covariance, "particles": ensemble}
         lines += [f"{key} = {_text(n[0]) if len(n) == 1 else _texts(n)}" for key, n in columns_of.items() if n]
-    return lines
+    return lines + ([f"# not numbers, for time, episode or [covariates]: {_texts(texts)}"] if texts else [])
 
 
 def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
@@ -165,9 +170,9 @@ def _sensors(names: Sequence[str], flat: Sequence[str]) -> dict[str, str | list[
 def _sections(state: Mapping[str, str], sensors: Mapping[str, str | list[str]]) -> list[str]:
     """Lines of [state] and [sensors]."""
     lines = ["[state]  # true values: component = column in m, or {column = NAME, unit = cm, rad, deg, or any}"]
-    lines += [f"{component} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
+    lines += [f"{_quoted(component)} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
     lines += ["[sensors]  # sensor = column or list of columns; each is a modality unless [modalities] groups them"]
-    return lines + [f"{key} = {_text(n) if isinstance(n, str) else _texts(n)}" for key, n in sensors.items()]
+    return lines + [f"{_quoted(key)} = {_text(n) if isinstance(n, str) else _texts(n)}" for key, n in sensors.items()]
 
 
 def _named(pattern: str, names: Sequence[str]) -> list[str]:
@@ -191,7 +196,12 @@ def _components(flat: Sequence[str], rows: Columns, arrays: Sequence[str]) -> di
 
 
 def _key(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "column"
+    return re.sub(r"[^\w-]+", "_", name).strip("_") or "column"
+
+
+def _quoted(key: str) -> str:
+    """A key of TOML, which are letters from A to Z, digits, hyphens and underscores without quotes."""
+    return key if key.isascii() else _text(key)
 
 
 def _text(name: str) -> str:
