@@ -132,15 +132,21 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
         if component.unit == "rad":
             yield f"{component.label} speed", "rad/s", np.abs(change[:, i]) / durations
     for key, array in episode.observations.items():
-        if is_image(array):
-            pixels = array.reshape(len(array), -1)
-            yield f"{display_name(key)} brightness", "", pixels.mean(1)
-            yield f"{display_name(key)} contrast", "", pixels.std(1)
-        elif array.ndim == 2 and array.shape[1] > 1:
-            yield f"{display_name(key)} magnitude", "", np.linalg.norm(array, axis=1)
-            motion = np.diff(array, axis=0, prepend=array[:1])
-            yield f"{display_name(key)} change", "", np.linalg.norm(motion, axis=1)
+        known = np.maximum.accumulate(episode.present(key))  # there is no reading before the first one
+        for name, values in _reading_columns(array):
+            yield f"{display_name(key)} {name}", "", np.where(known, values, np.nan)
     yield "control magnitude", "", np.linalg.norm(episode.controls, axis=1)
+
+
+def _reading_columns(array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Name and values (T,) of the covariates of a sensor's readings (T, ...)."""
+    if is_image(array):
+        pixels = array.reshape(len(array), -1)
+        yield "brightness", pixels.mean(1)
+        yield "contrast", pixels.std(1)
+    elif array.ndim == 2 and array.shape[1] > 1:
+        yield "magnitude", np.linalg.norm(array, axis=1)
+        yield "change", np.linalg.norm(np.diff(array, axis=0, prepend=array[:1]), axis=1)
 
 
 def _duration(mask: Mask, durations: Array) -> Array:

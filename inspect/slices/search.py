@@ -73,7 +73,8 @@ class Condition:
     def __str__(self) -> str:
         """``panel friction > 2.1``, ``1 s < outage length <= 2 s``, ``contact`` or ``policy is push``."""
         if self.category is not None:
-            switch = {"yes": self.covariate, "no": f"no {self.covariate}"}
+            yes, no = self.covariate, f"no {self.covariate}"
+            switch = {"yes": yes, yes: yes, "no": no, no: no}
             return switch.get(self.category, f"{self.covariate} is {self.category}")
         unit, factor = _shown(self.unit)
         low, high = (None if end is None else f"{factor * end:.3g} {unit}".strip() for end in (self.low, self.high))

@@ -15,7 +15,7 @@ from beliefscope.recordings.log_readers.table_folder import FILE
 
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"(?<![a-z])est|mean|pred|filter|posterior|belief"
-STD = r"std|sigma|σ|(^|_)sd(_|$)"
+STD = r"std|sigma|\u03c3|(^|_)sd(_|$)"  # \u03c3 is the letter sigma
 POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)

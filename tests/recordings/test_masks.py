@@ -21,6 +21,7 @@ from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+from beliefscope.inspect.slices.covariates import _step_columns
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader
@@ -205,3 +206,17 @@ def test_a_recording_keeps_names_with_spaces_and_signs(
     run = trace(as_external(still, "still"), named)
     assert_same(read_recording(write_recording(run, tmp_path / "run.rrd")), run)
     assert "entity path" not in capfd.readouterr().err
+
+
+def test_slices_have_no_reading_before_the_first_one(run: Trace, episode: Episode) -> None:
+    late = np.concatenate([np.zeros(10, np.float32), episode.covariates["image"][10:]])
+    camera = hold(episode.observations["camera"], late > 0)
+    part = replace(
+        episode,
+        covariates={**episode.covariates, "image": late},
+        observations={**episode.observations, "camera": camera},
+    )
+    columns = {name: values for name, _, values in _step_columns(replace(run, episode=part), TASK)}
+    first = int(late.argmax())
+    assert np.isnan(columns["camera brightness"][:first]).all()
+    np.testing.assert_allclose(columns["camera brightness"][first:], camera[first:].mean((1, 2)))

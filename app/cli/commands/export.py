@@ -17,7 +17,7 @@ def export(
     ),
     output: Path = opt.option(
         "FILE|DIR",
-        "Output: .parquet, .mcap, .npz, or .html for an interactive page; or a folder.",
+        "Output: .parquet, .mcap, .npz, .rrd for Rerun, or .html for an interactive page; or a folder.",
         ...,
         "-o",
         "--output",
@@ -26,12 +26,13 @@ def export(
     filter: str = opt.TRACE_FILTER,
     interactive: bool = opt.flag("Write interactive pages: the default for .html and for folders.", "--interactive"),
 ) -> console.Result:
-    """Export traces as tables or interactive pages.
+    """Export traces as tables, recordings or interactive pages.
 
     Parquet has one row per step and one column per number, for pandas and similar tools. MCAP has one topic per array,
-    and images and particles in Foxglove's schemas. npz has the arrays unchanged. Names: docs/recordings.md. HTML is one
-    file that works offline, for a paper's supplement or a colleague: timeline, maps, scene from above, images, values
-    and diagnosis under one cursor; run.html#step=42 opens a step. A folder has a page for each trace, and index.html.
+    and images and particles in Foxglove's schemas. npz has the arrays unchanged. Names: docs/recordings.md. A Rerun
+    recording has the diagnostics, but no maps. HTML is one file that works offline, for a paper's supplement or a
+    colleague: timeline, maps, scene from above, images, values and diagnosis under one cursor; run.html#step=42 opens a
+    step. A folder has a page for each trace, and index.html.
 
     \b
     Examples:
@@ -52,11 +53,27 @@ def export(
         return opt.trace_result(_page(sources[0], output, task, filter), output)
     if interactive:
         raise BadInput(f"--interactive writes a page: output {str(output)!r} must end in .html")
-    check_name("export format", output.suffix.removeprefix(".").lower(), (*FORMATS, "html"))
+    if output.suffix == ".rrd":
+        return opt.trace_result(_recording(sources[0], output, task, filter), output)
+    check_name("export format", output.suffix.removeprefix(".").lower(), (*FORMATS, "html", "rrd"))
     export_format(output)
     trace = open_trace(sources[0], task)
     export_trace(trace, output)
     return opt.trace_result(trace, output)
+
+
+def _recording(source: Path, output: Path, task: str, filter_: str) -> Trace:
+    """Write the Rerun recording of a trace, with its diagnostics."""
+    from beliefscope.inspect.catalog import quick
+    from beliefscope.inspect.traces.provenance import checkpoint_of
+    from beliefscope.recordings.open_trace import open_trace
+    from beliefscope.recordings.write import write_recording
+
+    trace = open_trace(source, task)
+    with console.progress("Recording") as advance:
+        diagnostics = quick(trace, checkpoint_of([trace], [source], filter_))
+        write_recording(trace, output, diagnostics=diagnostics, progress=advance)
+    return trace
 
 
 def _page(source: Path, output: Path, task: str, filter_: str) -> Trace:

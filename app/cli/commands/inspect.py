@@ -54,7 +54,8 @@ def inspect(
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         for name, result in results.items():
-            write_figure(result.plot(traces[0].episode.time), figures / f"{name}.{format}")
+            if (figure := result.plot(traces[0].episode.time)).axes:  # of several traces, some have tables only
+                write_figure(figure, figures / f"{name}.{format}")
     text = [f"{DIAGNOSTICS[name].title}: {result.text}" for name, result in results.items()]
     text += [f"{DIAGNOSTICS[name].title}: not available: {reason}" for name, reason in reasons.items()]
     document = {

@@ -134,3 +134,10 @@ def test_nothing_to_search() -> None:
     rng = np.random.default_rng(6)
     assert search(errors(rng), []) == []
     assert search(errors(rng), [StepCovariate("rare", "", (EPISODE < 2).astype(float), ("no", "yes"))]) == []
+
+
+@pytest.mark.parametrize(
+    ("category", "text"), [("yes", "fix"), ("fix", "fix"), ("no", "no fix"), ("no fix", "no fix"), ("3D", "fix is 3D")]
+)
+def test_switches_are_named_by_their_groups(category: str, text: str) -> None:
+    assert str(Condition("fix", "", category=category)) == text

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beliefscope.inspect.trace import load_trace
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 from log_files import START, mcap_writer
@@ -163,3 +165,19 @@ def test_mcap_files_without_topics(run: Run, tmp_path: Path) -> None:
     assert "the file has no topics" in refused(run, tmp_path / "log.mcap", TOPICS)
     (tmp_path / "log.mcap").write_bytes((tmp_path / "log.mcap").read_bytes()[:8])
     assert "not a complete MCAP file" in refused(run, tmp_path / "log.mcap", TOPICS)
+
+
+@pytest.mark.slow
+def test_estimates_of_a_log_have_a_recording_and_no_empty_figures(run: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "log.npz", **columns(), episode=np.repeat([0, 1], STEPS // 2))
+    (tmp_path / "map.toml").write_text(f'episode = "episode"\n{MAP}[estimate]\nmean = ["x", "yaw"]\n')
+    for i in range(2):
+        trace, recording = tmp_path / f"{i}.trace", tmp_path / f"{i}.rrd"
+        source = (tmp_path / "log.npz", "--map", tmp_path / "map.toml", "--episode", i)
+        assert run("import", *source, "-o", trace)[0] == 0
+        assert run("export", trace, "-o", recording)[0] == 0
+        assert run("import", recording, "-o", tmp_path / "same.trace")[0] == 0
+        assert np.array_equal(load_trace(tmp_path / "same.trace").estimate_mean, load_trace(trace).estimate_mean)
+    code, _, _ = run("inspect", tmp_path / "0.trace", tmp_path / "1.trace", "--figures", tmp_path / "figures")
+    assert code == 0
+    assert not (tmp_path / "figures" / "errors.svg").exists()
