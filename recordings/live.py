@@ -41,7 +41,7 @@ from beliefscope.filters.external.adapter import (
 from beliefscope.filters.external.step_values import stacked
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
-from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter, check_run_name
+from beliefscope.inspect.traces.live_file import LiveFileWriter, check_run_name, unused_path
 from beliefscope.inspect.traces.run import assemble_trace, step_arrays
 from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live_recording
 
@@ -136,11 +136,11 @@ class LiveRecorder:
             if like is None
             else {key: getattr(like, key) for key in ("dt", "seed", "split", "provenance")}
         )
-        self.path = _unused_path(Path(folder), name)
+        self.path = unused_path(Path(folder), name)
         self.steps = self.waited = self.lost = 0
         self._error: BadInput | None = None
         self._closed = False
-        self._queue: queue.Queue[_Row | None] = queue.Queue(QUEUE_SIZE)
+        self._queue: queue.Queue[_Row | BadInput | None] = queue.Queue(QUEUE_SIZE)
         self._writing = threading.Thread(target=self._write, name="live-data", daemon=True)
         self._views = LiveViews(self.path) if views else None
         self._writer: LiveFileWriter | None = None
@@ -180,24 +180,32 @@ class LiveRecorder:
 
         Raises BadInput at the first step only, for invalid values and if the files cannot be created.
         """
-        arrays = self._held | {key: np.array(value) for key, value in observations.items()}
-        self._held = {key: arrays[key] for key in (*self._task.periods, *self._task.masks) if key in arrays}
-        covariates = {name: key in observations for key, name in self._task.masks.items()} | dict(covariates)
-        row = _Row(
-            values
-            if isinstance(values, StepTrace)
-            else _with_batch_axis(copied(named_values(_tensors(values), "the filter", self._task))),
-            {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in arrays.items()},
-            np.array(np.zeros(self._task.control_size) if control is None else control, np.float32),
-            self._task.states(np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32)),
-            bool(np.any(arrays.get("contact", False))) if contact is None else contact,
-            self._covariates(covariates),
-            np.array(qpos, np.float32),
-            evidence,
-            time,
-        )
+        try:
+            for key in observations:
+                check_name(f"sensor of task {self._task.name!r}", key, self._task.observations)
+            arrays = self._held | {key: np.array(value) for key, value in observations.items()}
+            self._held = {key: arrays[key] for key in (*self._task.periods, *self._task.masks) if key in arrays}
+            covariates = {name: key in observations for key, name in self._task.masks.items()} | dict(covariates)
+            row: _Row | BadInput = _Row(
+                values
+                if isinstance(values, StepTrace)
+                else _with_batch_axis(copied(named_values(_tensors(values), "the filter", self._task))),
+                {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in arrays.items()},
+                np.array(np.zeros(self._task.control_size) if control is None else control, np.float32),
+                self._task.states(np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32)),
+                bool(np.any(arrays.get("contact", False))) if contact is None else contact,
+                self._covariates(covariates),
+                np.array(qpos, np.float32),
+                evidence,
+                time,
+            )
+        except Exception as error:
+            text = str(error) if isinstance(error, BadInput) else f"{type(error).__name__}: {error}"
+            if self._writer is None:
+                raise BadInput(text) from None
+            row = BadInput(f"step {self.steps}: {text}")
         self.steps += 1
-        if self._writer is None:
+        if self._writer is None and isinstance(row, _Row):
             self._begin(row)
         else:
             self.waited += int(self._queue.full())
@@ -251,8 +259,8 @@ class LiveRecorder:
         if not isinstance(row.values, StepTrace):
             check_values(row.values, (1,), self._sizes, "the filter")
             if "innovation" in row.values:  # the first step may lack measurements of later ones
-                largest = min(_largest_vector(self._task), MAX_CHANNELS)
-                self._channels = max(row.values["innovation"].shape[-1], largest)
+                largest = max((shape[0] for shape in self._task.observations.values() if len(shape) == 1), default=0)
+                self._channels = max(row.values["innovation"].shape[-1], min(largest, MAX_CHANNELS))
         elif self._checkpoint is None or row.evidence is None:
             raise BadInput("a StepTrace is recorded with its filter's checkpoint and the step's evidence")
         first = self._part([row])
@@ -280,16 +288,19 @@ class LiveRecorder:
             while len(rows) < BLOCK and not self._queue.empty():
                 rows.append(self._queue.get())
             running = rows[-1] is not None
-            block = [row for row in rows if row is not None]
+            invalid, written = [(i, row) for i, row in enumerate(rows) if isinstance(row, BadInput)], 0
+            block = [row for row in rows[: invalid[0][0] if invalid else None] if isinstance(row, _Row)]
             if block and self._error is None:
                 try:
                     self._writer.append(self._part(block))
+                    written = len(block)
                 except BadInput as error:
                     self._fail(error)
                 except Exception as error:
                     self._fail(BadInput(f"step {self._writer.steps}: {type(error).__name__}: {error}"))
-            if self._error is not None:
-                self.lost += len(block)
+            if invalid and self._error is None:
+                self._fail(invalid[0][1])
+            self.lost += sum(row is not None for row in rows) - written
         if self._error is None:
             try:
                 self._writer.finish()
@@ -298,8 +309,9 @@ class LiveRecorder:
         self._writer.close()
 
     def _fail(self, error: BadInput) -> None:
+        assert self._writer is not None
         self._error = error
-        warnings.warn(f"live run {str(self.path)!r} ends at step {self.steps}: {error}", stacklevel=2)
+        warnings.warn(f"live run {str(self.path)!r} ends at step {self._writer.steps}: {error}", stacklevel=2)
 
     def _part(self, rows: Sequence[_Row]) -> Trace:
         """Steps as a trace, of a Beliefscope or an external filter."""
@@ -359,15 +371,6 @@ class LiveRecorder:
         )
 
 
-def _unused_path(folder: Path, name: str) -> Path:
-    """The first unused of NAME, NAME-2, NAME-3, ..."""
-    number, path = 1, folder / f"{name}{SUFFIX}"
-    while path.exists():
-        number += 1
-        path = folder / f"{name}-{number}{SUFFIX}"
-    return path
-
-
 def _tensors(values: Any) -> Any:
     """NumPy arrays and numbers as tensors, including those in a dictionary or pair."""
     if isinstance(values, Mapping):
@@ -385,11 +388,6 @@ def _with_batch_axis(values: Values) -> Values:
 
 def _typed(name: str, value: Tensor) -> Tensor:
     return value.int() if name == "ancestors" else value.float()
-
-
-def _largest_vector(task: Task) -> int:
-    """Number of entries of the largest vector among the observations."""
-    return max((shape[0] for shape in task.observations.values() if len(shape) == 1), default=0)
 
 
 def _stack_evidence(evidence: Sequence[Evidence]) -> Evidence:

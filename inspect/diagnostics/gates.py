@@ -97,6 +97,9 @@ class Innovations(Diagnostic):
     def verdict(self) -> str:
         sentences = []
         for entry in self.modalities:
+            if not entry.measurements:
+                sentences.append(f"{display_name(entry.modality)}: no measurement.")
+                continue
             size = f"{display_name(entry.modality)}: NIS/m {entry.nis:.3g}"
             if not math.isnan(entry.low):
                 size += f" [{entry.low:.3g}, {entry.high:.3g}], "

@@ -51,6 +51,15 @@ Shapes = dict[str, tuple[tuple[int, ...], np.dtype[Any]]]
 """Array -> shape and dtype of one step, or of the whole array if it has no step axis."""
 
 
+def unused_path(folder: Path, name: str) -> Path:
+    """The first unused of NAME, NAME-2, NAME-3, ..."""
+    number, path = 1, folder / f"{name}{SUFFIX}"
+    while path.exists():
+        number += 1
+        path = folder / f"{name}-{number}{SUFFIX}"
+    return path
+
+
 def check_run_name(name: str) -> None:
     """Raise BadInput for a name that is not the name of a file in the folder of live runs."""
     if Path(name).name != name or name.startswith("."):

@@ -267,6 +267,29 @@ def test_later_errors_do_not_stop_the_filter(tmp_path: Path) -> None:
     assert (recorder.steps, recorder.lost) == (200, 160)
 
 
+@pytest.mark.parametrize(
+    ("later", "message"),
+    [
+        ({"values": {"estimate": np.zeros(3)}}, "step 3: filter output 'estimate' does not exist"),
+        ({"values": ["a", "b", "c"]}, "step 3: TypeError"),
+        ({"observations": {"forse": np.zeros(3)}}, "step 3: sensor 'forse' of task 'door' does not exist"),
+        ({"covariates": {"fix": True}}, "step 3: covariate 'fix' of task 'door' does not exist"),
+    ],
+)
+def test_later_invalid_arguments_do_not_stop_the_filter(tmp_path: Path, later: dict[str, Any], message: str) -> None:
+    usual = {"values": np.zeros(3), "observations": {"force": np.zeros(3)}}
+    recorder = LiveRecorder("run", task="door", folder=tmp_path, views=False)
+
+    def loop() -> None:
+        with recorder:
+            for t in range(6):
+                recorder.step(**usual | (later if t == 3 else {}))
+
+    with pytest.warns(UserWarning, match="ends at step"), pytest.raises(BadInput, match=message):
+        loop()
+    assert (LiveFileReader(recorder.path).poll(), recorder.steps, recorder.lost) == (3, 6, 3)
+
+
 def test_full_disk_ends_the_views_not_the_run(tmp_path: Path) -> None:
     (tmp_path / "run.rrd").symlink_to("/dev/full")
     with pytest.warns(UserWarning, match="recording of live run .*No space left"):
@@ -310,6 +333,8 @@ def test_no_files_without_steps(tmp_path: Path) -> None:
         (np.zeros((2, 3)), {}, {}, r"estimate_mean of shape \(2, 3\), expected \(1, 3\)"),
         (np.array([0, 0, np.nan]), {}, {}, "not finite"),
         (np.zeros(3), {"force": np.zeros(4)}, {}, r"'force' has shape \(1, 4\), not \(1, 3\)"),
+        (np.zeros(3), {"forse": np.zeros(3)}, {}, "sensor 'forse' of task 'door' does not exist"),
+        (np.zeros(3), {"force": [[1], [1, 2]]}, {}, "ValueError: setting an array element"),
         (np.zeros(3), {}, {"control": np.zeros(3)}, r"'controls' has shape \(1, 3\), not \(1, 7\)"),
         (np.zeros(3), {}, {"truth": np.zeros(2)}, r"'states' has shape \(1, 2\), not \(1, 3\)"),
     ],

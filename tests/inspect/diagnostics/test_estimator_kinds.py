@@ -45,6 +45,16 @@ def test_innovations_of_a_matched_filter_are_consistent_and_the_gate_acts() -> N
     assert gps.missed < 5
 
 
+def test_a_sensor_without_any_measurement_is_named() -> None:
+    (run,) = traces(1)
+    assert run.innovation is not None
+    innovation = run.innovation.copy()
+    innovation[:, 1] = np.nan
+    result: Any = DIAGNOSTICS["innovations"]([replace(run, innovation=innovation)])
+    assert "speed: no measurement." in result.verdict
+    assert "nan" not in result.verdict
+
+
 @pytest.mark.slow
 def test_gates_that_never_act_or_always_reject_are_reported() -> None:
     never: Any = DIAGNOSTICS["innovations"](traces(outliers=True))
