@@ -201,7 +201,8 @@ class Counterfactual(Diagnostic):
         scale, unit = main.factor, main.unit
         curves = [Curve("fused", scale * self.distance, chart, unit, "fused")]
         for k, m in enumerate(self.modalities if len(self.modalities) > 1 else ()):
-            curves.append(Curve(layer_label(m), scale * self.modality_distance[:, k], chart, unit, m))
+            if np.isfinite(self.modality_distance[:, k]).any():
+                curves.append(Curve(layer_label(m), scale * self.modality_distance[:, k], chart, unit, m))
         curves.append(
             Curve(
                 "fused",
@@ -224,8 +225,8 @@ class Counterfactual(Diagnostic):
         for i, component in enumerate(task.components):
             for values, name, layer in (
                 (self.truth, "truth", "truth"),
-                (self.original, "original", "fused"),
-                (self.counterfactual, "with intervention", "fused"),
+                (task.near(self.original, self.truth), "original", "fused"),
+                (task.near(self.counterfactual, self.truth), "with intervention", "fused"),
             ):
                 curves.append(Curve(name, factors[i] * values[:, i], component.label, units[i], layer))
         return curves

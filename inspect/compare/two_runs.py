@@ -175,6 +175,7 @@ class Comparison(Diagnostic):
             curves += [
                 Curve(layer_label(m), main.factor * self.modality_distance[:, k], chart, main.unit, m)
                 for k, m in enumerate(self.modalities)
+                if np.isfinite(self.modality_distance[:, k]).any()
             ]
 
         def both(values: Array, chart: str, unit: str = "", layer: str = "fused", prefix: str = "") -> list[Curve]:

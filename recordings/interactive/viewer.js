@@ -44,6 +44,8 @@ const scale = Math.max(1, window.devicePixelRatio);
 const LEFT = 56; // px, of the charts
 const SMALLEST_MAP = 120; // px
 const LARGEST_MAP = 240;
+/** Colours of the shaded groups of steps after the first one. */
+const BAND_COLOURS = ['#7d8fb3', '#b09a4a', '#6f9e7c'];
 
 /** @param {string} text base64 */
 const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -139,14 +141,19 @@ export class Viewer {
     this.step = 0;
     this.timer = 0;
     this.fused = run.layers.length - 1;
-    /** Masks of contact and blackout. */
-    this.bands = run.bands.map(({ name, mask }) => ({ name, mask: bytes(mask) }));
     /** Draw the panels of a step. @type {((t: number) => void)[]} */
     this.painters = [];
     /** Draw the cursor in the charts. @type {((t: number) => void)[]} */
     this.cursorPainters = [];
     this.frame = this.html('.run');
     this.frame.classList.toggle('dark', isDark());
+    const colours = [this.css('--contact'), ...BAND_COLOURS];
+    /** Masks of groups of steps, such as contact and blackout. */
+    this.bands = run.bands.map(({ name, mask }, i) => ({
+      name,
+      colour: name === 'blackout' ? this.css('--muted') : colours[i % colours.length],
+      mask: bytes(mask),
+    }));
     for (const layer of run.layers) layer.colour = legible(layer.colour);
     run.weights?.colours.forEach((colour, k, colours) => (colours[k] = legible(colour)));
     this.cursor = /** @type {HTMLInputElement} */ (this.html('#cursor'));
@@ -257,12 +264,14 @@ export class Viewer {
       result.push({ label: weights.label, unit: '', lines, stacked: true });
     }
     const layerLines = (/** @type {Row[]} */ values) =>
-      layers.map(({ label, colour }, l) => ({
-        name: label,
-        colour,
-        values: values[l],
-        dash: l < this.fused,
-      }));
+      layers
+        .map(({ label, colour }, l) => ({
+          name: label,
+          colour,
+          values: values[l],
+          dash: l < this.fused,
+        }))
+        .filter((line, l) => l === this.fused || line.values.some((v) => v !== null));
     for (const { label, unit, truth, mean, std } of components) {
       const lines = [{ name: 'truth', colour: this.run.truth, values: truth }, ...layerLines(mean)];
       const band = {
@@ -305,8 +314,8 @@ export class Viewer {
     const x = (/** @type {number} */ t) =>
       LEFT + ((width - LEFT - 8) * t) / Math.max(1, this.run.steps - 1);
     const y = (/** @type {number} */ v) => height - 5 - ((height - 10) * (v - low)) / (high - low);
-    for (const { name, mask } of this.bands) {
-      c.fillStyle = name === 'blackout' ? this.css('--muted') : this.css('--contact');
+    for (const { colour, mask } of this.bands) {
+      c.fillStyle = colour;
       c.globalAlpha = 0.18;
       mask.forEach((on, t) => on && c.fillRect(x(t - 0.5), 0, x(1) - x(0), height));
     }
@@ -408,13 +417,10 @@ export class Viewer {
         return create('span', {}, sample, name);
       });
       if (!host.childElementCount)
-        for (const { name, mask } of this.bands)
+        for (const { name, colour, mask } of this.bands)
           if (mask.includes(1)) {
             const sample = create('i', { className: 'band' });
-            sample.style.setProperty(
-              '--c',
-              name === 'blackout' ? 'var(--muted)' : 'var(--contact)',
-            );
+            sample.style.setProperty('--c', colour);
             entries.push(create('span', {}, sample, name));
           }
       const title = create('b', {

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tests.inspect.diagnosis.test_innovation_checks import Boat, run as boat_run
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
@@ -87,3 +90,15 @@ def test_maps_use_manual_beta(replay: Replay) -> None:
     assert np.abs((fused - fused.max()) - (haptics - haptics.max())).max() > 1.0
     same = (MapEngine(replay.checkpoint, run).map(step - 10, size=size) for run in (counterfactual, replay.original))
     np.testing.assert_array_equal(*(run.log_likelihood for run in same))
+
+
+def test_curves_of_angles_are_in_the_turn_of_the_truth_and_unreported_updates_have_none() -> None:
+    original = boat_run(Boat())
+    turned = original.estimate_mean + np.float32([0.0, 0.0, 2.0 * np.pi, 0.0])
+    unknown = np.full_like(original.modality_mean, np.nan)
+    run = replace(original, estimate_mean=turned, modality_mean=unknown)
+    curves = compare(run, run, Intervention(5, 9)).curves()
+    estimate, *_ = [c.values for c in curves if c.chart == "heading" and c.name == "original"]
+    truth, *_ = [c.values for c in curves if c.chart == "heading" and c.name == "truth"]
+    assert np.abs(estimate - truth).max() < 90.0
+    assert {c.name for c in curves if c.chart.startswith("Distance between")} == {"fused"}
