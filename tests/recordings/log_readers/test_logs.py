@@ -184,27 +184,6 @@ def test_a_guessed_map_has_names_units_and_sensors(tmp_path: Path) -> None:
     assert read_log(small, read_map(map_file(tmp_path, text)), "drive")[0].task.main_error.label == "position (cm)"
 
 
-def test_a_guessed_map_keeps_letters_dates_and_texts(tmp_path: Path) -> None:
-    t = np.arange(20.0)
-    columns = {
-        "Zeit": np.datetime64("2026-01-01T00:00") + t.astype("timedelta64[s]"),
-        "timestamp": t,
-        "Fahrt": np.array(["A"] * 20),
-        "Kurs ψ": t,
-        "Kompass °": t,
-        "ekf.mean": np.stack([t, t], 1),
-        "ekf.std": np.stack([t, t], 1),
-    }
-    text = guess_map(Preview(columns), "log")
-    values = tomllib.loads(text)
-    assert values["time"] == "timestamp"
-    assert values["estimate"] == {"mean": "ekf.mean", "std": "ekf.std"}
-    assert values["sensors"] == {"Kurs_ψ": "Kurs ψ", "Kompass": "Kompass °"}
-    assert '# not numbers, for time, episode or [covariates]: ["Zeit", "Fahrt"]' in text
-    del columns["timestamp"]
-    assert tomllib.loads(guess_map(Preview(columns), "log"))["time"] == "Zeit"
-
-
 def test_one_component_is_a_task(tmp_path: Path) -> None:
     columns = {"t": 0.1 * np.arange(20.0), "true_level": np.linspace(280.0, 290.0, 20), "est_level": np.full(20, 285.0)}
     text = guess_map(Preview(columns), "tank").replace('"true_level"', '{column = "true_level", unit = "K"}', 1)
