@@ -135,7 +135,7 @@ def _validate(fault: str, key: str, parameter: Field[Any], value: Any) -> Any:
     if value is None and parameter.default is None:
         return None
     if meta["kind"] is str:
-        if not isinstance(value, str) or not value.isprintable() or not value or set(value) & set(",:= "):
+        if not isinstance(value, str) or not value.isprintable() or not value.strip() or set(value) & set(",:="):
             raise BadInput(f"{fault}'s {key!r} is {value!r}, not a name")
         if meta["choices"] and value not in meta["choices"]:
             raise unknown_name(f"{key} of {fault}", value, meta["choices"])

@@ -41,7 +41,7 @@ from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
-from beliefscope.inspect.diagnostics.statistic_kinds import label_of
+from beliefscope.inspect.diagnostics.statistic_kinds import label_of, sensor_of
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -128,7 +128,7 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
     def subject(statistic: str) -> str:
         kind, about, _ = statistic.split("/")
         if statistic in of_sensors or about == "labels":
-            return about.partition(" ")[0]
+            return sensor_of(about, case.inputs.checkpoint.task.observations)[0]
         return "models" if kind.startswith(("module", "dynamics", "process noise")) else "filter"
 
     numbers = Counter(subject(deviation.statistic) for deviation in case.deviations)

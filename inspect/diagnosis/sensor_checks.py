@@ -33,6 +33,7 @@ from beliefscope.inspect.diagnosis.window_checks import (
     window_statistics,
     window_values,
 )
+from beliefscope.inspect.diagnostics.statistic_kinds import sensor_of
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
@@ -75,7 +76,7 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
     differs most from the rest of the episode; of other statistics of windows, the most deviating windows.
     """
     kind, subject, phase = statistic.split("/")
-    key, _, axis = subject.partition(" ")
+    key, axis = sensor_of(subject, episode.observations)
     if key not in episode.observations:
         return None
     episode = with_continuous_angles(episode)
@@ -98,7 +99,7 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
 def covers_episode(statistic: str, episode: Episode) -> bool:
     """Whether all readings of an episode are lost images, or the same reading, if a statistic counts such readings."""
     kind, subject, _ = statistic.split("/")
-    key, _, axis = subject.partition(" ")
+    key, axis = sensor_of(subject, episode.observations)
     if key not in episode.observations:
         return False
     readings = episode.observations[key][episode.present(key)]

@@ -39,7 +39,7 @@ def undo(name: str, inputs: RunInputs, deviations: Deviations, base: Checkpoint 
         name: key of ``UNDO``, or one of its keys that end in a sensor or modality.
         base: checkpoint of the same architecture, whose modules replace faulty ones where it is given.
     """
-    action, _, subject = name.rpartition(" ")
+    action, _, subject = name.partition(" ")
     if base is not None and name in MODULES:
         return _with_modules(inputs, base, MODULES[name])
     function = UNDO.get(name) or partial(BY_SUBJECT[action], subject)
@@ -48,7 +48,7 @@ def undo(name: str, inputs: RunInputs, deviations: Deviations, base: Checkpoint 
 
 def brings_back(name: str, base: Checkpoint | None = None) -> bool:
     """Whether an intervention brings back healthy readings, modules or equations; others only remove a sensor."""
-    function = UNDO.get(name) or BY_SUBJECT[name.rpartition(" ")[0]]
+    function = UNDO.get(name) or BY_SUBJECT[name.partition(" ")[0]]
     return function not in (drop, skip_lost_images) or (base is not None and name in MODULES)
 
 

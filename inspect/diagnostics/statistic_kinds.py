@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from beliefscope.datasets.task import Component, Task, axis_name, display_name, display_unit
 
 KINDS = {
@@ -181,8 +183,9 @@ def label_of(statistic: str, task: Task | None = None) -> str:
         phase = phase if is_contact_known(task) or phase not in ("contact", "free motion") else "all"
         if channel := channel_of(subject, task):
             subject = subject.removesuffix(channel[0]) + channel[1].name
+    owners = () if task is None else (*task.observations, *task.modalities, *(c.name for c in task.components))
+    name, axis = sensor_of(subject, owners)
     title = KINDS[kind][0] if kind in KINDS else kind
-    name, _, axis = subject.partition(" ")
     if (kind, name) == ("lag", "labels"):
         return f"delay of the labels behind {display_name(axis) or 'all modalities'}"
     if (kind, name) == ("offset", "labels"):
@@ -194,14 +197,21 @@ def label_of(statistic: str, task: Task | None = None) -> str:
     return f"{before}{title}{after}"
 
 
+def sensor_of(subject: str, sensors: Iterable[str]) -> tuple[str, str]:
+    """Name of the sensor that the subject of a statistic starts with, and the axis; the first word if it has none."""
+    names = [name for name in sensors if f"{subject} ".startswith(f"{name} ")]
+    name = max(names, key=len, default=subject.partition(" ")[0])
+    return name, subject[len(name) + 1 :]
+
+
 def unit_of(statistic: str, task: Task) -> tuple[str, float]:
     """Unit for display of a statistic, and its factor from the statistic's own; empty and 1 for one without a unit."""
     kind, subject, _ = statistic.split("/")
     if kind == "error":
         return task.main_error.conversion
     if kind in OF_COMPONENTS:
-        name = subject.rpartition(" ")[2]
-        return next((c.conversion for c in task.components if c.name == name), display_unit("m"))
+        ending = f" {subject}"
+        return next((c.conversion for c in task.components if ending.endswith(f" {c.name}")), display_unit("m"))
     if kind in OF_READINGS:
         channel = channel_of(subject, task)
         unit, factor = channel[1].conversion if channel else ("gray levels" if subject == "image" else "", 1.0)

@@ -116,3 +116,15 @@ def test_a_deviation_is_written_in_its_unit() -> None:
 def test_the_numbers_of_a_filter_that_diverges_have_an_exponent() -> None:
     deviation = Deviation("error//all", 1.8e17, 0.017, 0.015, 0.021, 0.01, True, 3.0, TASKS["door"])
     assert deviation.text == "RMS position error is 1.8e+19 cm, healthy 1.7 cm (1.5 to 2.1)"
+
+
+def test_names_with_spaces_are_whole() -> None:
+    task = replace(
+        GPS,
+        components=(Component("Ort x", "m"), Component("Ort y", "m")),
+        observations={"Rad Radar": (2,)},
+        modalities={"Rad": ("Rad Radar",)},
+    )
+    assert label_of("level/Rad Radar x/all", task) == "level of Rad Radar (x)"
+    assert label_of("dynamics bias/Ort y/all", task) == "bias of the dynamics model of Ort y"
+    assert label_of("module bias/Rad Ort y/all", task) == "bias of the measurement model of Rad (Ort y)"
