@@ -61,7 +61,7 @@ class Entry:
         run: (traces, checkpoint) -> result. The traces are of one filter; with several, results have bounds and
             intervals over episodes. ``options`` are passed by name.
         why_not: (trace, checkpoint or None) -> one-line reason why the diagnostic does not apply, or None.
-        needs: ``trace`` only, the ``checkpoint`` too, or a ``filter`` that can be run, unlike that of a live run.
+        needs: ``trace`` only, or a ``filter`` too that can be run, unlike that of a live run.
         slow: takes more than two seconds; computed on request only.
         options: option -> description.
         statistics: trace -> statistics of a healthy profile (``HealthyProfile``). Such a diagnostic takes the
@@ -73,7 +73,7 @@ class Entry:
     question: str
     run: Callable[..., Diagnostic]
     why_not: Callable[[Trace, Checkpoint | None], str | None] = lambda trace, checkpoint: None
-    needs: Literal["trace", "checkpoint", "filter"] = "trace"
+    needs: Literal["trace", "filter"] = "trace"
     slow: bool = False
     options: Mapping[str, str] = field(default_factory=dict)
     statistics: Callable[[Trace], dict[str, float]] | None = None
@@ -115,7 +115,7 @@ class Entry:
     def refusal(self, trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         """One-line reason why the diagnostic cannot be computed, or None."""
         if self.needs != "trace":
-            if checkpoint is None or (self.needs == "filter" and isinstance(checkpoint, UnavailableFilter)):
+            if checkpoint is None or isinstance(checkpoint, UnavailableFilter):
                 return f"{self.name} needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
             if checkpoint.hash != trace.checkpoint_hash:
                 return f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"

@@ -276,7 +276,7 @@ ENTRY = Entry(
     "ridge have the direction that the task expects?",
     run=maps,
     why_not=lambda trace, checkpoint: None if checkpoint is None else no_maps(checkpoint, trace),
-    needs="checkpoint",
+    needs="filter",
     slow=True,
     options={
         "size": "cells per side, 41 by default",

@@ -164,7 +164,7 @@ def test_without_a_filter_to_run_a_live_run_has_the_diagnostics_of_its_trace() -
     unavailable = UnavailableFilter(trace.filter, trace.checkpoint_hash, trace.task)
     results, reasons = run_diagnostics([trace], unavailable, slow=True)
     assert {"consistency", "innovations", "errors"} <= set(results)
-    for name in ("standalone", "efficiency", "equations", "shapley", "saliency", "conventions"):
+    for name in ("maps", "standalone", "efficiency", "equations", "shapley", "saliency", "conventions"):
         assert "needs the filter, not only its trace" in reasons[name]
 
 
