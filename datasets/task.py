@@ -27,8 +27,7 @@ DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 HALF_WIDTHS = {"m": 0.135, "rad": 0.5}
 """Unit -> default of ``Task.map_half_width``; 1 in other units."""
 
-LARGE = 5.0
-"""m: half width of a map from which lengths are displayed in m instead of cm."""
+LARGE = 5.0  # m: half width of a map from which lengths are displayed in m instead of cm
 
 LENGTHS = ("m", "km", "dm", "cm", "mm", "um", "nm", "px")
 """Units of a position."""
@@ -319,8 +318,7 @@ class Task:
         """
         if not self.rotations or np.ndim(values) == 0 or values.shape[-1] != len(self.components) + len(self.rotations):
             return values
-        parts: list[NDArray[Any]] = []
-        start = 0
+        parts, start = list[NDArray[Any]](), 0
         for where in self.rotations:
             first = where.start + len(parts) // 2  # each rotation before has one number more
             quaternion = values[..., first : first + 4]

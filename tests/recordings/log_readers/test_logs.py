@@ -15,7 +15,7 @@ from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.statistics.measures import errors, nees
 from beliefscope.inspect.trace import load_trace, save_trace
-from beliefscope.recordings.log_readers.column_map import ColumnMap, read_map
+from beliefscope.recordings.log_readers.column_map import read_map
 from beliefscope.recordings.log_readers.columns import column, joined, read_columns
 from beliefscope.recordings.log_readers.guess import guess_map
 from beliefscope.recordings.log_readers.messages import Preview
@@ -107,25 +107,6 @@ def test_modalities_group_sensors(tmp_path: Path) -> None:
     episode = read_log(table(), read_map(map_file(tmp_path, text)), "log")[0]
     assert episode.task.modalities == {"speed": ("speed",), "haptics": ("force", "torque")}
     assert episode.task.observations == {"force": (2,), "torque": (1,), "speed": (1,)}
-
-
-def test_channels_are_named_after_their_columns() -> None:
-    sensors: dict[str, str | list[str]] = {
-        "gps": ["gps_lat", "gps_lon"],
-        "imu": ["/imu/data.gyro.z", "/imu/data.acc.x"],
-        "twice": ["gps_lat", "gps_lat"],
-        "pair": ["left", "left_right"],
-        "array": "ranges",
-    }
-    mapping = ColumnMap("rover", {}, control=["throttle", "steering"], sensors=sensors)
-    sizes = {"gps": 2, "imu": 2, "twice": 2, "pair": 2, "array": 8, "control": 2}
-    names = {key: [channel.name for channel in each] for key, each in mapping.channels(sizes).items()}
-    assert names == {
-        "gps": ["lat", "lon"],
-        "imu": ["gyro.z", "acc.x"],
-        "pair": ["left", "left_right"],
-        "control": ["throttle", "steering"],
-    }
 
 
 def test_covariates_define_groups(tmp_path: Path) -> None:
