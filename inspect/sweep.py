@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from glob import glob
@@ -97,17 +97,28 @@ class Inputs:
     particles: int = 300
     all_episodes: bool = False
 
-    def cells(self, size: int = EPISODES) -> list[Cell]:
+    def cells(self, size: int = EPISODES, skip: Callable[[str], None] | None = None) -> list[Cell]:
         """All cells with up to ``size`` episodes, by checkpoint.
 
-        Raises BadInput for unusable files, and for data sets or faults that fit no checkpoint.
+        Args:
+            skip: called with the problem of each unusable checkpoint, which is left out. By default, they are errors.
+
+        Raises BadInput with all unusable checkpoints, or if none is usable; for data sets that are unusable or fit no
+        checkpoint; and for faults that fit no checkpoint.
         """
         cells: list[Cell] = []
         used: set[Path] = set()
         hashes: dict[str, Path] = {}
         tasks: set[str] = set()
+        problems: list[str] = []
         for path in self.checkpoints:
-            provenance_of(path)  # an invalid one is reported before the work
+            try:
+                provenance_of(path)
+                if not is_code(str(path)):
+                    _checkpoint(path)
+            except BadInput as error:
+                problems.append(str(error))
+                continue
             for data_path in self.data or (sample_path(_filter(path).task),):
                 checkpoint = _filter(path, data_path)
                 tasks.add(checkpoint.task.name)
@@ -127,27 +138,45 @@ class Inputs:
                             Cell(path, checkpoint.hash, data_path, data.hash, text, seed, self.particles, block)
                             for block in _blocks(episodes, size)
                         ]
+        _report_unusable(problems, len(self.checkpoints), skip)
         if unused := [str(path) for path in self.data if path not in used]:
             raise BadInput(f"data {', '.join(unused)} fit no checkpoint; their tasks are {', '.join(sorted(tasks))}")
         return list(dict.fromkeys(cells))
 
 
+def _report_unusable(problems: list[str], count: int, skip: Callable[[str], None] | None) -> None:
+    """Call ``skip`` with each problem of ``count`` checkpoints; raise BadInput without it, or if none is usable."""
+    if problems and (skip is None or len(problems) == count):
+        if len(problems) == 1:
+            raise BadInput(problems[0])
+        advice = "; --skip-bad leaves them out" if len(problems) < count else ""
+        raise BadInput(f"{len(problems)} of {count} checkpoints are unusable: {'; '.join(problems)}{advice}")
+    for problem in problems:
+        assert skip is not None
+        skip(problem)
+
+
 def provenance_of(path: Path) -> Mapping[str, Any]:
     """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one, or of code.
 
-    It is the configuration of the training, for example, or the address of a tracker's run. Raises BadInput if it is
-    not a JSON object.
+    It is the configuration of the training, for example, or the address of a tracker's run. NaN and infinite numbers,
+    which JSON lacks but Python writes, are None. Raises BadInput if it is not a JSON object.
     """
     beside = path.with_suffix(".json")
     if is_code(str(path)) or not beside.is_file():
         return {}
     try:
-        provenance = json.loads(beside.read_text())
+        provenance = json.loads(beside.read_text(), parse_constant=lambda _: None, parse_float=_finite)
     except ValueError as error:
         raise BadInput(f"{beside} is not JSON: {error}") from None
     if not isinstance(provenance, dict):
         raise BadInput(f"{beside} contains {type(provenance).__name__}, expected a JSON object of key: value")
     return provenance
+
+
+def _finite(digits: str) -> float | None:
+    number = float(digits)
+    return number if math.isfinite(number) else None
 
 
 def describe_checkpoint(path: Path, data: Path | None = None) -> Row:

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
@@ -173,6 +174,13 @@ def test_external_filters_run_beside_checkpoints(inputs: Inputs, tmp_path: Path,
     (row,) = tables.query("SELECT * FROM results WHERE checkpoint = ? LIMIT 1", [filter_.hash]).to_pylist()
     with pytest.raises(BadInput, match=r"04_own_filter\.py:build is an external filter, .* serve --filter /"):
         tables.trace(row)
+
+
+def test_provenance_is_standard_json(tmp_path: Path) -> None:
+    path = Path(shutil.copy(pretrained_path("door", "image-ekf"), tmp_path))
+    path.with_suffix(".json").write_text('{"loss": NaN, "best": {"loss": -Infinity, "rate": 1e999}, "lr": 1e-3}')
+    provenance = describe_checkpoint(path)["provenance"]
+    assert read_json(provenance) == {"loss": None, "best": {"loss": None, "rate": None}, "lr": 1e-3}
 
 
 def test_queries_find_any_text_of_the_provenance(tmp_path: Path) -> None:

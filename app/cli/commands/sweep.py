@@ -24,6 +24,7 @@ def sweep(
     seeds: int = opt.option("K", "Run with seeds 0 to K - 1.", 1, parser=opt.integer(1)),
     particles: int = 300,
     every: bool = False,
+    skip_bad: bool = opt.flag("Skip unusable checkpoints and report the reasons.", "--skip-bad"),
     block: int = opt.option(
         "N", "Number of episodes in a cell, the unit of work that is stored.", 64, parser=opt.integer(1)
     ),
@@ -58,7 +59,7 @@ def sweep(
         particles,
         every,
     )
-    cells = inputs.cells(block)
+    cells = inputs.cells(block, skip=(lambda problem: console.note(f"skipped: {problem}")) if skip_bad else None)
     opt.check_output(output / "results.parquet" if output.is_dir() else output)
     output.mkdir(exist_ok=True)
     used = {cell.checkpoint for cell in cells}

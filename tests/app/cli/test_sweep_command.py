@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,3 +23,24 @@ def test_checkpoints_without_data_of_their_task_are_named(run: Callable[..., Any
     code, _, error = run("sweep", *arguments, "--data", tmp_path / "push.h5", "-o", tmp_path / "sweep")
     assert code == 0
     assert "Warning: no data of their tasks, or copies of other checkpoints: door-image-ekf.safetensors" in error
+
+
+def test_unusable_checkpoints_are_listed_and_can_be_skipped(run: Callable[..., Any], tmp_path: Path) -> None:
+    with open_dataset(sample_path("push")) as data:
+        write_dataset(tmp_path / "push.h5", data.task, [data[9]])
+    good = Path(shutil.copy(pretrained_path("push", "image-ekf"), tmp_path / "good.safetensors"))
+    (tmp_path / "truncated.safetensors").write_bytes(good.read_bytes()[:1000])
+    (tmp_path / "text.safetensors").write_text("no checkpoint")
+    sweep = ("sweep", "--checkpoints", tmp_path / "*.safetensors", "--data", tmp_path / "push.h5")
+    code, _, error = run(*sweep, "-o", tmp_path / "sweep")
+    assert code == 2
+    assert "2 of 3 checkpoints are unusable" in error
+    assert all(text in error for text in ("text.safetensors", "truncated.safetensors", "--skip-bad"))
+    assert not (tmp_path / "sweep").exists()
+    code, out, error = run(*sweep, "-o", tmp_path / "sweep", "--skip-bad", "--json", "-")
+    assert code == 0
+    assert error.count("skipped: ") == 2
+    assert [row["name"] for row in json.loads(out)["overview"]] == ["good"]
+    good.unlink()
+    code, _, error = run(*sweep, "-o", tmp_path / "other", "--skip-bad")
+    assert (code, "2 of 2 checkpoints are unusable" in error) == (2, True)
