@@ -159,19 +159,24 @@ def _report_unusable(problems: list[str], count: int, skip: Callable[[str], None
 def provenance_of(path: Path) -> Mapping[str, Any]:
     """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one, or of code.
 
-    It is the configuration of the training, for example, or the address of a tracker's run. NaN and infinite numbers,
-    which JSON lacks but Python writes, are None. Raises BadInput if it is not a JSON object.
+    It is the configuration of the training, for example, or the address of a tracker's run, as ``read_provenance``
+    returns it. Raises BadInput if it is not a JSON object.
     """
     beside = path.with_suffix(".json")
     if is_code(str(path)) or not beside.is_file():
         return {}
     try:
-        provenance = json.loads(beside.read_text(), parse_constant=lambda _: None, parse_float=_finite)
+        provenance = read_provenance(beside.read_text())
     except ValueError as error:
         raise BadInput(f"{beside} is not JSON: {error}") from None
     if not isinstance(provenance, dict):
         raise BadInput(f"{beside} contains {type(provenance).__name__}, expected a JSON object of key: value")
     return provenance
+
+
+def read_provenance(text: str) -> Any:
+    """A JSON document; NaN and infinite numbers, which JSON lacks but Python writes, are None. Raises ValueError."""
+    return json.loads(text, parse_constant=lambda _: None, parse_float=_finite)
 
 
 def _finite(digits: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
@@ -120,13 +121,15 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
 
     @app.get("/api/experiments/{sweep}")
     def results(sweep: str, phase: str = "all") -> Experiments:
+        from beliefscope.inspect.sweep import read_provenance  # imports torch
+
         rows = tables(sweep).overview(phase)
         names = catalog_names(store)
         tasks = set(rows["task"].to_pylist()) & set(store.tasks())
         data = {data.hash: name for task in tasks for name, data in store.datasets(task).items()}
         sent = [
             ExperimentRow(
-                **as_json(row),
+                **as_json(row) | {"provenance": json.dumps(read_provenance(row["provenance"]))},
                 catalog_name=names.get((row["task"], row["checkpoint"])),
                 data_name=data.get(row["data"]),
             )

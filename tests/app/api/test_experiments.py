@@ -9,14 +9,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
+from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.sweep import Inputs
-from beliefscope.recordings.sweep_table import Experiments, run_sweep
+from beliefscope.recordings.sweep_table import CHECKPOINTS, Experiments, run_sweep
 
 pytestmark = pytest.mark.slow
 
@@ -59,6 +62,20 @@ def test_results(settings: Settings, sweep: Path, open_client: Callable[..., Tes
         assert table.headers["content-type"].startswith("text/csv")
         rows = list(csv.DictReader(io.StringIO(table.text)))
         assert [float(r["error"]) for r in rows] == pytest.approx([r["error"] for r in expected])
+
+
+def test_provenance_of_earlier_versions_is_sent_as_standard_json(
+    settings: Settings, sweep: Path, open_client: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(sweep, tmp_path / "copy"))
+    rows = [
+        row | {"provenance": '{"loss": NaN, "lr": 0.1}'}
+        for row in pq.read_table(copy / f"{CHECKPOINTS}.parquet").to_pylist()
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), copy / f"{CHECKPOINTS}.parquet")
+    with open_client(replace(settings, sweeps={"mine": copy}, data={}, checkpoints={})) as client:
+        (provenance,) = {row["provenance"] for row in client.get("/api/experiments/mine").json()["rows"]}
+        assert read_json(provenance) == {"loss": None, "lr": 0.1}
 
 
 def info_hash(name: str) -> str:
