@@ -20,6 +20,12 @@ test('words match in any text, conditions match numbers, and more of them never 
   for (const key of NUMBER_KEYS) assert.equal(names(`${key}<-1e9`).length, 0);
 });
 
+test('clean data are named as in the table', () => {
+  for (const text of ['faults = none', 'faults=""', 'none run', 'faults != blackout=0.4'])
+    assert.deepEqual(names(text), ['run-2'], text);
+  assert.deepEqual(names('faults != none'), ['run-1']);
+});
+
 /** Indices of the matching rows. @param {string} text */
 const places = (text) => {
   const { rows, problem } = matching(RECORDED, text);

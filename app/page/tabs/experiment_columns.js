@@ -8,7 +8,7 @@
 import { displayName } from '../core/units.js';
 import { groupEntries, namesIn } from './experiment_group_menu.js';
 import { differingEntries, entryText, isNumeric } from './experiment_provenance.js';
-import { NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
+import { faultsText, NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @type {Column} */
 const SEEDS = {
@@ -62,7 +62,7 @@ export function columnsOf(rows, areGroups, entries, pinned) {
       title: key,
       help: displayName(key),
       number: false,
-      content: (/** @type {ExperimentRow} */ row) => row[key] || 'none',
+      content: (/** @type {ExperimentRow} */ row) => faultsText(row[key]),
     })),
     ...(areGroups ? [SEEDS] : []),
     ...NUMBER_KEYS.map((key) => ({ key, ...NUMBERS[key] })).map(

@@ -3,7 +3,7 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 
 import { entryNames, numberIn, provenanceOf } from './experiment_provenance.js';
-import { NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
+import { faultsText, NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @typedef {(row: ExperimentRow) => boolean} Test */
 
@@ -70,7 +70,8 @@ function testOf(rows, part, quoted, sign, value = '') {
     return { problem: `there is no column ${name}. ${columnList(rows)}` };
   }
   if (!value) return { problem: `the value after ${sign} is missing.` };
-  return condition(key, SYNONYMS[sign] ?? sign, unquoted(value));
+  const text = unquoted(value);
+  return condition(key, SYNONYMS[sign] ?? sign, key === 'faults' ? faultsText(text) : text);
 }
 
 /**
@@ -90,7 +91,7 @@ function condition(key, sign, text) {
     };
   }
   return (row) => {
-    const value = valueOf(row, key);
+    const value = key === 'faults' ? faultsText(row.faults) : valueOf(row, key);
     if (value === null) return false;
     const number = numberIn(value);
     const equal =
@@ -153,7 +154,8 @@ function searched(row) {
   const cached = texts.get(row);
   if (cached !== undefined) return cached;
   const entries = Object.entries(provenanceOf(row)).map(([name, value]) => `${name} ${value}`);
-  const text = normal([...TEXT_KEYS.map((key) => row[key]), ...entries].join('\n'));
+  const cells = [row.name, row.filter, row.task, faultsText(row.faults)];
+  const text = normal([...cells, ...entries].join('\n'));
   texts.set(row, text);
   return text;
 }

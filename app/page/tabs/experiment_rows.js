@@ -52,6 +52,9 @@ export function valueOf(row, column) {
   return typeof value === 'boolean' ? String(value) : (value ?? null);
 }
 
+/** Sensor faults as displayed. @param {string} faults empty for clean data */
+export const faultsText = (faults) => faults || 'none';
+
 /**
  * Value of a column with numbers; null for other values.
  * @param {ExperimentRow} row
