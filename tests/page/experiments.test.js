@@ -160,6 +160,18 @@ test('an axis is logarithmic if positive values differ by more than a factor of 
   assert.ok(Math.abs(axisOf(1e-5, 1e-2).share(10 ** -3.5) - 0.5) < 1e-12);
 });
 
+test('bars below zero do not make an axis linear', () => {
+  const groups = [1.2, 8, 470].map((nees) => ({ ...ROW, nees }));
+  const axis = scale(
+    groups,
+    ({ nees }) => nees,
+    ({ nees }) => (nees === 470 ? 900 : 0.5),
+  );
+  assert.deepEqual(axis.ticks.map(axis.text), ['1', '10', '100', '1000']);
+  assert.equal(axis.share(470 - 900), 0);
+  assert.ok(axis.share(1.2) > 0 && axis.share(470 + 900) < 1);
+});
+
 /** @param {object[]} changes of `ROW`, each with another checkpoint */
 const rowsOf = (...changes) =>
   changes.map((change, i) => ({ ...ROW, checkpoint: String(i).repeat(64), ...change }));

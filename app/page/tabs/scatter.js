@@ -181,19 +181,20 @@ export const levelName = (kind) => `level:${kind}`;
  * @param {(row: Row) => number} spread standard deviation
  */
 export function scale(rows, value, spread) {
-  const ends = rows.flatMap((row) => {
-    const centre = value(row);
-    return centre === null ? [] : [centre - spread(row), centre + spread(row)];
-  });
-  const [least, greatest] = extent(ends);
+  const centres = rows.map(value).filter((centre) => centre !== null);
+  const [least, greatest] = extent(centres);
   const isLog = least > 0 && greatest > LINEAR_RATIO * least;
   const place = isLog ? Math.log10 : Number;
-  const [low, high] = padded([place(least), place(greatest)]);
+  const ends = rows.flatMap((row) => {
+    const centre = value(row);
+    return centre === null ? [] : [centre, centre - spread(row), centre + spread(row)];
+  });
+  const [low, high] = padded(extent(ends.filter((end) => !isLog || end > 0).map(place)));
   return { value, spread, ...(isLog ? powersOfTen : multiples)(low, high), share };
 
-  /** @param {number} point */
+  /** Bars that reach below zero of a logarithmic axis end at its start. @param {number} point */
   function share(point) {
-    return (place(point) - low) / (high - low);
+    return isLog && point <= 0 ? 0 : (place(point) - low) / (high - low);
   }
 }
 
