@@ -125,7 +125,7 @@ export class EpisodePanel {
       button.addEventListener('click', () =>
         this.#store.set({ rows: 'checkpoints', cell: rowKey(row) }),
       );
-      const values = `RMSE ${fixed(row.error, 2)} ${row.unit}, NEES ${significant(row.nees)}`;
+      const values = `RMSE ${fixed(row.error, 2)} ${row.unit}, NEES/n ${significant(row.nees)}`;
       return create('li', {}, button, create('span', { textContent: values }));
     });
     html('ol', this.#section).replaceChildren(...items);
@@ -157,7 +157,7 @@ export class EpisodePanel {
       });
     } else link.title = `This server runs seed ${this.#openedSeed}: serve with --seed ${seed}`;
     const values = [`RMSE ${fixed(error, 2)} ${unit}`, `worst ${fixed(worst, 2)} ${unit}`];
-    if (nees !== null) values.push(`NEES ${significant(nees)}`);
+    if (nees !== null) values.push(`NEES/n ${significant(nees)}`);
     if (!isOpened) values.push(`seed ${seed}, not of this server`);
     return create(
       'li',
