@@ -12,7 +12,7 @@ import { trackHeights } from '../../app/page/timeline/layout.js';
 import { areShares, upperEdges } from '../../app/page/timeline/stacked_weights.js';
 import { withMovedBorder } from '../../app/page/timeline/track_sizes.js';
 import { TRACKS, tracks } from '../../app/page/timeline/tracks.js';
-import { wrapped } from '../../app/page/widgets/plots.js';
+import { label, wrapped } from '../../app/page/widgets/plots.js';
 import { FUSION, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
@@ -127,4 +127,9 @@ test('moving a border keeps the sum and the other charts, within the limits, and
     assert.deepEqual(withMovedBorder(result, index, -actual), heights);
   }
   assert.deepEqual(withMovedBorder([10, 10], 0, 5), [10, 10], 'both are too low');
+});
+
+test('labels have spaces in joined names and none in numbers', () => {
+  assert.equal(label('image+haptics'), 'image + haptics');
+  for (const text of ['+9.27 %', '8.22e+04 nats']) assert.equal(label(text), text);
 });

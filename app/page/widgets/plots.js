@@ -140,8 +140,9 @@ function paint(canvas, colours) {
   context2d(canvas).putImageData(image, 0, 0);
 }
 
-/** @param {string} text */
-export const label = (text) => typeset(displayName(text)).replaceAll('+', ' + ');
+/** Text for display, with spaces in joined names such as image+haptics, not in numbers. @param {string} text */
+export const label = (text) =>
+  typeset(displayName(text)).replace(/(?<=[\p{L}\d])\+(?=\p{L})/gu, ' + ');
 
 /** @param {string} title */
 export const heading = (title) =>
