@@ -25,6 +25,9 @@ from beliefscope.inspect.traces.batch import Progress, trace_all
 MAX_EPISODES = 120
 """Maximum number of episodes of a profile; more hardly change it."""
 
+SENSOR_SHARE = 0.85
+"""Share of the time of a profile that its sensor record takes."""
+
 
 FOLDS = 4
 """Number of groups of episodes."""
@@ -124,14 +127,29 @@ def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> 
 
 
 def measure_profile(
-    filter_: Filter, name: str, episodes: Sequence[Episode], data: str, is_sample: bool = False
+    filter_: Filter,
+    name: str,
+    episodes: Sequence[Episode],
+    data: str,
+    is_sample: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any] | None:
     """JSON of the healthy profile of a trained filter over the held-out of the episodes; None if there are none.
 
     data: where the episodes come from. is_sample: whether they have the images of the pretrained filters' camera.
+    progress: called with the completed fraction, 0..1.
     """
+    report = progress or (lambda share: None)
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
-    sensors = sensor_record(held_out, pretrained_reference(filter_.task) if is_sample else None)
-    return profile_of(Checkpoint(filter_, name, "", {}), held_out, data, sensors).to_json()
+    reference = pretrained_reference(filter_.task) if is_sample else None
+    sensors = sensor_record(held_out, reference, lambda share: report(SENSOR_SHARE * share))
+    profile = profile_of(
+        Checkpoint(filter_, name, "", {}),
+        held_out,
+        data,
+        sensors,
+        lambda share: report(SENSOR_SHARE + (1 - SENSOR_SHARE) * share),
+    )
+    return profile.to_json()

@@ -184,7 +184,7 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     code, out, err = run(line)
     trained = json.loads(out)
     assert code == 0
-    assert "dynamics" in err
+    assert all(text in err for text in ("dynamics", "evaluation: 100 %", "healthy record: 100 %"))
     assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
     assert trained["record"]["faults"] == []
     episodes = trained["record"]["episodes"]

@@ -49,6 +49,7 @@ def train(
     report: Report | None = None,
     on_validation: Report = lambda *progress: None,
     on_resume: Callable[[str], None] = lambda stage: None,
+    on_evaluation: Callable[[float], None] = lambda done: None,
     device: str | None = None,
     partial: Path | None = None,
     shared: Path | None = None,
@@ -62,6 +63,7 @@ def train(
         blackouts: probabilities of an image blackout; one is drawn for each training window.
         on_validation: called like ``report`` with each validation loss.
         on_resume: called with the name of the last finished stage if the training resumes.
+        on_evaluation: called with the completed fraction of the evaluation, 0..1.
         partial: file of the finished stages, from which an interrupted training resumes; removed at the end.
         shared: folder of modules that other filters of the same task can use: dynamics, image encoders.
 
@@ -111,7 +113,7 @@ def train(
         "seconds": round(seconds, 1),
         "threads": torch.get_num_threads(),
         "data_summary": summarise(filter_.statistics, filter_.task, splits["train"]),
-        "metrics": measure(filter_, held_out) if held_out else {},
+        "metrics": measure(filter_, held_out, progress=on_evaluation) if held_out else {},
     }
     if state is not None:
         state.drop()
@@ -144,7 +146,10 @@ def versions() -> dict[str, str]:
 
 
 def measure(
-    filter_: Filter | ExternalFilter, episodes: Sequence[Episode], start_offset: StartOffset = NO_OFFSET
+    filter_: Filter | ExternalFilter,
+    episodes: Sequence[Episode],
+    start_offset: StartOffset = NO_OFFSET,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> dict[str, Any]:
     """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``, ``"0.95"``); without images ``"0"``.
 
@@ -153,7 +158,8 @@ def measure(
     """
     several = len(filter_.task.modalities if isinstance(filter_, ExternalFilter) else filter_.names) > 1
     results: dict[str, Metrics] = {}
-    for blackout in evaluated_blackouts(filter_.task):
+    blackouts = evaluated_blackouts(filter_.task)
+    for blackout in blackouts:
         first = next(iter(results.values()), None)
         result = evaluate(
             filter_,
@@ -162,6 +168,7 @@ def measure(
             start_offset=start_offset,
             baselines=first is None,
             modalities=several,
+            progress=lambda done: progress((len(results) + done) / len(blackouts)),
         )
         results[f"{blackout:g}"] = result if first is None else replace(result, baselines=first.baselines)
     return {

@@ -88,10 +88,18 @@ def train(
             report=report,
             on_validation=lambda stage, step, _, loss: write("validation", stage, step, loss),
             on_resume=lambda stage: console.note(f"resuming after stage {stage!r}, from {partial.name}"),
+            on_evaluation=lambda done: update("evaluation", done, ""),
             partial=partial,
         )
-    record = trained.record | {"faults": injected.to_json()}
-    profile = measure_profile(trained.filter, filter, episodes, record["command"])
+        record = trained.record | {"faults": injected.to_json()}
+        profile = measure_profile(
+            trained.filter,
+            filter,
+            episodes,
+            record["command"],
+            is_sample=data is None,
+            progress=lambda done: update("healthy record", done, ""),
+        )
     checkpoint_hash = save_checkpoint(trained.filter, filter, record, output, profile)
     lines = [f"{filter}, trained in {record['seconds']:.0f} s"]
     for name, metrics in record["metrics"].get("0", {}).items():

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
+from beliefscope.filters.training.train import Trained
+
 Run = Callable[..., tuple[int, str, str]]
 
 TRAINED = "Filters that can be trained: crossmodal-ekf, crossmodal-pf, crossmodal-ukf, information-ekf, "
@@ -50,3 +53,19 @@ def test_other_commands_name_a_missing_file_of_a_filter(run: Run, tmp_path: Path
     code, _, error = run("trace door --filter", path, "-o", tmp_path / "run.trace")
     assert code == 2
     assert error.startswith(f"error: filter '{path}' does not exist: expected a file and its function, such as ")
+
+
+@pytest.mark.slow
+def test_the_healthy_record_over_a_sample_set_uses_the_images_of_its_camera(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = load_checkpoint(pretrained_path("push", "haptics-ekf"))
+    given: list[bool] = []
+    monkeypatch.setattr(
+        "beliefscope.filters.training.train.train", lambda *_, **__: Trained(base.filter, dict(base.record))
+    )
+    monkeypatch.setattr(
+        "beliefscope.inspect.healthy.measure_profile", lambda *_, is_sample=False, **__: given.append(is_sample)
+    )
+    assert run("train push --filter haptics-ekf -o", tmp_path / "new.safetensors")[0] == 0
+    assert given == [True]

@@ -21,7 +21,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, sav
 from beliefscope.filters.models.networks import ImageEncoder
 from beliefscope.filters.training.plan import PLANS, Plan
 from beliefscope.filters.training.stages import ALL_PARAMETERS, IMAGES, Trainer, seed_name
-from beliefscope.filters.training.train import train
+from beliefscope.filters.training.train import measure, train
 
 pytestmark = pytest.mark.slow
 
@@ -55,6 +55,13 @@ def test_same_seed_gives_same_checkpoint(name: str, episodes: list[Episode], tmp
     assert first == checkpoint_hash(5)
     if name == KINDS[0]:
         assert first != checkpoint_hash(6)
+
+
+def test_the_evaluation_reports_its_progress(episodes: list[Episode]) -> None:
+    done: list[float] = []
+    results = measure(build(architecture("door", "haptics-ekf"), seed=0).eval(), episodes[4:], progress=done.append)
+    assert done == sorted(done)
+    assert (len(done) >= len(results), done[-1]) == (True, 1.0)
 
 
 def test_stages_are_seeded_with_the_names_of_earlier_versions() -> None:

@@ -143,7 +143,11 @@ def test_a_measured_profile_is_that_of_new_episodes() -> None:
     checkpoint = load_checkpoint(PRETRAINED / "push-image-ekf.safetensors")
     with open_dataset("datasets/samples/push.h5") as data:
         episodes = [data[i] for i in range(140, 152)]
-    document = measure_profile(checkpoint.filter, checkpoint.name, [*episodes, replace(episodes[0], split="train")], "")
+    done: list[float] = []
+    training = replace(episodes[0], split="train")
+    document = measure_profile(checkpoint.filter, checkpoint.name, [*episodes, training], "", progress=done.append)
+    assert done == sorted(done)
+    assert done[-1] == 1.0
     assert document is not None
     measured = HealthyProfile.from_json(json.loads(json.dumps(document, allow_nan=False)))
     assert measured.episodes == 12
