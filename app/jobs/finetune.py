@@ -54,6 +54,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 message = f"training step {step} of {steps}, loss {loss:.3g}; {log.errors}"
                 report(share("training", step / steps), message)
 
+            report(share("training", 0.0), "encoding images and evaluating the base checkpoint")
             result = finetune(
                 base,
                 episodes,
@@ -65,9 +66,13 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             )
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
-        report(share("profile", 0.0), "measuring the healthy record")
         source = f"held-out episodes of {data_name}"
-        profile = measure_profile(result.filter, base.name, episodes, source, is_sample)
+
+        def on_profile(done: float) -> None:
+            report(share("profile", done), "measuring the healthy record")
+
+        on_profile(0.0)
+        profile = measure_profile(result.filter, base.name, episodes, source, is_sample, on_profile)
         save_checkpoint(result.filter, base.name, result.record, path, profile)
         finetuned = load_checkpoint(path)
         comparison = compare_checkpoints(

@@ -140,10 +140,12 @@ def finetune(
         source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source, data)
+        console.note("Encoding images and evaluating the base checkpoint")
         with _progress(base, partial, log, rerun) as callbacks:
             tuned = tune(base, members, callbacks=callbacks, **source)
         assert tuned is not None, "runs without a stop callback always complete"
-        profile = measure_profile(tuned.filter, base.name, members, command, is_sample=data is None)
+        with console.progress("Measuring the healthy record") as advance:
+            profile = measure_profile(tuned.filter, base.name, members, command, data is None, advance)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
