@@ -61,9 +61,8 @@ def train(
 
     Args:
         blackouts: probabilities of an image blackout; one is drawn for each training window.
-        on_validation: called like ``report`` with each validation loss.
+        on_validation: called like ``report`` with each validation loss. on_evaluation: with its completed share.
         on_resume: called with the name of the last finished stage if the training resumes.
-        on_evaluation: called with the completed fraction of the evaluation, 0..1.
         partial: file of the finished stages, from which an interrupted training resumes; removed at the end.
         shared: folder of modules that other filters of the same task can use: dynamics, image encoders.
 

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
@@ -65,10 +65,9 @@ def train(
     injected = read_faults(faults, target)
     partial = output.with_name(f"{output.name}.partial")
     # The record has the name and hash of the data, but not their folder.
-    source = "" if data is None else f" --data {data.name}"
-    source += f" --faults {injected}" if injected else ""
-    source += "" if probabilities == BLACKOUTS else f" --blackouts {blackouts}"
-    source += "" if networks == "default" else f" --networks {networks}"
+    source = _option("data", data and data.name) + _option("faults", injected and str(injected))
+    source += _option("blackouts", probabilities != BLACKOUTS and blackouts)
+    source += _option("networks", networks != "default" and networks)
     with opt.open_episodes(target, data, skip_bad) as dataset, console.bars() as update, log_losses(log) as write:
 
         def report(stage: str, step: int, steps: int, loss: float) -> None:
@@ -92,19 +91,26 @@ def train(
             partial=partial,
         )
         record = trained.record | {"faults": injected.to_json()}
-        profile = measure_profile(
-            trained.filter,
-            filter,
-            episodes,
-            record["command"],
-            is_sample=data is None,
-            progress=lambda done: update("healthy record", done, ""),
-        )
+
+        def report_record(done: float) -> None:
+            update("healthy record", done, "")
+
+        profile = measure_profile(trained.filter, filter, episodes, record["command"], data is None, report_record)
     checkpoint_hash = save_checkpoint(trained.filter, filter, record, output, profile)
+    return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, _summary(filter, record))
+
+
+def _summary(filter: str, record: Mapping[str, Any]) -> list[str]:
+    """Lines about training and the errors on clean held-out episodes."""
     lines = [f"{filter}, trained in {record['seconds']:.0f} s"]
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
-    return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, lines)
+    return lines
+
+
+def _option(name: str, value: object) -> str:
+    """An option of a command, with a space before it; empty without a value."""
+    return f" --{name} {value}" if value else ""
 
 
 def _check_training(task: Task, episodes: Sequence[Episode], sample: bool) -> None:

@@ -64,8 +64,6 @@ def test_the_healthy_record_over_a_sample_set_uses_the_images_of_its_camera(
     monkeypatch.setattr(
         "beliefscope.filters.training.train.train", lambda *_, **__: Trained(base.filter, dict(base.record))
     )
-    monkeypatch.setattr(
-        "beliefscope.inspect.healthy.measure_profile", lambda *_, is_sample=False, **__: given.append(is_sample)
-    )
+    monkeypatch.setattr("beliefscope.inspect.healthy.measure_profile", lambda *arguments: given.append(arguments[4]))
     assert run("train push --filter haptics-ekf -o", tmp_path / "new.safetensors")[0] == 0
     assert given == [True]
