@@ -148,7 +148,8 @@ def finetune(
             profile = measure_profile(tuned.filter, base.name, members, command, data is None, advance)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
-    lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
+    lines = [*_summary(tuned.record), "", _change_command(filter or target, str(output), base.task.name, data)]
+    lines += ["", verdict.statement, verdict.verdict] if verdict else []
     result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
 
@@ -209,9 +210,7 @@ def _external(
     save_weights(tensors, output)
     tuned = f"{base.source.partition('@')[0]}@{output}"
     digest = load_external(tuned, base.task).hash
-    command = ["beliefscope", "change", base.source, tuned, "--task", base.task.name]
-    command += ["--data", str(data)] if data else []
-    lines = [*_summary(record), "", shlex.join(command)]
+    lines = [*_summary(record), "", _change_command(base.source, tuned, base.task.name, data)]
     return opt.checkpoint_result(output, base.task.name, base.name, digest, record, lines)
 
 
@@ -234,6 +233,13 @@ def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) ->
     return judge(settings.success, comparison, base.task)
 
 
+def _change_command(before: str, after: str, task: str, data: Path | None) -> str:
+    """The command that compares two filters over all steps of the held-out episodes."""
+    return shlex.join(
+        ["beliefscope", "change", before, after, "--task", task] + (["--data", str(data)] if data else [])
+    )
+
+
 def _summary(record: dict[str, Any]) -> list[str]:
     """Lines about training, errors before and after, and frozen tensors."""
     from beliefscope.filters.finetuning.report import held_out_rows, training_summary
@@ -244,7 +250,7 @@ def _summary(record: dict[str, Any]) -> list[str]:
     return [
         training_summary(record),
         "",
-        format_table("On held-out episodes", ["", "before", "after", "change"], held_out_rows(record)),
+        format_table("On windows of held-out episodes", ["", "before", "after", "change"], held_out_rows(record)),
         "",
         unchanged if frozen["tensors"] else "No tensor was frozen.",
     ]

@@ -42,9 +42,12 @@ def test_events_of_other_data_need_no_training_episodes(
     write_dataset(tmp_path / "own.h5", task, short_episodes(task.name, indices, 65))
     output, data = tmp_path / "tuned.safetensors", tmp_path / "own.h5"
     line = "finetune push-field --filter information-ekf --event 0:10-60 --steps 1 --length 8 --data"
-    code, _, error = run(line, data, "-o", output)
+    code, out, error = run(line, data, "-o", output)
     assert code == 0, error
     assert "Simulating" not in error
+    assert error.startswith("Encoding images and evaluating the base checkpoint")
+    assert "On windows of held-out episodes" in out
+    assert f"beliefscope change information-ekf {output} --task push-field --data {data}" in out
     assert output.is_file()
 
 
