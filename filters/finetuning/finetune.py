@@ -43,13 +43,15 @@ class Callbacks:
     Attributes:
         report: after each step, with step, total steps and loss. on_validation: after each validation, the base
             checkpoint's first; again with the earlier ones when a run resumes. on_resume: with the step at which a run
-            resumes. stop: before each step; the run pauses if it returns true.
+            resumes. stop: before each step; the run pauses if it returns true. on_start: before the images are encoded
+            and the base checkpoint is evaluated; all arguments are valid by then.
     """
 
     report: Callable[[int, int, float], None] = lambda step, steps, loss: None
     on_validation: Callable[[Validation], None] = lambda validation: None
     on_resume: Callable[[int], None] = lambda step: None
     stop: Callable[[], bool] = lambda: False
+    on_start: Callable[[], None] = lambda: None
 
 
 NO_CALLBACKS = Callbacks()
@@ -99,6 +101,7 @@ def finetune(
     key = cache_key(base=base.hash, settings=settings.to_json(), data=data_hash, versions=versions(), device=device)
     state = Partial(partial, key) if partial else None
     loop = FilterLoop(filter_, trained, settings, mixes["train"], mixes["val"])
+    callbacks.on_start()
     with cached_encoders(filter_, images):
         before = validate(filter_, mixes["test"], 0, 0.0, settings)
         seconds = run_loop(loop, state, began, callbacks)

@@ -140,7 +140,6 @@ def finetune(
         source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source, data)
-        console.note("Encoding images and evaluating the base checkpoint")
         with _progress(base, partial, log, rerun) as callbacks:
             tuned = tune(base, members, callbacks=callbacks, **source)
         assert tuned is not None, "runs without a stop callback always complete"
@@ -189,7 +188,10 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: 
         def on_resume(step: int) -> None:
             console.note(f"resuming after step {step}, from {partial.name}")
 
-        yield Callbacks(report, on_validation, on_resume)
+        def on_start() -> None:
+            console.note("Encoding images and evaluating the base checkpoint")
+
+        yield Callbacks(report, on_validation, on_resume, on_start=on_start)
 
 
 def _external(
