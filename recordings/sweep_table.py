@@ -182,7 +182,7 @@ DOCUMENTS = ["training", "provenance"]
 """Columns of the overview with JSON documents, which a table for reading leaves out."""
 
 SHOWN = 20
-"""Rows of the overview in a notebook."""
+"""Rows of the overview in a notebook and after a sweep."""
 
 KEYS = {
     RESULTS: "checkpoint, data, faults, seed, particles, episode, phase",

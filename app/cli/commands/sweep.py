@@ -1,3 +1,4 @@
+import shlex
 from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
@@ -48,7 +49,7 @@ def sweep(
     """
     opt.prepare_workers(engine, workers, "beliefscope.recordings.sweep_table")
     from beliefscope.inspect.sweep import Inputs, find_checkpoints
-    from beliefscope.recordings.sweep_table import DOCUMENTS, Experiments, run_sweep
+    from beliefscope.recordings.sweep_table import DOCUMENTS, SHOWN, Experiments, run_sweep
 
     opt.check_folder(output, "output")
     inputs = Inputs(
@@ -77,8 +78,10 @@ def sweep(
     overview = Experiments([output]).overview()
     document = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
     document |= {"overview": overview.to_pylist()}
+    more, command = len(overview) - SHOWN, shlex.join(["beliefscope", "experiments", str(output)])
     return console.Result(
         document,
-        console.arrow("Checkpoints", overview.drop_columns(DOCUMENTS)),
+        console.arrow("Checkpoints, largest errors first", overview.drop_columns(DOCUMENTS).slice(0, SHOWN))
+        + (f"\n{plural(more, 'more row')}: {command} --top {len(overview)}" if more > 0 else ""),
         output / "results.parquet",
     )

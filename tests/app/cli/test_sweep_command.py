@@ -25,6 +25,20 @@ def test_checkpoints_without_data_of_their_task_are_named(run: Callable[..., Any
     assert "Warning: no data of their tasks, or copies of other checkpoints: door-image-ekf.safetensors" in error
 
 
+def test_the_largest_errors_are_printed(
+    run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("beliefscope.recordings.sweep_table.SHOWN", 1)
+    with open_dataset(sample_path("push")) as data:
+        write_dataset(tmp_path / "push.h5", data.task, [data[9]])
+    arguments = ["--checkpoints", pretrained_path("push", "haptics-ekf"), "--data", tmp_path / "push.h5"]
+    faults = ["--faults", "blackout=0.4", "--faults", "blackout=0.8"]
+    code, out, _ = run("sweep", *arguments, *faults, "-o", tmp_path / "sweep")
+    assert code == 0
+    assert out.count("haptics-ekf") == 2, "name and filter of one row"
+    assert f"1 more row: beliefscope experiments {tmp_path / 'sweep'} --top 2" in out
+
+
 def test_unusable_checkpoints_are_listed_and_can_be_skipped(run: Callable[..., Any], tmp_path: Path) -> None:
     with open_dataset(sample_path("push")) as data:
         write_dataset(tmp_path / "push.h5", data.task, [data[9]])
