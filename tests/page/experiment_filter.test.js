@@ -20,6 +20,11 @@ test('words match in any text, conditions match numbers, and more of them never 
   for (const key of NUMBER_KEYS) assert.equal(names(`${key}<-1e9`).length, 0);
 });
 
+test('columns that contain an unknown name are listed first', () => {
+  const rows = [{ ...ROW, provenance: '{"optimizer": {"lr": 1}, "a": 2}' }];
+  assert.match(matching(rows, 'lr > 1').problem, /no column lr\. Columns: optimizer\.lr, error, /);
+});
+
 test('clean data are named as in the table', () => {
   for (const text of ['faults = none', 'faults=""', 'none run', 'faults != blackout=0.4'])
     assert.deepEqual(names(text), ['run-2'], text);

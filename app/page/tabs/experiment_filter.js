@@ -67,7 +67,7 @@ function testOf(rows, part, quoted, sign, value = '') {
     // A fault such as blackout=0.4 is a word.
     if (rows.some((row) => searched(row).includes(normal(part))))
       return (row) => searched(row).includes(normal(part));
-    return { problem: `there is no column ${name}. ${columnList(rows)}` };
+    return { problem: `there is no column ${name}. ${columnList(rows, name)}` };
   }
   if (!value) return { problem: `the value after ${sign} is missing.` };
   const text = unquoted(value);
@@ -129,9 +129,15 @@ function columnKey(rows, name) {
 
 const TEXT_KEYS = /** @type {const} */ (['name', 'filter', 'task', 'faults']);
 
-/** @param {ExperimentRow[]} rows */
-function columnList(rows) {
-  const names = [...NUMBER_KEYS, ...TEXT_KEYS, ...entryNames(rows)];
+/**
+ * Columns in a message, first the ones whose names contain a text: `optimizer.lr` for `lr`.
+ * @param {ExperimentRow[]} rows
+ * @param {string} name
+ */
+function columnList(rows, name) {
+  const all = [...NUMBER_KEYS, ...TEXT_KEYS, ...entryNames(rows)];
+  const similar = all.filter((column) => normal(column).includes(normal(name)));
+  const names = [...new Set([...similar, ...all])];
   const listed = names.slice(0, LISTED).map((name) => (/[\s<>=!]/.test(name) ? `"${name}"` : name));
   const more = names.length > LISTED ? ` and ${names.length - LISTED} more` : '';
   return `Columns: ${listed.join(', ')}${more}. Quote names with spaces.`;

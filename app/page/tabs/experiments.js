@@ -51,7 +51,7 @@ const BODY = `
     <button type="button" class="group-by text" popovertarget="experiment-groups" aria-haspopup="dialog" title="Entries of the provenance that distinguish groups of checkpoints" hidden></button>
     <label class="picker">Steps <select class="steps" aria-label="Steps"></select></label>
     <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees > 2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions with &gt; &lt; &gt;= &lt;= = or !=, such as nees &gt; 2 or seed = 1. Quote names and texts with spaces: &quot;95 % coverage&quot; &lt; 90%"></label>
-    <a class="csv" download>CSV</a>
+    <a class="csv" download title="All results of these steps, a row for each checkpoint, data set and faults">CSV</a>
   </div>
   <p class="problems" role="alert"></p>
   <div class="axes">
