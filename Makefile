@@ -13,6 +13,8 @@ VENV := .venv
 BIN  := $(VENV)/bin
 # --no-compile: compiling every module of every package adds half a minute; Python compiles modules when they are imported.
 PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_FLAGS)
+# Packages to compile for the tests: their processes start at the same time, and each would compile them.
+COMPILED := torch scipy numpy matplotlib viser fastapi pydantic
 # Otherwise each of the many processes that the tests start would compile PyTorch again: 2 s of CPU time.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -54,6 +56,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 $(VENV)/installed-test: $(VENV)/installed
 	@echo "Adding the test tools to $(VENV)."
 	@$(PIP) -e '.[test]'
+	@-$(BIN)/python -m compileall -qq -j 0 $(foreach name,$(COMPILED),$(VENV)/lib/python3*/site-packages/$(name)) || true
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed-test

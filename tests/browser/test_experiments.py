@@ -87,6 +87,7 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path:
         shutil.rmtree(folder)
 
 
+@pytest.mark.long
 def test_a_slow_or_failed_load_is_reported(open_page: Any, server: Any) -> None:
     """Before the modules of the tabs arrive, while the sweeps load, and after an error."""
     waiting: list[Any] = []

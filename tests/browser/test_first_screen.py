@@ -163,6 +163,7 @@ def test_names_of_tabs_have_space_beside_their_dividers(start_server: Callable[.
     check_names_of_tabs(open_page("?task=door&tab=diagnostics", url=start_server("--read-only").url))
 
 
+@pytest.mark.long
 def test_tabs_that_fail_to_load_say_so_and_are_tried_again(open_page: Any, server: Any) -> None:
     """Of a server that fails while the run is displayed; the run and the scene stay usable."""
     page = open_page("?tab=diagnostics")

@@ -80,6 +80,7 @@ def test_slow_drawing_is_paused_while_scrubbing(frame: Frame) -> None:
     assert frame.drawn_within(800) > 2
 
 
+@pytest.mark.long
 def test_pause_expires(frame: Frame) -> None:
     frame.draw(100)
     frame.pause("Infinity")

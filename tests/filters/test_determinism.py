@@ -47,7 +47,7 @@ def write_trace(name: str, path: Path) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
+@pytest.mark.parametrize("name", [pytest.param("crossmodal-ekf", marks=pytest.mark.long), "crossmodal-pf"])
 def test_repeated_runs_are_identical_and_threads_only_change_rounding(
     name: str, tmp_path: Path, short_episodes: Callable[..., list[Episode]]
 ) -> None:

@@ -84,15 +84,29 @@ def map_layers(client: TestClient, task: Task) -> list[str] | None:
             "estimate_sigma",
             "weights effective_weights effective_sample_size",
         ),
-        ("image-pf", ["image", "fused"], "estimate_sigma effective_sample_size", "weights effective_weights"),
-        ("unimodal-ekf", ["image", "haptics", "fused"], "effective_weights", "weights"),
+        pytest.param(
+            "image-pf",
+            ["image", "fused"],
+            "estimate_sigma effective_sample_size",
+            "weights effective_weights",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            "unimodal-ekf", ["image", "haptics", "fused"], "effective_weights", "weights", marks=pytest.mark.long
+        ),
         (
             "crossmodal-ukf",
             ["image", "haptics", "fused"],
             "effective_weights weights modality_sigma",
             "effective_sample_size",
         ),
-        ("information-ekf", ["image", "haptics", "fused"], "effective_weights weights", "effective_sample_size"),
+        pytest.param(
+            "information-ekf",
+            ["image", "haptics", "fused"],
+            "effective_weights weights",
+            "effective_sample_size",
+            marks=pytest.mark.long,
+        ),
         ("information-pf", ["image", "haptics", "fused"], "effective_weights weights effective_sample_size", ""),
         ("lstm", None, "estimate_mean", "estimate_sigma modality_mean modality_sigma weights effective_weights"),
     ],

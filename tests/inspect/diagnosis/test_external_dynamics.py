@@ -79,9 +79,9 @@ def profile() -> HealthyProfile:
     ("filter_", "cause"),
     [
         (Cart(gain=-1.0), "dynamics.inverted"),
-        (Cart(gain=0.1), "dynamics.frozen"),
+        pytest.param(Cart(gain=0.1), "dynamics.frozen", marks=pytest.mark.long),
         (Cart(noise=0.0005), "process_noise.small"),
-        (Cart(noise=0.05), "process_noise.large"),
+        pytest.param(Cart(noise=0.05), "process_noise.large", marks=pytest.mark.long),
         (Cart(weight=0.98), "weights.constant"),
     ],
 )

@@ -45,7 +45,7 @@ def case(name: str, index: int, faults: str) -> tuple[Episode, Trace, float]:
         ("push-crossmodal-pf", 142, "image_occluded=16:gray=255:x=8:y=8:from=36:to=42"),
     ],
 )
-@pytest.mark.parametrize("restorable", [True, False])
+@pytest.mark.parametrize("restorable", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_no_shorter_repair_exists(name: str, index: int, faults: str, restorable: bool) -> None:
     clean, run, bound = case(name, index, faults)
     checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
