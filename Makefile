@@ -56,7 +56,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 $(VENV)/installed-test: $(VENV)/installed
 	@echo "Adding the test tools to $(VENV)."
 	@$(PIP) -e '.[test]'
-	@-$(BIN)/python -m compileall -qq -j 0 $(foreach name,$(COMPILED),$(VENV)/lib/python3*/site-packages/$(name)) || true
+	@$(BIN)/python -m compileall -qq -j 0 $(foreach name,$(COMPILED),$(VENV)/lib/python3*/site-packages/$(name)) || true
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed-test
