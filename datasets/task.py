@@ -252,9 +252,8 @@ class Task:
         if math.isnan(self.map_half_width) and self.map_components:
             units = [c.unit for c in self.components if c.name == self.map_components[0]]
             object.__setattr__(self, "map_half_width", HALF_WIDTHS.get(units[0], 1.0) if units else 1.0)
-        if self.map_half_width >= LARGE and any(
-            c.unit == "m" and c.name in self.map_components for c in self.components
-        ):
+        lengths = [c.name for c in self.components if c.unit == "m"]
+        if self.map_half_width >= LARGE and any(name in lengths for name in self.map_components):
             object.__setattr__(self, "components", _in_metres(self.components))
             object.__setattr__(self, "channels", {key: _in_metres(each) for key, each in self.channels.items()})
 
@@ -318,7 +317,8 @@ class Task:
         """
         if not self.rotations or np.ndim(values) == 0 or values.shape[-1] != len(self.components) + len(self.rotations):
             return values
-        parts, start = list[NDArray[Any]](), 0
+        parts: list[NDArray[Any]] = []
+        start = 0
         for where in self.rotations:
             first = where.start + len(parts) // 2  # each rotation before has one number more
             quaternion = values[..., first : first + 4]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
@@ -123,13 +124,18 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
     def results(sweep: str, phase: str = "all") -> Experiments:
         from beliefscope.inspect.sweep import read_provenance  # imports torch
 
+        @cache
+        def standard_json(provenance: str) -> str:
+            """The same for all rows of a checkpoint."""
+            return json.dumps(read_provenance(provenance))
+
         rows = tables(sweep).overview(phase)
         names = catalog_names(store)
         tasks = set(rows["task"].to_pylist()) & set(store.tasks())
         data = {data.hash: name for task in tasks for name, data in store.datasets(task).items()}
         sent = [
             ExperimentRow(
-                **as_json(row) | {"provenance": json.dumps(read_provenance(row["provenance"]))},
+                **as_json(row) | {"provenance": standard_json(row["provenance"])},
                 catalog_name=names.get((row["task"], row["checkpoint"])),
                 data_name=data.get(row["data"]),
             )

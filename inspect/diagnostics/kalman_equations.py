@@ -167,7 +167,9 @@ class KalmanEquations(Diagnostic):
             for name, channels, values in zip(self.modalities, self.channels, self.measurement_noise, strict=True)
             for channel, value in zip(channels, values, strict=True)
         ]
-        known = tuple((name, float(factor * value), unit) for name, value, (unit, factor) in noise if value == value)
+        known = tuple(
+            (name, float(factor * value), unit) for name, value, (unit, factor) in noise if not np.isnan(value)
+        )
         tables = [Table("Jacobians against finite differences", heads, tuple(rows), note)]
         if self.modalities:
             heads = ("steps with", "covariance error, %", "mean error, %")

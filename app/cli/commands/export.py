@@ -53,7 +53,7 @@ def export(
         return opt.trace_result(_page(sources[0], output, task, filter), output)
     if interactive:
         raise BadInput(f"--interactive writes a page: output {str(output)!r} must end in .html")
-    if output.suffix == ".rrd":
+    if output.suffix.lower() == ".rrd":
         return opt.trace_result(_recording(sources[0], output, task, filter), output)
     check_name("export format", output.suffix.removeprefix(".").lower(), (*FORMATS, "html", "rrd"))
     export_format(output)
