@@ -57,8 +57,8 @@ class Dynamics(nn.Module):
 
     def forward(self, states: Tensor, control_part: Tensor) -> Tensor:
         """Next states (..., n), without noise; ``control_part`` must broadcast against the states' leading axes."""
-        hidden = self.shared(self.join_state(self.state_encoder(self.angles.features(states))) + control_part)
-        change, gate = self.output(hidden).split([self.n, 1], dim=-1)
+        hidden = linear(self.join_state, self.state_encoder(self.angles.features(states))) + control_part
+        change, gate = linear(self.output, self.shared(hidden)).split([self.n, 1], dim=-1)
         return states + self._without_static(change) * torch.sigmoid(gate)
 
     def _without_static(self, change: Tensor) -> Tensor:

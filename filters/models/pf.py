@@ -18,7 +18,7 @@ from beliefscope.filters.filter import Architecture, Filter, encoders
 from beliefscope.filters.models import common_random_numbers
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import mixture, only_present
-from beliefscope.filters.models.networks import Residual, Stack, in_chunks, vector_stack
+from beliefscope.filters.models.networks import Residual, Stack, in_chunks, linear, vector_stack
 from beliefscope.filters.models.resampling import resample
 from beliefscope.filters.models.weight_model import WeightModel
 
@@ -48,8 +48,7 @@ class MeasurementModel(nn.Module):
 
     def state_part(self, states: Tensor) -> Tensor:
         """States (..., n), standardised, to (..., units)."""
-        part: Tensor = self.join_state(self.state_encoder(self.angles.features(states)))
-        return part
+        return linear(self.join_state, self.state_encoder(self.angles.features(states)))
 
     def log_likelihood(self, observation_part: Tensor, state_part: Tensor) -> Tensor:
         """Two broadcastable parts (..., units) to (...)."""
