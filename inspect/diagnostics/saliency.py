@@ -18,7 +18,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.external_step import ExternalStep
-from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
+from beliefscope.inspect.diagnostics.single_step import SingleStep, channels_of
 from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -146,7 +146,7 @@ class Saliency(Diagnostic):
 
     def _strongest(self, attribution: Attribution) -> str:
         """The channel with the largest attribution; empty if all round to zero."""
-        channels = channel_names(self.task, attribution.integrated)
+        channels = channels_of(self.task, attribution.integrated)
         candidates = [
             (abs(value), f"{channel.name} ({self._format(float(value), '+')})")
             for modality, names in channels.items()
@@ -172,12 +172,13 @@ class Saliency(Diagnostic):
         ]
         tables = tables if self.attributions else []
         rows: list[tuple[Value, ...]] = []
-        for modality, channels in channel_names(self.task, self.inputs).items():
+        for modality, channels in channels_of(self.task, self.inputs).items():
             for i, channel in enumerate(channels):
-                observations = [channel.factor * values[modality][i] for values in (self.inputs, self.means)]
+                display_unit, factor = channel.conversion
+                observations = [factor * values[modality][i] for values in (self.inputs, self.means)]
                 sources = [*(attribution.integrated for attribution in self.attributions), self.occlusion]
                 values = [self.factor * source[modality][i] for source in sources]
-                rows.append((modality, channel.name, channel.unit, *map(_rounded, [*observations, *values])))
+                rows.append((modality, channel.name, display_unit, *map(_rounded, [*observations, *values])))
         if rows:
             baselines = [f"relative to {attribution.baseline}" for attribution in self.attributions]
             head = ("modality", "channel", "unit", "value", "training mean", *baselines, "occlusion")

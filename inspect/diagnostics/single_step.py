@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from beliefscope.datasets.errors import check_name
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.models.common_random_numbers import Common
@@ -22,26 +22,13 @@ from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.traces.replay import Intervention, Replay, repeat_belief
 
 
-@dataclass(frozen=True)
-class Channel:
-    """One channel of a modality, such as ``force y``, with its display unit and conversion factor."""
-
-    name: str
-    unit: str
-    factor: float
-
-
-def channel_names(task: Task, modalities: Iterable[str]) -> dict[str, tuple[Channel, ...]]:
-    """Modality -> channels, for modalities that are not images."""
+def channels_of(task: Task, modalities: Iterable[str]) -> dict[str, tuple[Component, ...]]:
+    """Modality -> channels, such as ``force y``, for modalities that are not images."""
     channels = {}
     for modality in modalities:
         keys = {key: task.observations[key] for key in task.modalities[modality]}
         if all(len(shape) == 1 for shape in keys.values()):
-            channels[modality] = tuple(
-                Channel(channel.name, *channel.conversion)
-                for key, (size,) in keys.items()
-                for channel in (task.channel(key, i) for i in range(size))
-            )
+            channels[modality] = tuple(task.channel(key, i) for key, (size,) in keys.items() for i in range(size))
     return channels
 
 

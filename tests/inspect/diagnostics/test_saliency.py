@@ -21,7 +21,7 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrain
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.saliency import ENTRY, MIN_CHANGE, Saliency, saliency
-from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
+from beliefscope.inspect.diagnostics.single_step import SingleStep, channels_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.replay import Intervention, Replay
@@ -328,9 +328,9 @@ def test_filter_without_images_has_one_baseline() -> None:
 
 def test_channels_have_names_and_units() -> None:
     task = builtin("crossmodal-ekf").checkpoint.task
-    names = channel_names(task, task.modalities)
-    assert list(names) == ["haptics"]
-    assert [(x.name, x.unit) for x in names["haptics"]][-2:] == [("torque z", "N m"), ("contact", "")]
+    channels = channels_of(task, task.modalities)
+    assert list(channels) == ["haptics"]
+    assert [(x.name, x.unit) for x in channels["haptics"]][-2:] == [("torque z", "N m"), ("contact", "")]
 
 
 def test_invalid_arguments_are_refused() -> None:
