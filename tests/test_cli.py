@@ -213,6 +213,8 @@ BAD = [
     f"record {EKF} -o new.mcap",
     f"trace {EKF} -o new.npz",
     "train door --filter crossmodal-pf -o new.pt",
+    "train door --filter crossmodal-pf -o ekf.safetensors",
+    "finetune ekf.safetensors -o ekf.safetensors",
     "finetune door --filter crossmodal-ekf -o new.pt",
     f"counterfactual {EKF} --from 40 --to 60",
     f"counterfactual {EKF} --faults blackout --from 60 --to 40",

@@ -93,6 +93,14 @@ def flag(description: str, *names: str, default: Any = False) -> Any:
     return typer.Option(default, *names, help=description)
 
 
+def _check_checkpoint(path: Path) -> Path:
+    """The path of a checkpoint to write. Raises BadInput if one exists, before work that would end in its loss."""
+    check_output(path, ".safetensors")
+    if path.exists():
+        raise BadInput(f"output {str(path)!r} exists; give the name of a new file, or delete it first")
+    return path
+
+
 def output_file(
     metavar: str, description: str, *suffixes: str, names: Sequence[str] = ("-o", "--output"), default: Any = None
 ) -> Any:
@@ -101,7 +109,9 @@ def output_file(
 
 
 DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5", default=...)
-CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors", default=...)
+CHECKPOINT = option(
+    "CHECKPOINT", "Output .safetensors file; must not exist.", ..., "-o", "--output", callback=_check_checkpoint
+)
 TRACE_FILTER = option(
     "NAME|CHECKPOINT|FILE.py:FUNCTION",
     "Filter that produced the traces. Default: the pretrained filter with the traces' checkpoint hash.",
