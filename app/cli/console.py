@@ -53,13 +53,16 @@ class Result:
         """Print the text, or the JSON document to the destination ``-``."""
         from beliefscope.inspect.diagnostics.views import as_json
 
-        document, text = dict(self.document), self.text
-        if self.path is not None:
-            size = self.path.stat().st_size
-            document |= {"path": str(self.path), "bytes": size}
-            amount = f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
-            text = f"{self.path} ({amount}): {text}"
+        document, text = self.described()
         print(text if json_destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
+
+    def described(self) -> tuple[dict[str, Any], str]:
+        """Document and text with the path and size of the written file, if there is one."""
+        if self.path is None:
+            return dict(self.document), self.text
+        size = self.path.stat().st_size
+        amount = f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+        return {**self.document, "path": str(self.path), "bytes": size}, f"{self.path} ({amount}): {self.text}"
 
 
 def arrow(title: str, rows: Any) -> str:

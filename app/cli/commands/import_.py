@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,22 @@ from beliefscope.datasets.text import plural
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
     from beliefscope.inspect.trace import Trace
+    from beliefscope.recordings.log_readers.column_map import ColumnMap
 
 RECORDINGS = (".rrd", ".live")
 
 
 def import_(
-    source: Path = opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log (file or folder)."),
-    output: Path | None = opt.output_file(
-        "RUN.trace|RUN.live|DATA.h5",
-        "Output: a trace, a run for the folder live of a workspace, or a data set.",
-        *(".trace", ".live", ".h5"),
+    sources: list[Path] = opt.argument(
+        "FILE...", "Recording (.rrd), file of a live run (.live), or log (file or folder); several for a folder."
+    ),
+    output: Path | None = opt.option(
+        "RUN.trace|RUN.live|DATA.h5|DIR",
+        "Output: a trace, a run for the folder live of a workspace, or a data set; or a folder of traces, one for each "
+        "file.",
+        None,
+        "-o",
+        "--output",
     ),
     map: Path | None = opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", None, "--map"),
     guess: bool = opt.flag("Print a first map of a log instead of importing it.", "--guess"),
@@ -34,10 +41,11 @@ def import_(
     ),
     task: str = opt.TASK_OF_FILES,
 ) -> console.Result:
-    """Import a recording or a log as a trace or data set.
+    """Import recordings and logs as traces or data sets.
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
-    Of a live run that is in progress or was killed, the complete steps are imported.
+    Of a live run that is in progress or was killed, the complete steps are imported. With a folder as output, each file
+    becomes a trace of the same name in it; files that cannot be imported are reported, and the others are written.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
@@ -51,6 +59,7 @@ def import_(
     \b
     Examples:
       beliefscope import run.rrd -o run.trace
+      beliefscope import first.rrd second.rrd -o traces
       beliefscope import log.csv --guess
       beliefscope import log.csv --map map.toml -o log.h5
       beliefscope import logs --map map.toml --split auto -o logs.h5
@@ -60,34 +69,82 @@ def import_(
     """
     from beliefscope.datasets.dataset import SPLITS
     from beliefscope.recordings.log_readers.column_map import read_map
-    from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
+    from beliefscope.recordings.log_readers.columns import preview_columns
     from beliefscope.recordings.log_readers.guess import guess_map
-    from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
-    from beliefscope.recordings.open_trace import open_recording
 
     if guess:
-        text = guess_map(preview_columns(source), source.stem)
+        if len(sources) > 1:
+            raise BadInput(f"--guess prints the map of one log, not of {len(sources)}")
+        text = guess_map(preview_columns(sources[0]), sources[0].stem)
         return console.Result({"map": text}, text.rstrip())
     if output is None:
-        raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")
-    if source.suffix.lower() in RECORDINGS and map is None:
-        if split is not None:
-            raise BadInput(f"--split applies to logs: {source.name} is a recording, whose episode already has a split")
-        opt.check_output(output, ".trace", ".live")
-        return _written(open_recording(source, task), output)
-    if map is None:
-        raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
+        raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5; or -o DIR for several files")
     check_name("split", split or "test", (*SPLITS, "auto"))
-    mapping = read_map(map)
+    mapping = None if map is None else read_map(map)
+
+    def import_file(source: Path, output: Path) -> console.Result:
+        if source.suffix.lower() in RECORDINGS and mapping is None:
+            return _recording(source, output, split, task)
+        return _log(source, output, mapping, split or "test", episode)
+
+    if not output.suffix or output.is_dir():
+        return _folder(sources, output, import_file)
+    opt.check_output(output, ".trace", ".live", ".h5")
+    if len(sources) > 1:
+        raise BadInput(f"{len(sources)} files need a folder as output, not {str(output)!r}")
+    return import_file(sources[0], output)
+
+
+def _folder(sources: list[Path], folder: Path, import_file: Callable[[Path, Path], console.Result]) -> console.Result:
+    """Write a trace for each file; report files with errors."""
+    names = [f"{source.stem}.trace" for source in sources]
+    if len(set(names)) < len(names):
+        raise BadInput("files need different names, without their suffixes, to become traces of one folder")
+    opt.check_folder(folder, "output")
+    opt.check_output(folder / names[0] if folder.is_dir() else folder)
+    folder.mkdir(exist_ok=True)
+    if len(sources) == 1:
+        return import_file(sources[0], folder / names[0])
+    documents: list[dict[str, Any]] = []
+    lines: list[str] = []
+    for source, name in zip(sources, names, strict=True):
+        try:
+            document, line = import_file(source, folder / name).described()
+            lines.append(line)
+        except BadInput as error:
+            document = {"error": str(error)}
+            console.note(f"error: {source}: {error}")
+        documents.append({"source": str(source), **document})
+    lines.append(f"{len(lines)} of {plural(len(sources), 'file')} imported")
+    failed = any("error" in document for document in documents)
+    return console.Result({"files": documents}, "\n".join(lines), code=2 if failed else 0)
+
+
+def _recording(source: Path, output: Path, split: str | None, task: str) -> console.Result:
+    from beliefscope.recordings.open_trace import open_recording
+
+    if split is not None:
+        raise BadInput(f"--split applies to logs: {source.name} is a recording, whose episode already has a split")
+    opt.check_output(output, ".trace", ".live")
+    return _written(open_recording(source, task), output)
+
+
+def _log(source: Path, output: Path, mapping: ColumnMap | None, split: str, episode: int) -> console.Result:
+    """Write a data set, or a trace of one episode."""
+    from beliefscope.recordings.log_readers.columns import read_columns
+    from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
+
+    if mapping is None:
+        raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
     columns = read_columns(source, mapping)
-    episodes = read_log(columns, mapping, source.name, split or "test")
-    if output.suffix != ".h5":
-        if not 0 <= episode < len(episodes):
-            raise BadInput(f"episode {episode} does not exist: {source.name} has {plural(len(episodes), 'episode')}")
-        result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
-        values, text = _values([episodes[episode]])
-        return replace(result, document={**result.document, **values}, text=f"{result.text}, {text}")
-    return _data_set(episodes, output)
+    episodes = read_log(columns, mapping, source.name, split)
+    if output.suffix == ".h5":
+        return _data_set(episodes, output)
+    if not 0 <= episode < len(episodes):
+        raise BadInput(f"episode {episode} does not exist: {source.name} has {plural(len(episodes), 'episode')}")
+    result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
+    values, text = _values([episodes[episode]])
+    return replace(result, document={**result.document, **values}, text=f"{result.text}, {text}")
 
 
 def _data_set(episodes: list[Episode], output: Path) -> console.Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -87,3 +88,37 @@ def test_a_recording_has_a_split_already(run: Run, tmp_path: Path) -> None:
     code, _, error = run("import --split train", tmp_path / "run.rrd", "-o", tmp_path / "run.trace")
     assert code == 2
     assert error == "error: --split applies to logs: run.rrd is a recording, whose episode already has a split\n"
+
+
+def test_several_logs_become_a_folder_of_traces_and_a_damaged_one_is_reported(run: Run, log: Path) -> None:
+    second, damaged, output = log.with_name("second.npz"), log.with_name("damaged.npz"), log.with_name("traces")
+    second.write_bytes(log.read_bytes())
+    damaged.write_bytes(log.read_bytes()[:100])
+    code, out, error = run("import", log, damaged, second, "--map", log.with_name("map.toml"), "-o", output)
+    assert code == 2
+    assert [line.partition(" (")[0] for line in out.splitlines()] == [
+        str(output / "log.trace"),
+        str(output / "second.trace"),
+        "2 of 3 files imported",
+    ]
+    assert error.startswith(f"error: {damaged}: damaged.npz ")
+    assert error.count("\n") == 1
+    assert {path.name for path in output.iterdir()} == {"log.trace", "second.trace"}
+    assert load_trace(output / "second.trace").task.name == "car"
+    code, out, _ = run("import --json -", log, damaged, "--map", log.with_name("map.toml"), "-o", output)
+    first, other = json.loads(out)["files"]
+    assert (code, first["path"], set(other)) == (2, str(output / "log.trace"), {"source", "error"})
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        ("run.trace", "2 files need a folder as output, not '{}/run.trace'"),
+        ("traces", "files need different names, without their suffixes, to become traces of one folder"),
+    ],
+)
+def test_several_files_need_a_folder_and_different_names(run: Run, log: Path, output: str, message: str) -> None:
+    files = (log, log.with_suffix(".csv"))
+    code, _, error = run("import", *files, "--map", log.with_name("map.toml"), "-o", log.with_name(output))
+    assert (code, error) == (2, f"error: {message.format(log.parent)}\n")
+    assert not log.with_name(output).exists()
