@@ -151,12 +151,16 @@ class ColumnMap:
         return {name for component in self.state.values() for name in listed(component.column) if name}
 
     @property
+    def estimated(self) -> set[str]:
+        """References to columns of the recorded estimate, without its fusion weights."""
+        return {name for key in VALUES for name in listed(self.estimate.get(key, []))}
+
+    @property
     def required(self) -> set[str]:
         """References to columns that have values at all steps: state, sensors, control, estimate and episode."""
-        estimate = (self.estimate.get(key, []) for key in VALUES)
         weights = self.estimate.get("weights", {}).values()
-        parts = (*self.sensors.values(), self.control, *estimate, *weights)
-        return self.truth | {name for part in parts for name in listed(part)} | ({self.episode} - {""})
+        parts = (*self.sensors.values(), self.control, *weights)
+        return self.truth | self.estimated | {name for part in parts for name in listed(part)} | ({self.episode} - {""})
 
     @property
     def references(self) -> set[str]:

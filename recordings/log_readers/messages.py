@@ -15,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.text import percent
 from beliefscope.recordings.log_readers.arrays import Columns, check_size
 from beliefscope.recordings.log_readers.column_map import ColumnMap, base_name
 from beliefscope.recordings.log_readers.images import image_of, is_image
+
+Ticks = NDArray[np.int64]
 
 LONGEST = 10_000_000
 """Largest number of ticks."""
@@ -32,6 +35,12 @@ CLOCK = "clock"
 
 NEW = "new message of "
 """Before the name of a column: whether its topic has had a message since the step before."""
+
+DELAY = "delay of the estimate"
+"""Column of the s from the state of each tick to the estimate that follows before the next tick; NaN without one."""
+
+LATE = 0.2
+"""Delay, as a share of a step, up to which an estimate is probably that of the tick before it."""
 
 AGE = "age"
 """Field of every topic: s since its last message."""
@@ -119,7 +128,8 @@ def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
     The first tick is the first at which every topic of state, sensors, control, estimate and episode has a message;
     covariates are missing (NaN, empty text) before their first. The last tick is the first after the last message of
     the state's topics, or of all topics if the state is unknown. The column ``CLOCK`` has the times of the ticks, s
-    since the first one, ``NEW`` before a name whether its topic has had a message since the tick before.
+    since the first one, ``NEW`` before a name whether its topic has had a message since the tick before, ``DELAY`` how
+    late the estimates are.
 
     Raises BadInput for unknown topics and fields, topics without messages or whose times do not overlap, more than
     ``LONGEST`` ticks, and values of different shapes.
@@ -153,7 +163,41 @@ def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
             else:
                 columns[name] = _held(_stacked(name, entry.values[name]), order, index, name)
             columns[NEW + name] = np.diff(index, prepend=-1) > 0
+    if log.second and (estimates := _topics(log.topics, mapping.estimated)):
+        published = _next_time(series, ticks, min(estimates), steps)
+        held = [_last_time(series, ticks, topic, steps) for topic in _topics(log.topics, mapping.truth)]
+        columns[DELAY] = (published - np.min(held or [clock.times(steps)], axis=0)) / log.second
     return columns
+
+
+def _last_time(series: Mapping[str, Series], ticks: Mapping[str, Ticks], topic: str, steps: Ticks) -> Ticks:
+    """(T,) time of the topic's last message at or before each tick."""
+    index = np.searchsorted(np.sort(ticks[topic]), steps, side="right") - 1
+    return np.sort(series[topic].times)[index]
+
+
+def _next_time(
+    series: Mapping[str, Series], ticks: Mapping[str, Ticks], topic: str, steps: Ticks
+) -> NDArray[np.float64]:
+    """(T,) time of the topic's message between each tick and the next; NaN without one."""
+    own = np.sort(ticks[topic])
+    index = np.minimum(np.searchsorted(own, steps, side="right"), len(own) - 1)
+    return np.where(own[index] == steps + 1, np.sort(series[topic].times)[index], np.nan)
+
+
+def late_estimates(columns: Columns, mapping: ColumnMap) -> str:
+    """A warning if most estimates are published just after the tick of their state, else empty."""
+    if DELAY not in columns or len(columns[DELAY]) < 2:
+        return ""
+    delays, step = columns[DELAY][:-1], float(np.median(np.diff(columns[CLOCK])))
+    late = delays[delays <= LATE * step]
+    if len(late) <= len(delays) / 2:
+        return ""
+    return (
+        f"{percent(len(late) / len(delays))} of the estimates are published just after the tick of their state "
+        f"(typically {1e3 * np.median(late):.2g} ms), so they are one step old at the ticks. To pair them with their "
+        f"state, make their topic the clock of the map, in place of {mapping.clock or 'dt'}"
+    )
 
 
 class _Clock:

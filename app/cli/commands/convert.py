@@ -30,7 +30,7 @@ def convert(
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.store import write_dataset
 
-    target = load_task(task)
+    target = load_task(opt.definition_of(task, data))
     with opt.open_episodes(target, data, skip_bad) as episodes, console.progress("Converting") as advance:
 
         def read() -> Iterator[Episode]:

@@ -132,6 +132,7 @@ def _recording(source: Path, output: Path, split: str | None, task: str) -> cons
 def _log(source: Path, output: Path, mapping: ColumnMap | None, split: str, episode: int) -> console.Result:
     """Write a data set, or a trace of one episode."""
     from beliefscope.recordings.log_readers.columns import read_columns
+    from beliefscope.recordings.log_readers.messages import late_estimates
     from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
 
     if mapping is None:
@@ -142,6 +143,8 @@ def _log(source: Path, output: Path, mapping: ColumnMap | None, split: str, epis
         return _data_set(episodes, output)
     if not 0 <= episode < len(episodes):
         raise BadInput(f"episode {episode} does not exist: {source.name} has {plural(len(episodes), 'episode')}")
+    if warning := late_estimates(columns, mapping):
+        console.note(f"Warning: {source.name}: {warning}")
     result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
     values, text = _values([episodes[episode]])
     return replace(result, document={**result.document, **values}, text=f"{result.text}, {text}")

@@ -51,6 +51,14 @@ def test_the_episodes_are_in_the_selected_split(run: Run, log: Path, option: str
     assert load_trace(log.with_name("run.trace")).episode.split == expected
 
 
+def test_a_data_set_is_converted_by_the_name_of_its_own_task(run: Run, log: Path) -> None:
+    data, copy = log.with_name("data.h5"), log.with_name("copy.h5")
+    assert run("import", log, "--map", log.with_name("map.toml"), "-o", data)[0] == 0
+    code, _, error = run("convert car --data", data, "-o", copy)
+    assert code == 0, error
+    assert copy.read_bytes() == data.read_bytes()
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error:std")
 @pytest.mark.parametrize("name", ["unimodal-ekf", "unimodal-pf", "lstm"])

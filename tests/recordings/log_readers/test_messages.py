@@ -6,8 +6,9 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.log_readers.column_map import read_map
 from beliefscope.recordings.log_readers.columns import preview_columns, read_columns
 from beliefscope.recordings.log_readers.guess import guess_map
+from beliefscope.recordings.log_readers.messages import late_estimates, on_clock
 from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
 
 ROOT = Path(__file__).parents[3]
@@ -293,3 +295,37 @@ def test_the_command_line_imports_a_log(json_log: Path, tmp_path: Path, run: Cal
     code, _, error = run("import", json_log, "--map", unknown, "-o", tmp_path / "b.h5")
     assert (code, (tmp_path / "b.h5").exists()) == (2, False)
     assert "x is unknown in episode 0: a data set needs all states" in error
+
+
+class DelayedEstimates:
+    """Truth every 50 ms, with estimates some ms later."""
+
+    topics = ("/truth", "/estimate")
+    second = 1000.0
+    timeline = ""
+
+    def __init__(self, delay: int) -> None:
+        self.delay = delay
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+        for k in range(40):
+            for topic, time in (("/truth", 50 * k), ("/estimate", 50 * k + self.delay)):
+                if topic in topics:
+                    yield topic, time, lambda: {"x": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("delay", "clock", "expected"),
+    [
+        (4, "dt = 0.05", "100 % of the estimates are published just after the tick of their state (typically 4 ms)"),
+        (4, 'clock = "/truth"', "the clock of the map, in place of /truth"),
+        (4, 'clock = "/estimate"', ""),
+        (0, "dt = 0.05", ""),
+        (30, "dt = 0.05", ""),
+    ],
+)
+def test_estimates_just_after_the_ticks_cause_a_warning(tmp_path: Path, delay: int, clock: str, expected: str) -> None:
+    text = f'{clock}\n[state]\nx = "/truth.x"\n[estimate]\nmean = "/estimate.x"\n'
+    mapping = read_map(map_file(tmp_path, text))
+    warning = late_estimates(on_clock(DelayedEstimates(delay), mapping), mapping)
+    assert expected in warning if expected else warning == ""
