@@ -238,7 +238,7 @@ test('faults of one kind have levels, and no fault has level 0', () => {
 const recorded = (...entries) =>
   rowsOf(...entries.map((provenance) => ({ provenance: JSON.stringify(provenance) })));
 
-test('seeds, addresses, dates, and texts and ids of every checkpoint do not distinguish groups', () => {
+test('seeds, addresses, dates, and texts, ids and times of every checkpoint do not distinguish groups', () => {
   const rows = recorded(
     ...[0, 1, 2, 3].map((i) => ({
       dir: `/runs/${i}`,
@@ -247,6 +247,9 @@ test('seeds, addresses, dates, and texts and ids of every checkpoint do not dist
       trainSeed: i,
       seed: { value: i },
       run_id: 100 + i,
+      started_at: 1764361200.5 + 600 * i,
+      train: { wallTime: 612 - i },
+      time_step: 0.1 * i,
       url: `https://tracker/${i % 2}`,
       env_id: i < 2 ? 'door' : 'push',
       lr: ['1e-3', 3e-4][i % 2],
@@ -256,7 +259,7 @@ test('seeds, addresses, dates, and texts and ids of every checkpoint do not dist
     })),
     {},
   );
-  assert.deepEqual(settingEntries(rows), ['env_id', 'lr', 'dropout', 'seeding']);
+  assert.deepEqual(settingEntries(rows), ['time_step', 'env_id', 'lr', 'dropout', 'seeding']);
   assert.deepEqual(groupEntries(rows, ''), settingEntries(rows));
   assert.deepEqual(groupEntries(rows, namesText(['lr', 'run_id', 'gone'])), ['run_id', 'lr']);
   assert.deepEqual(groupEntries(rows, ','), []);

@@ -7,6 +7,8 @@
 
 const NUMBER = /^[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?$/i;
 const DATE = /^\d{4}-\d{2}-\d{2}(?:[T _]|$)/;
+/** Last words of the names of times: `wall_time` and `createdAt`, but not `time_step`. */
+const TIMES = ['time', 'timestamp', 'duration', 'seconds', 'runtime', 'at'];
 
 /** @type {WeakMap<ExperimentRow, Record<string, Entry>>} */
 const parsed = new WeakMap();
@@ -66,7 +68,7 @@ export const differingEntries = (rows) =>
 
 /**
  * Names of the entries that distinguish settings of the training rather than its runs. All differing ones but seeds,
- * addresses, dates, and texts and numeric ids that differ for every checkpoint.
+ * addresses, dates, and texts, numeric ids and times that differ for every checkpoint.
  * @param {ExperimentRow[]} rows
  */
 export function settingEntries(rows) {
@@ -77,7 +79,8 @@ export function settingEntries(rows) {
       if (entries.every(isAddress) || entries.every((value) => DATE.test(String(value))))
         return false;
       // A number that always differs can be a setting that was drawn at random, such as a learning rate.
-      const isRun = hasWord(name, 'id') || entries.some((value) => numberIn(value) === null);
+      const isNamedRun = hasWord(name, 'id') || TIMES.includes(wordsOf(name).at(-1) ?? '');
+      const isRun = isNamedRun || entries.some((value) => numberIn(value) === null);
       return !isRun || new Set(entries).size < entries.length || entries.length < 2;
     })
     .map(([name]) => name);
@@ -88,12 +91,15 @@ export function settingEntries(rows) {
  * @param {string} name
  * @param {string} word
  */
-const hasWord = (name, word) =>
+const hasWord = (name, word) => wordsOf(name).includes(word);
+
+/** @param {string} name */
+const wordsOf = (name) =>
   name
     .replace(/([a-z])([A-Z])/g, '$1 $2')
     .toLowerCase()
     .split(/[^a-z]+/)
-    .includes(word);
+    .filter(Boolean);
 
 /**
  * Whether an entry has numbers, also stored as text, and no other values.
