@@ -16,6 +16,7 @@ from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.permalinks import page_link
+from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
@@ -130,6 +131,9 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
         responses={202: {"model": DiagnosisJob | Progress}},
     )
     def get_diagnosis(selection: RequestedRun, over: Over = "episode") -> Response:
+        if selection.data.startswith(LIVE_PREFIX):  # of no data set, whose episodes a job could run
+            store.live.ended_run(selection.data)
+            return JSONResponse({"job": None, "preliminary": preliminary_diagnosis(store, selection)}, status_code=202)
         job = jobs.find("diagnosis", _arguments(store, selection, over))
         if path := jobs.finished_result(job):
             return FileResponse(path, media_type="application/json")

@@ -52,6 +52,8 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
     page.until(f"() => beliefscope.state().follow && beliefscope.state().step === {NEWEST} && {NEWEST} > {left}")
     page.page.click("#tab-diagnostics")
     page.until("() => /when it has ended/.test(document.querySelector('#diagnostics .note').textContent)")
+    page.page.click("#tab-diagnosis")
+    page.until("() => /when it has ended/.test(document.querySelector('#diagnosis .headline').textContent)")
     page.page.click("#tab-failures")
     page.until("() => document.querySelector('#failures').dataset.state === 'live'")
     assert page.page.locator("#failures .doing button").count() == 0
@@ -62,5 +64,10 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
     assert f"at step {page.page.evaluate(f'() => {NEWEST}')}:" in message
     assert page.page.locator("#follow").is_hidden()
     page.until("() => document.querySelectorAll('#failures .events tbody tr').length > 0")
+    page.page.click("#tab-diagnosis")
+    page.until(
+        "() => /^Preliminary, from this live run/.test(document.querySelector('#diagnosis .status').textContent)"
+    )
+    assert page.page.locator("#diagnosis > .doing button").count() == 0
     page.page.click("#tab-diagnostics")
     page.until("() => document.querySelectorAll('#diagnostics .list li').length > 3")

@@ -247,6 +247,7 @@ export class DisplayedRun {
       ended: (/** @type {Trace} */ trace) => {
         page.timeline.grow();
         page.tabs?.diagnostics.show(trace);
+        page.tabs?.diagnosis.show(trace);
         page.tabs?.failures.show(trace);
       },
       listed: refreshPickers,

@@ -98,6 +98,7 @@ export class Diagnosis {
     if (trace?.selection.filter !== this.#trace?.selection.filter) this.#healthyFilter = '';
     this.#trace = trace;
     this.#failure = '';
+    if (this.#isLive) this.#results.delete(this.#key); // a new live run can have the same name
     this.#repair.clear();
     this.#loading.abort();
     this.load();
@@ -119,12 +120,13 @@ export class Diagnosis {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     this.#repair.show(trace);
-    if (trace.live) return this.#draw();
+    if (this.#liveState) return this.#draw();
     if (trace.header.no_diagnosis) return this.#loadRecord(trace, signal);
-    this.#records.load(this.#recordKey, () => this.#getRecord(trace, signal), signal);
+    if (!this.#isLive)
+      this.#records.load(this.#recordKey, () => this.#getRecord(trace, signal), signal);
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
-    if (this.#entry.state !== 'absent' || !this.#starts) return;
+    if (this.#entry.state !== 'absent' || !this.#canStart) return;
     await new Promise((resolve) => setTimeout(resolve, SETTLING));
     if (!signal.aborted && this.#open && this.#entry.state === 'absent') this.#startOrCancel();
   }
@@ -179,11 +181,26 @@ export class Diagnosis {
     return JSON.stringify([names, over === 'episode' ? episode : over]);
   }
 
+  /** Whether the run is or was a live run: it belongs to no data set, so that no job can confirm its diagnosis. */
+  get #isLive() {
+    return this.#trace?.selection.data.startsWith('live:') ?? false;
+  }
+
+  get #canStart() {
+    return this.#starts && !this.#isLive;
+  }
+
+  /** State of a live run without a diagnosis; null for any other run. @returns {Entry | null} */
+  get #liveState() {
+    if (this.#trace?.live?.state === 'running') return { state: 'live' };
+    const reason = this.#isLive && this.#trace?.header.no_diagnosis;
+    return reason ? { state: 'error', error: reason } : null;
+  }
+
   /** @returns {Entry} */
   get #entry() {
     if (this.#failure) return { state: 'error', error: this.#failure };
-    if (this.#trace?.live) return { state: 'live' };
-    return this.#results.get(this.#key);
+    return this.#liveState ?? this.#results.get(this.#key);
   }
 
   #startOrCancel() {
@@ -195,12 +212,12 @@ export class Diagnosis {
 
   #draw() {
     if (!this.#open) return;
-    if (this.#trace && !this.#trace.live && this.#trace.header.no_diagnosis)
+    if (this.#trace && !this.#liveState && this.#trace.header.no_diagnosis)
       return this.#drawRecord(this.#trace, this.#trace.header.no_diagnosis);
     const entry = this.#entry;
     const { over } = this.#store.state;
     const set = (/** @type {string} */ value) => this.#store.set({ over: value });
-    choice(html('.choice', this.#host), OVER, over, set);
+    choice(html('.choice', this.#host), this.#isLive ? [] : OVER, over, set);
     const result = entry.state === 'ready' ? entry.result : entry.preliminary;
     if (this.#trace && entry.state === 'ready' && over === 'episode')
       this.confirmed(this.#trace, entry.result);
@@ -210,11 +227,12 @@ export class Diagnosis {
     const state = stateOf(entry);
     this.#writeHeadline(result?.headline ?? state);
     const { episode } = this.#store.state;
+    const source = this.#isLive ? 'this live run' : `episode ${episode}`;
     html('.status', this.#host).textContent = entry.preliminary
-      ? `Preliminary, from episode ${episode} alone and before any cause is undone. ${state}`
+      ? `Preliminary, from ${source} alone and before any cause is undone. ${state}`
       : '';
     showJobButton(html('.doing', this.#host), entry, {
-      action: this.#trace ? (ACTIONS[entry.state] ?? '') : '',
+      action: this.#trace && !this.#isLive ? (ACTIONS[entry.state] ?? '') : '',
       progress: 'Progress of the diagnosis',
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
@@ -225,7 +243,7 @@ export class Diagnosis {
     this.#listed = result;
     const causes = (result?.causes ?? []).filter(({ probability }) => probability >= SHOWN);
     const rows = causes.map((cause, i) => {
-      const canTrain = this.#starts && !i && isTrainable(cause);
+      const canTrain = this.#canStart && !i && isTrainable(cause);
       const open = (/** @type {number} */ e, /** @type {number | null} */ s) =>
         this.#openStep(e, s, cause);
       return causeItem(cause, open, canTrain ? [this.#finetuneButton()] : []);
@@ -300,7 +318,7 @@ export class Diagnosis {
     const trace = this.#trace;
     const isOld = result?.outdated ?? false;
     const isShown = isInUse || isOld || ['active', 'ended', 'error'].includes(entry.state);
-    host.hidden = !this.#starts || !isShown;
+    host.hidden = !this.#canStart || !isShown;
     if (host.hidden || !trace) return;
     const { data } = trace.selection;
     const source = isOld
@@ -375,7 +393,7 @@ function findingOf({ state, masked, miscalibrated }) {
 function stateOf(entry) {
   if (entry.state === 'error') return sentence(entry.error);
   if (entry.state === 'live')
-    return 'A live run has no diagnosis, because it belongs to no data set.';
+    return 'The live run is in progress. It is diagnosed when it has ended.';
   if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
   if (entry.state === 'loading') return 'Loading …';
   return '';

@@ -248,6 +248,7 @@ def test_run_of_an_unavailable_filter(client: TestClient, folder: Path, full_tra
     writer.finish()
     missing = client.get(TRACE.format(run["filter"])).json()["missing_quantities"]
     assert missing == header["missing_quantities"]
+    assert client.get(f"/api/diagnosis/door/{run['filter']}/9?data=live:run").status_code == 400
     writer.close()
 
 
@@ -278,6 +279,7 @@ def test_run_without_true_states(client: TestClient, folder: Path, full_trace: T
     writer.close()
     failures = client.get(f"/api/failures/door/{full_trace.filter}?data=live:run").json()
     assert [score["total"] for score in failures["scores"] if score["name"] == "error"] == [0]
+    assert client.get(f"/api/diagnosis/door/{full_trace.filter}/9?data=live:run").status_code == 202
 
 
 def test_invalid_requests_for_a_live_run(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
@@ -288,6 +290,7 @@ def test_invalid_requests_for_a_live_run(client: TestClient, writer: LiveFileWri
         "/api/trace/door/crossmodal-ekf/9?data=live:none": "live run 'none' does not exist",
         "/api/trace/door/crossmodal-ekf/9?data=live:../secret": "does not exist",
         "/api/failures/door/crossmodal-ekf?data=live:run": "live run 'run' is still running",
+        "/api/diagnosis/door/crossmodal-ekf/9?data=live:run": "live run 'run' is still running",
     }.items():
         answer = client.get(url)
         assert (answer.status_code, message in answer.json()["error"]) == (400, True), answer.text
@@ -319,6 +322,19 @@ def test_failures_of_an_ended_run(client: TestClient, writer: LiveFileWriter, fu
     assert "data=live%3Arun" in by_error["events"][0]["link"]
     refused = client.post(f"/api/failures/door/{full_trace.filter}?data=live:run")
     assert "a single episode, not a data set" in refused.json()["error"]
+
+
+def test_an_ended_run_has_a_preliminary_diagnosis(
+    client: TestClient, writer: LiveFileWriter, full_trace: Trace
+) -> None:
+    blind = replace(full_trace.episode, observations={key: 0 * v for key, v in full_trace.episode.observations.items()})
+    writer.append(replace(full_trace, episode=blind))
+    writer.finish()
+    answer = client.get(f"/api/diagnosis/door/{full_trace.filter}/9?data=live:run")
+    assert answer.status_code == 202, answer.text
+    reply = answer.json()
+    assert reply["job"] is None
+    assert reply["preliminary"]["causes"][0]["next"]
 
 
 def poll(client: TestClient, url: str) -> dict[str, Any]:
