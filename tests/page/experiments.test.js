@@ -8,6 +8,7 @@ import {
   seedGroups,
 } from '../../app/page/tabs/experiment_groups.js';
 import { columnsOf, entryColumns } from '../../app/page/tabs/experiment_columns.js';
+import { tableCsv } from '../../app/page/tabs/experiment_csv.js';
 import { worstOfSeed } from '../../app/page/tabs/experiment_episodes.js';
 import { matching } from '../../app/page/tabs/experiment_filter.js';
 import { groupEntries, namesText } from '../../app/page/tabs/experiment_group_menu.js';
@@ -281,6 +282,31 @@ test('at most 100 entries are columns, the pinned ones among them, and condition
     [100, 130, 'p120', 'p98'],
   );
   assert.equal(matching(rows, 'p129>1').rows.length, 1);
+});
+
+test('the CSV has the displayed rows and columns with all digits', () => {
+  const rows = recorded({ note: 'a, "b"', lr: 0.123456789 }, { note: 'c', lr: 1 }, { lr: 2 });
+  rows[0].error = 1 / 3;
+  const columns = columnsOf(rows, false, ['lr', 'note'], ['lr']);
+  const lines = tableCsv(rows.slice(0, 2), columns).split('\n');
+  assert.equal(
+    lines[0],
+    'checkpoint,lr,"RMSE, cm",NEES/n,95 % coverage,"worst, cm",episodes,steps,note',
+  );
+  assert.equal(lines.length, 2 + 2); // with the title and the end
+  assert.ok(lines[1].startsWith(`${rows[0].name},0.123456789,`));
+  assert.ok(lines[1].includes(`,${1 / 3},`));
+  assert.ok(lines[1].endsWith(',"a, ""b"""'));
+});
+
+test('the CSV of means has their standard deviations', () => {
+  const rows = recorded({ seed: 1 }, { seed: 2 });
+  [rows[0].error, rows[1].error] = [1, 2];
+  const columns = columnsOf(rows, true, [], []);
+  const [head, line] = tableCsv(seedGroups(rows, []), columns).split('\n');
+  assert.ok(head.includes('"RMSE, cm","RMSE, cm, standard deviation"'));
+  assert.ok(line.includes(`,2,1.5,${Math.SQRT1_2},`));
+  assert.ok(!line.includes('±'));
 });
 
 test('groups are named by the fewest settings that distinguish them', () => {

@@ -528,14 +528,6 @@ export const experiments = (sweep, phase) =>
   get(`${path(['experiments', sweep])}?${new URLSearchParams({ phase })}`);
 
 /**
- * Address of the same results as CSV.
- * @param {string} sweep
- * @param {string} phase
- */
-export const experimentsCsv = (sweep, phase) =>
-  `${path(['experiments', sweep, 'results.csv'])}?${new URLSearchParams({ phase })}`;
-
-/**
  * Gets the results of a checkpoint by episode.
  * @param {string} sweep
  * @param {Pick<ExperimentRow, 'checkpoint' | 'data' | 'faults'>} row

@@ -5,6 +5,7 @@
 
 import { context2d, create, element, html, messageOf } from '../core/dom.js';
 import { COLOUR_TABLES } from '../core/colours.js';
+import { download } from '../core/download.js';
 import { fixed, sentence } from '../core/units.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap } from './draw_map.js';
@@ -21,10 +22,9 @@ const TILE = { side: 140, gap: 8, names: 70, head: 36 }; // px, of a sheet with 
 
 /** Exports of the displayed steps. @type {Record<string, (sheets: DisplayedMaps[], name: string) => Promise<string> | string>} */
 const ACTIONS = {
-  png: async (sheets, name) => download(await png(sheets), `${name}.png`),
-  svg: (sheets, name) =>
-    download(new Blob([svg(sheets)], { type: 'image/svg+xml' }), `${name}.svg`),
-  csv: (sheets, name) => download(new Blob([csv(sheets)], { type: 'text/csv' }), `${name}.csv`),
+  png: async (sheets, name) => save(await png(sheets), `${name}.png`),
+  svg: (sheets, name) => save(new Blob([svg(sheets)], { type: 'image/svg+xml' }), `${name}.svg`),
+  csv: (sheets, name) => save(new Blob([csv(sheets)], { type: 'text/csv' }), `${name}.csv`),
   copy: async (sheets) => {
     await navigator.clipboard.write([new ClipboardItem({ 'image/png': png(sheets) })]);
     return 'Image copied.';
@@ -284,9 +284,7 @@ function drawColourBar(context, { shade, colourMap }) {
  * @param {Blob} blob
  * @param {string} name
  */
-function download(blob, name) {
-  const link = create('a', { href: URL.createObjectURL(blob), download: name });
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+function save(blob, name) {
+  download(blob, name);
   return 'Saved.';
 }

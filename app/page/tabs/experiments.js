@@ -6,12 +6,14 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { element, html, messageOf } from '../core/dom.js';
+import { download } from '../core/download.js';
 import { plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { setPanelError, setPanelState } from '../widgets/panel_state.js';
 import { sortRows } from '../widgets/sorting.js';
 import { entryColumns, tableLayout } from './experiment_columns.js';
+import { tableCsv } from './experiment_csv.js';
 import { EpisodePanel } from './experiment_episodes.js';
 import { matching } from './experiment_filter.js';
 import { GroupMenu, namesText } from './experiment_group_menu.js';
@@ -51,7 +53,7 @@ const BODY = `
     <button type="button" class="group-by text" popovertarget="experiment-groups" aria-haspopup="dialog" title="Entries of the provenance that distinguish groups of checkpoints" hidden></button>
     <label class="picker">Steps <select class="steps" aria-label="Steps"></select></label>
     <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees > 2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions with &gt; &lt; &gt;= &lt;= = or !=, such as nees &gt; 2 or seed = 1. Quote names and texts with spaces: &quot;95 % coverage&quot; &lt; 90%"></label>
-    <a class="csv" download title="All results of these steps, a row for each checkpoint, data set and faults">CSV</a>
+    <button type="button" class="csv text quiet" title="Download the displayed rows and columns, with all digits">CSV</button>
   </div>
   <p class="problems" role="alert"></p>
   <div class="axes">
@@ -152,6 +154,7 @@ export class Experiments {
     pick('steps', '.steps');
     pick('x', '.x');
     pick('y', '.y');
+    html('.csv', this.#host).addEventListener('click', () => this.#saveCsv());
     const match = element('.match', HTMLInputElement, this.#host);
     match.addEventListener('input', () => store.set({ match: match.value }));
   }
@@ -229,10 +232,6 @@ export class Experiments {
     axis('y', this.#numbers);
     element('.rows', HTMLSelectElement, this.#host).value = state.rows;
     element('.match', HTMLInputElement, this.#host).value = state.match;
-    element('.csv', HTMLAnchorElement, this.#host).href = api.experimentsCsv(
-      sweep.name,
-      this.#steps,
-    );
   }
 
   #draw() {
@@ -314,6 +313,12 @@ export class Experiments {
     const group = this.#matching.find((row) => cellOf(row) === cell && 'members' in row);
     const row = this.#rows.find((other) => rowKey(other) === cell);
     this.#episodes.show(this.#sweep?.name ?? '', this.#steps, group ?? row);
+  }
+
+  #saveCsv() {
+    const { columns } = this.#layout(this.#rows, this.#store.state);
+    const csv = new Blob([tableCsv(this.#matching, columns)], { type: 'text/csv' });
+    download(csv, `results-${this.#steps.replaceAll(' ', '-')}.csv`);
   }
 
   /** @param {string} problem */

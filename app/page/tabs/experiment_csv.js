@@ -1,0 +1,52 @@
+/** The displayed table of the Experiments tab as CSV. */
+
+/** @import { ExperimentRow } from '../types/server.js' */
+/** @import { Column } from './experiment_columns.js' */
+/** @import { SeedGroup } from './experiment_groups.js' */
+
+import { NUMBERS, valueOf } from './experiment_rows.js';
+
+/** @typedef {{title: string, value: (row: ExperimentRow | SeedGroup) => unknown}} Field */
+
+/**
+ * Writes the rows and columns as displayed, with all digits of the numbers. The standard deviations of groups, and the
+ * unit of results in several units, are columns of their own.
+ * @param {(ExperimentRow | SeedGroup)[]} rows
+ * @param {Column[]} columns
+ */
+export function tableCsv(rows, columns) {
+  const fields = columns.flatMap((column) => fieldsOf(rows, column));
+  if (new Set(rows.map(({ unit }) => unit)).size > 1)
+    fields.push({ title: 'unit', value: ({ unit }) => unit });
+  const lines = [
+    fields.map(({ title }) => title),
+    ...rows.map((row) => fields.map(({ value }) => value(row))),
+  ];
+  return lines.map((line) => `${line.map(quoted).join(',')}\n`).join('');
+}
+
+/**
+ * @param {(ExperimentRow | SeedGroup)[]} rows
+ * @param {Column} column
+ * @returns {Field[]}
+ */
+function fieldsOf(rows, { key, title, number, content }) {
+  const isContent = !number || key === 'seeds';
+  const field = {
+    title,
+    value: isContent ? content : (/** @type {ExperimentRow} */ row) => valueOf(row, key),
+  };
+  /** @param {ExperimentRow | SeedGroup} row */
+  const spread = (row) =>
+    'spread' in row && key in NUMBERS
+      ? row.spread[/** @type {keyof typeof NUMBERS} */ (key)]
+      : undefined;
+  const hasSpread = rows.some((row) => spread(row) !== undefined);
+  return [field, ...(hasSpread ? [{ title: `${title}, standard deviation`, value: spread }] : [])];
+}
+
+/** @param {unknown} value */
+function quoted(value) {
+  const text = String(value ?? '');
+  return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+}
