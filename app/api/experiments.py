@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
@@ -44,10 +45,10 @@ class SweepList(Reply):
 class ExperimentRow(Reply):
     """Results of a checkpoint over a data set in one phase.
 
-    checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
-    ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
-    timestamps. training: JSON of the hash of its data, plan, blackouts, faults and the settings of a fine-tuning run.
-    provenance: JSON of the file beside the checkpoint.
+    checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. data_file: name of
+    the file or folder of the data. error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s
+    since the first step of the episode; None without timestamps. training: JSON of the hash of its data, plan,
+    blackouts, faults and the settings of a fine-tuning run. provenance: JSON of the file beside the checkpoint.
     """
 
     name: str
@@ -70,6 +71,7 @@ class ExperimentRow(Reply):
     provenance: str
     catalog_name: str | None
     data_name: str | None
+    data_file: str
 
 
 class Experiments(Reply):
@@ -129,7 +131,9 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
             """The same for all rows of a checkpoint."""
             return json.dumps(read_provenance(provenance))
 
-        rows = tables(sweep).overview(phase)
+        experiments = tables(sweep)
+        rows = experiments.overview(phase)
+        files = {row["data"]: Path(row["path"]).name for row in experiments.query("FROM datasets").to_pylist()}
         names = catalog_names(store)
         tasks = set(rows["task"].to_pylist()) & set(store.tasks())
         data = {data.hash: name for task in tasks for name, data in store.datasets(task).items()}
@@ -138,6 +142,7 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
                 **as_json(row) | {"provenance": standard_json(row["provenance"])},
                 catalog_name=names.get((row["task"], row["checkpoint"])),
                 data_name=data.get(row["data"]),
+                data_file=files[row["data"]],
             )
             for row in rows.slice(0, LARGEST).to_pylist()
         ]

@@ -136,6 +136,7 @@ export const ROW = {
   provenance: '{"lr": 0.001}',
   catalog_name: null,
   data_name: null,
+  data_file: 'door.h5',
 };
 
 /** Checkpoints with provenance of several forms, as JSON that is stored with escapes. */

@@ -191,7 +191,7 @@ export class EpisodePanel {
     if (!row) return;
     if (!row.data_name) {
       this.#report(
-        `This server does not have the episodes of ${row.name} (data ${row.data.slice(0, 12)}): serve them with --data.`,
+        `This server does not have the episodes of ${row.data_file} (${row.data.slice(0, 12)}), over which ${row.name} ran: serve them with --data.`,
       );
       return;
     }

@@ -459,10 +459,10 @@ export interface components {
          * ExperimentRow
          * @description Results of a checkpoint over a data set in one phase.
          *
-         *     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. error, worst: in
-         *     ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s since the first step of the episode; None without
-         *     timestamps. training: JSON of the hash of its data, plan, blackouts, faults and the settings of a fine-tuning run.
-         *     provenance: JSON of the file beside the checkpoint.
+         *     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. data_file: name of
+         *     the file or folder of the data. error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s
+         *     since the first step of the episode; None without timestamps. training: JSON of the hash of its data, plan,
+         *     blackouts, faults and the settings of a fine-tuning run. provenance: JSON of the file beside the checkpoint.
          */
         ExperimentRow: {
             /** Name */
@@ -505,6 +505,8 @@ export interface components {
             catalog_name: string | null;
             /** Data Name */
             data_name: string | null;
+            /** Data File */
+            data_file: string;
         };
         /**
          * Experiments

@@ -50,7 +50,7 @@ def test_results(settings: Settings, sweep: Path, open_client: Callable[..., Tes
         assert answer["count"] == len(expected) == 4
         for row, stored in zip(answer["rows"], expected, strict=True):
             assert stored.items() <= row.items()
-            assert row["data_name"] == "own"
+            assert (row["data_name"], row["data_file"]) == ("own", "own.h5")
             assert row["catalog_name"] == ("image-ekf" if stored["checkpoint"] == info_hash("image-ekf") else None)
         row = answer["rows"][0]
         query = {key: row[key] for key in ("checkpoint", "data", "faults")} | {"phase": "contact"}
