@@ -171,10 +171,12 @@ class ColumnMap:
 
 def read_map(path: Path) -> ColumnMap:
     """Read a map. Raises BadInput for a damaged file, unknown keys and wrong types."""
+    text = ""
     try:
-        values = tomllib.loads(path.read_text())
+        text = path.read_text()
+        values = tomllib.loads(text)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInput(f"{path.name} cannot be read: {error!s:.200}") from None
+        raise BadInput(f"{path.name} cannot be read: {error!s:.200}{_quoting(str(error), text)}") from None
     for key in values:
         check_name(f"key of {path.name}", key, KEYS)
     sensors, estimate = (_table(values, name, path) for name in ("sensors", "estimate"))
@@ -206,6 +208,14 @@ def read_map(path: Path) -> ColumnMap:
     modalities = _modalities(_table(values, "modalities", path), sensors, path)
     columns = {"control": control, "sensors": sensors, "valid": valid, "modalities": modalities}
     return ColumnMap(task, state, dt, covariates=covariates, estimate=estimate, **columns, **names)
+
+
+def _quoting(error: str, text: str) -> str:
+    """A hint for an error of TOML in a line with a letter that names have in quotes only; else empty."""
+    number = re.search(r"at line (\d+)", error)
+    line = text.split("\n")[int(number[1]) - 1] if number else ""
+    name = re.search(r"[\w-]*[^\W\x00-\x7f][\w-]*", re.sub(r"\"[^\"]*\"|'[^']*'|#.*", "", line))
+    return f'; names with other letters than A to Z are quoted: "{name[0]}"' if name else ""
 
 
 def _table(values: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:

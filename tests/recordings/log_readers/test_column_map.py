@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from beliefscope.recordings.log_readers.column_map import ColumnMap
+from pathlib import Path
+
+import pytest
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.log_readers.column_map import ColumnMap, read_map
 
 
 def test_channels_are_named_after_their_columns() -> None:
@@ -22,3 +27,20 @@ def test_channels_are_named_after_their_columns() -> None:
         "pair": ["left", "left_right"],
         "control": ["throttle", "steering"],
     }
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ('größe = "x"', '; names with other letters than A to Z are quoted: "größe"'),
+        ('[state]\nψ = "x"', 'are quoted: "ψ"'),
+        ('[zustände]\nx = "x"', 'are quoted: "zustände"'),
+        ('a b = "ψ" # ψ', ""),
+    ],
+)
+def test_the_error_of_a_bare_key_with_other_letters_has_a_hint(tmp_path: Path, text: str, hint: str) -> None:
+    path = tmp_path / "map.toml"
+    path.write_text(text)
+    with pytest.raises(BadInput, match=r"map.toml cannot be read: .* \(at line \d+, column \d+\)") as error:
+        read_map(path)
+    assert str(error.value).endswith(hint or ")")
