@@ -116,7 +116,7 @@ def _topics(trace: Trace) -> Topics:
     arrays: dict[str, list[Column]] = {}
     topics: Topics = []
     for column in columns(trace):
-        if column.group == "observations" and is_image(trace.episode.observations[column.parts[0]]):
+        if column.group == "observations" and _encoding(trace.episode.observations[column.parts[0]]):
             topics.append((f"/observations/{column.parts[0]}", _images(column, trace)))
         else:
             arrays.setdefault(f"/{column.group}/{column.parts[0]}", []).append(column)
@@ -153,8 +153,16 @@ def _numbers(topic: str, group: list[Column]) -> tuple[dict[str, Any], Callable[
     return schema, message
 
 
+def _encoding(readings: NDArray[Any]) -> str:
+    """Encoding of images (T, ...) in Foxglove's schema: gray, RGB, or float32 with one channel; else empty."""
+    if is_image(readings):
+        return "rgb8" if readings.ndim == 4 else "mono8"
+    return "32FC1" if readings.dtype == np.float32 and readings.ndim == 3 else ""
+
+
 def _images(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
     height, width, *channels = column.shape
+    readings = trace.episode.observations[column.parts[0]]
     numbers = {name: {"type": "integer"} for name in ("width", "height", "step")}
     texts = {name: {"type": "string"} for name in ("frame_id", "encoding")}
     schema = _schema("foxglove.RawImage", {"timestamp": TIME, **texts, **numbers, "data": BYTES})
@@ -163,10 +171,10 @@ def _images(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int
         return {
             "timestamp": _time(step, trace),
             "frame_id": column.parts[0],
-            "encoding": "rgb8" if channels else "mono8",
+            "encoding": _encoding(readings),
             "width": width,
             "height": height,
-            "step": width * (channels[0] if channels else 1),
+            "step": width * (channels[0] if channels else 1) * readings.itemsize,
             "data": _packed(column.values[step]),
         }
 

@@ -23,6 +23,9 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.trace import Trace, arrays_of, load_trace, save_trace, trace
 from beliefscope.recordings.export import export_trace
+from beliefscope.recordings.log_readers.column_map import read_map
+from beliefscope.recordings.log_readers.columns import read_columns
+from beliefscope.recordings.log_readers.read_log import read_log
 from beliefscope.recordings.rerun_log.columns import columns
 from beliefscope.recordings.write import write_recording
 
@@ -150,6 +153,21 @@ def test_mcap(run: Trace, tmp_path: Path) -> None:
         np.testing.assert_array_equal(points[..., :2], run.particles[..., :2])
         np.testing.assert_allclose(points[..., 3].sum(1), 1.0, atol=1e-5)  # float32 over 40 particles
         np.testing.assert_allclose(points[..., 3], np.exp(run.log_weights), rtol=1e-6)
+
+
+def test_depth_images_are_read_back_from_mcap(run: Trace, tmp_path: Path) -> None:
+    pytest.importorskip("mcap.reader")
+    depth = np.random.default_rng(0).normal(size=(len(run), 3, 5)).astype(np.float32)
+    depth[0, 0] = np.nan, 0.0, -0.0, 1e-40, 3e38
+    observations = {**run.episode.observations, "depth": depth}
+    export_trace(replace(run, episode=replace(run.episode, observations=observations)), tmp_path / "run.mcap")
+    (tmp_path / "map.toml").write_text(
+        f'dt = {run.episode.dt}\n[state]\nx = "/trace/states.{run.task.components[0].name}"\n'
+        '[sensors]\ndepth = "/observations/depth.data"\n'
+    )
+    mapping = read_map(tmp_path / "map.toml")
+    (episode,) = read_log(read_columns(tmp_path / "run.mcap", mapping), mapping, "run.mcap")
+    assert episode.observations["depth"].tobytes() == depth.tobytes()
 
 
 def test_non_finite_numbers_are_null_in_json(run: Trace, tmp_path: Path) -> None:
