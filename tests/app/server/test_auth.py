@@ -160,6 +160,14 @@ def test_number_of_counted_addresses_is_limited() -> None:
     assert len(checker._attempts) <= 1000
 
 
+def test_restart_revokes_cookies() -> None:
+    host = "localhost:8000"
+    first, restarted = SignIn(TOKEN), SignIn(TOKEN)
+    cookie = first.cookie(host).partition(";")[0]
+    assert first.has_cookie(host, cookie)
+    assert not restarted.has_cookie(host, cookie)
+
+
 def test_generated_token_is_exempt_from_the_limit() -> None:
     token = token_for("0.0.0.0", False, {})
     checker = SignIn(token)
