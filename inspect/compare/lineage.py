@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -95,14 +96,23 @@ class Ancestor:
             return {}
         return {name: rmse[name] for name in sorted(rmse, key=lambda name: name != self.main)}
 
-    @property
-    def summary(self) -> list[str]:
-        """Lines of text: file and hash, errors with the data they are of, and the command."""
+    def summary(self, base: Ancestor | None) -> list[str]:
+        """Lines of text: file and hash, errors with the data they are of, and the command. base: None if missing."""
         errors = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in self.rmse.items())
         data = self.record.get("data_hash")  # errors on different data are not comparable
         lines = [f"{self.path} {self.hash[:12]} {self.task} {self.name}"]
         lines += [f"RMSE {errors}{f', data {data[:12]}' if data else ''}"] if errors else []
-        return lines + ([self.command] if self.command else [])
+        return lines + ([self._command(base)] if self.command else [])
+
+    def _command(self, base: Ancestor | None) -> str:
+        """The command with the path of the base checkpoint, whose record has only the name that its file had."""
+        try:
+            words = shlex.split(self.command)
+        except ValueError:  # not a command line
+            return self.command
+        if base is None or not any(word.endswith(".safetensors") for word in words):
+            return self.command
+        return shlex.join([str(base.path) if word.endswith(".safetensors") else word for word in words])
 
     @property
     def learned(self) -> list[str]:
@@ -157,7 +167,7 @@ class Lineage:
         def lines(member: Ancestor, indent: str) -> Iterator[str]:
             orphan = member.base is not None and member.base not in self.members
             note = [f"fine-tuned from {str(member.base)[:12]}, which is not in these folders"] if orphan else []
-            first, *others = [*member.summary, *note]
+            first, *others = [*member.summary(self.members.get(str(member.base))), *note]
             yield indent + first
             yield from (f"{indent}  {line}" for line in others)
             for other in self.finetuned(member.hash):

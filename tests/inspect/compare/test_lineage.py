@@ -76,6 +76,20 @@ def test_tree_matches_the_headers(family: Path) -> None:
     assert "cut.safetensors" in lineage.left_out[0]
 
 
+def test_commands_have_the_paths_of_the_base_checkpoints(family: Path) -> None:
+    """In any folder, such as an exported one with other names of the files."""
+    base = family / "finetuned.safetensors"
+    command = "beliefscope finetune finetuned.safetensors --slice 'blackout 0.8' --data door.h5"
+    digest = finetune(base, family / "deep" / "third.safetensors", 0.3, command=command)
+    assert f"  {command.replace('finetuned.safetensors', str(base))}\n" in f"{lineage_of([family])}\n"
+    folder = family.parent / "shared"
+    export(lineage_of([family]), digest, folder, "0")
+    (exported,) = (line for line in str(lineage_of([folder])).splitlines() if "--slice" in line)
+    assert Path(exported.split()[2]).is_file()
+    broken = finetune(base, family / "broken.safetensors", 0.4, command="from 'a.safetensors")
+    assert lineage_of([family]).members[broken].command in str(lineage_of([family]))
+
+
 def test_find_by_file_or_hash(family: Path) -> None:
     lineage = lineage_of([family])
     finetuned = lineage.find("finetuned.safetensors")
