@@ -56,6 +56,9 @@ def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any, tmp_path:
         page.until("() => document.querySelectorAll('#experiments thead th')[1].innerText.includes('width')")
         assert page.state["pinned"] == "width"
         assert panel.locator("tbody td a").first.get_attribute("href").startswith("https://tracker.example/")
+        with page.page.expect_download() as saved:
+            panel.locator(".csv").click()
+        assert Path(saved.value.path()).read_text().startswith("checkpoint,width,")
         panel.locator("select.rows").select_option("seeds")
         assert panel.locator(".group-by").text_content() == "Group by 1 of 2 entries…"  # without addresses
         panel.locator(".group-by").click()
