@@ -64,10 +64,10 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
     assert f"at step {page.page.evaluate(f'() => {NEWEST}')}:" in message
     assert page.page.locator("#follow").is_hidden()
     page.until("() => document.querySelectorAll('#failures .events tbody tr').length > 0")
-    page.page.click("#tab-diagnosis")
-    page.until(
-        "() => /^Preliminary, from this live run/.test(document.querySelector('#diagnosis .status').textContent)"
-    )
-    assert page.page.locator("#diagnosis > .doing button").count() == 0
     page.page.click("#tab-diagnostics")
     page.until("() => document.querySelectorAll('#diagnostics .list li').length > 3")
+    page.page.click("#tab-diagnosis")
+    for _ in range(2):
+        page.until("() => /this live run alone/.test(document.querySelector('#diagnosis .status').textContent)")
+        assert page.page.locator("#diagnosis .doing button:visible").count() == 0
+        page.page.reload()  # the run is then no longer followed

@@ -54,7 +54,8 @@ export class Repair {
     this.#trace = trace;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    this.#host.hidden = Boolean(trace.live || trace.header.no_diagnosis);
+    const isLive = trace.selection.data.startsWith('live:'); // of no data set, which a search needs
+    this.#host.hidden = isLive || Boolean(trace.header.no_diagnosis);
     if (this.#host.hidden) return;
     this.#results.load(this.#key, () => api.repair(trace.selection, signal), signal);
   }
