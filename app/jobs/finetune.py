@@ -32,7 +32,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     with store_of_job(arguments) as store, one_thread():
         settings = store.settings
         folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
-        path = folder / "finetuned.safetensors"
+        path, partial = folder / "finetuned.safetensors", folder / "finetuned.partial"
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         is_sample = data_name not in settings.data
@@ -62,7 +62,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
                 callbacks=Callbacks(on_step, on_validation, log.resume),
-                partial=folder / "finetuned.partial",
+                partial=partial,
             )
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
@@ -74,6 +74,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         on_profile(0.0)
         profile = measure_profile(result.filter, base.name, episodes, source, is_sample, on_profile)
         save_checkpoint(result.filter, base.name, result.record, path, profile)
+        partial.unlink(missing_ok=True)
         finetuned = load_checkpoint(path)
         comparison = compare_checkpoints(
             base,

@@ -118,8 +118,6 @@ def finetune_external(
         "seconds": round(seconds, 1),
         "versions": versions(),
     }
-    if state is not None:
-        state.drop()
     return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}, record
 
 

@@ -78,7 +78,7 @@ def finetune(
     Args:
         episodes: of the whole data set; their positions are the indices in ``settings.events``. Episodes with events
             are trained on, whatever their split, and not evaluated on.
-        partial: file from which a paused or interrupted run resumes.
+        partial: file from which a paused or interrupted run resumes; to be deleted when the result is stored.
 
     Raises:
         BadInput: a pattern matches nothing, a slice or event does not fit, or there is no training episode.
@@ -134,8 +134,6 @@ def finetune(
         **{key: base.record[key] for key in ("data_summary",) if key in base.record},
         "metrics": {"0": {"fused": evaluate(filter_, groups["test"]).to_dict()}},
     }
-    if state is not None:
-        state.drop()
     return FineTuned(filter_.cpu(), record)
 
 

@@ -39,9 +39,6 @@ class Partial:
     def save(self, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
         _write(self.path, tensors, {**progress, "key": self.key})
 
-    def drop(self) -> None:
-        self.path.unlink(missing_ok=True)
-
 
 class SharedModules:
     """A folder of trained modules that do not depend on the filter they belong to: dynamics, image encoders."""

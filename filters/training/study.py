@@ -247,6 +247,7 @@ def _failure(cell: Cell, error: Exception) -> Document:
 def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
     episodes = _episodes(cell.source, cell.data, cell.skip_bad, cell.data_hash)
     checkpoint = cell.path(folder, ".safetensors")
+    partial = checkpoint.with_name(f"{checkpoint.name}.partial")
     trained = train(
         architecture(cell.definition, cell.filter),
         episodes,
@@ -256,10 +257,11 @@ def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
         command=f"beliefscope train {cell.task} --filter {cell.filter} --data {cell.data.name} "
         f"--preset {cell.preset} --seed {cell.seed}",
         report=report,
-        partial=checkpoint.with_name(f"{checkpoint.name}.partial"),
+        partial=partial,
         shared=folder / "shared",
     )
     checkpoint_hash = save_checkpoint(trained.filter, cell.filter, trained.record, checkpoint)
+    partial.unlink(missing_ok=True)
     results = {"checkpoint_hash": checkpoint_hash, "trivial": trivial(cell.definition, episodes)}
     return trained.record | cell.inputs() | results | {OFFSET: offset_metrics(trained.filter, episodes)}
 

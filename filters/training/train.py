@@ -63,7 +63,8 @@ def train(
         blackouts: probabilities of an image blackout; one is drawn for each training window.
         on_validation: called like ``report`` with each validation loss. on_evaluation: with its completed share.
         on_resume: called with the name of the last finished stage if the training resumes.
-        partial: file of the finished stages, from which an interrupted training resumes; removed at the end.
+        partial: file of the finished stages, from which an interrupted training resumes; to be deleted when the result
+            is stored.
         shared: folder of modules that other filters of the same task can use: dynamics, image encoders.
 
     Raises:
@@ -114,8 +115,6 @@ def train(
         "data_summary": summarise(filter_.statistics, filter_.task, splits["train"]),
         "metrics": measure(filter_, held_out, progress=on_evaluation) if held_out else {},
     }
-    if state is not None:
-        state.drop()
     return Trained(filter_.cpu(), record)
 
 

@@ -146,6 +146,7 @@ def finetune(
         with console.progress("Measuring the healthy record") as advance:
             profile = measure_profile(tuned.filter, base.name, members, command, data is None, advance)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
+        partial.unlink(missing_ok=True)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = [*_summary(tuned.record), "", _change_command(filter or target, str(output), base.task.name, data)]
     lines += ["", verdict.statement, verdict.verdict] if verdict else []
@@ -210,6 +211,7 @@ def _external(
     assert result is not None, "runs without a stop callback always complete"
     tensors, record = result
     save_weights(tensors, output)
+    source["partial"].unlink(missing_ok=True)
     tuned = f"{base.source.partition('@')[0]}@{output}"
     digest = load_external(tuned, base.task).hash
     lines = [*_summary(record), "", _change_command(base.source, tuned, base.task.name, data)]

@@ -97,6 +97,7 @@ def train(
 
         profile = measure_profile(trained.filter, filter, episodes, record["command"], data is None, report_record)
     checkpoint_hash = save_checkpoint(trained.filter, filter, record, output, profile)
+    partial.unlink(missing_ok=True)
     return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, _summary(filter, record))
 
 

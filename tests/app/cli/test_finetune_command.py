@@ -49,6 +49,7 @@ def test_events_of_other_data_need_no_training_episodes(
     assert "On windows of held-out episodes" in out
     assert f"beliefscope change information-ekf {output} --task push-field --data {data}" in out
     assert output.is_file()
+    assert [path.name for path in tmp_path.glob("*.partial")] == []
 
 
 def test_training_from_scratch_needs_collected_episodes(run: Run, tmp_path: Path) -> None:

@@ -76,4 +76,3 @@ def test_sigterm_resumes_to_identical_weights(make: Callable[[Path | None], Filt
     resumed, uninterrupted = make(partial).state_dict(), make(None).state_dict()
     for name, value in uninterrupted.items():
         assert torch.equal(value, resumed[name]), name
-    assert not partial.exists()

@@ -234,7 +234,9 @@ def test_interrupted_training_resumes_to_the_same_weights(episodes: list[Episode
             pass
     assert len(interrupted) > 8
     assert resumed == expected
-    assert not partial.exists()
+    stages = len(interrupted)
+    assert checkpoint_hash(partial=partial, report=interrupt_in_next_stage) == expected
+    assert len(interrupted) == stages, "no stage is repeated before the result is stored"
     shared = tmp_path / "shared"
     assert checkpoint_hash(shared=shared) == expected
     assert len(list(shared.iterdir())) == 2
