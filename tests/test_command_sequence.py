@@ -194,7 +194,7 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert json.loads(out)["episodes"] == 1
 
     options = "--faults force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
-    hardened = json.loads(run(line.replace("--json", options))[1])["record"]
+    hardened = json.loads(run(line.replace("pf.", "hardened.").replace("--json", options))[1])["record"]
     assert (trained["record"]["blackouts"], hardened["blackouts"]) == ([0.0, 0.4, 0.8], [0.0, 0.8])
     assert hardened["command"].partition("--blackouts ")[2].startswith("0,0.8")
     assert [fault["fault"] for fault in hardened["faults"]] == ["force_bias", "blackout"]
