@@ -24,21 +24,23 @@ class Symptom:
         weight: relative to the other symptoms of the cause.
         target: how the statistics together must deviate: ``mirrored``, to the healthy values with the opposite sign;
             ``shifted``, all by the same amount; ``common``, those of all modalities by the same amount in each
-            component; ``alone``, the opposite of ``common``.
-        otherwise: symptoms that may occur in its place.
+            component; ``alone``, the opposite of ``common``; ``shrunk``, towards zero and not beyond.
+        otherwise: symptoms that may occur in its place. unmeasured: those in its place if it has no statistic.
         optional: whether it counts only where it can be observed.
     """
 
     statistics: str
     direction: Literal[-1, 0, 1] = 1
     weight: float = 1.0
-    target: Literal["", "mirrored", "shifted", "common", "alone"] = ""
+    target: Literal["", "mirrored", "shifted", "common", "alone", "shrunk"] = ""
     otherwise: tuple[Symptom, ...] = ()
+    unmeasured: tuple[Symptom, ...] = ()
     optional: bool = False
 
     def matches(self, statistic: str) -> bool:
         """Whether a statistic belongs to the symptom or those in its place, whatever its value."""
-        return matches(self.statistics, statistic) or any(other.matches(statistic) for other in self.otherwise)
+        others = (*self.otherwise, *self.unmeasured)
+        return matches(self.statistics, statistic) or any(other.matches(statistic) for other in others)
 
 
 def matches(patterns: str, statistic: str) -> bool:

@@ -122,6 +122,7 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     """Of the particles that an external filter reports: those of ``equation_statistics`` that need no equations of it.
 
     ``prior ess`` is of the steps after a resampling, of all steps if there is none: not every filter resamples always.
+    ``ancestors`` and ``offspring`` are of the steps with a resampling.
     ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
     to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it.
     """
@@ -130,6 +131,13 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     log_weights, prior = _tensor(trace.log_weights), _tensor(trace.prior_log_weights)
     count = log_weights.shape[1]
     values = {"particles//all": float(count), "prior ess//all": _ess_after_resampling(log_weights, prior)}
+    ancestors = np.arange(count)[None] if trace.ancestors is None else trace.ancestors
+    resampled = np.flatnonzero((ancestors != np.arange(count)).any(-1) & (ancestors >= 0).all(-1))
+    if len(resampled):
+        offspring = _offspring(ancestors[resampled], len(resampled), count)
+        expected = count * log_weights[torch.from_numpy(resampled)].exp().numpy()
+        values["ancestors//all"] = float((offspring > 0).mean())
+        values["offspring//all"] = float(np.square(offspring - expected).mean())
     if trace.log_likelihood is None:
         return values
     weight = log_weights.exp()

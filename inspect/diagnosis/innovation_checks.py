@@ -24,7 +24,8 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
 
     ``innovation bias``, by channel: mean of nu, in standard deviations. ``innovation std``: geometric mean of the
     standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a channel
-    of angles. ``updates``: share of steps with an accepted innovation. ``measurement noise``: geometric mean of the
+    of angles. ``updates``: share of steps with an accepted innovation. ``absent updates``: share of the steps without a
+    reading of the modality that have one. ``measurement noise``: geometric mean of the
     standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of all
     modalities, where the measurement noise of some is unknown.
     """
@@ -38,7 +39,12 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     values: dict[str, float] = {}
     names = channel_names(trace, pair[0])
     for k, modality in enumerate(trace.modalities):
-        values[f"updates/{modality}/all"] = float(np.mean(accepted[:, k].any(-1)))
+        updated = np.asarray(accepted[:, k].any(-1))
+        values[f"updates/{modality}/all"] = float(updated.mean())
+        keys = trace.task.modalities.get(modality, ())
+        absent = np.logical_and.reduce([~trace.episode.present(key)[keep] for key in keys]) if keys else None
+        if absent is not None and absent.any():
+            values[f"absent updates/{modality}/all"] = float(updated[absent].mean())
         channels = np.flatnonzero(used[:, k].sum(0) >= MIN_STEPS)
         if not len(channels):
             continue

@@ -19,6 +19,10 @@ from beliefscope.inspect.trace import Trace
 LIKELIHOODS, PARTICLES = 40, 60
 """Largest numbers of steps and of particles whose likelihoods are compared, evenly spaced."""
 
+NEAR = 3.0
+"""Largest error of the reading expected at the nearest particle, relative to its noise: far from the readings, the
+likelihoods of all particles are a line, which does not show where their maximum is."""
+
 
 def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of the measurement noise."""
@@ -43,17 +47,22 @@ def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple
 def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
     """``measurement function/CHANNEL/all``: root mean square error of h(x) in the noise of the readings, by channel.
 
-    The filter has h(x) = z - nu at a state x from the prediction to the estimate: one update may follow another. The
-    healthy record's model of the sensor expects readings g there, and h(x) may be between those at both ends. Neither
-    the sensor nor the dynamics matter. Of innovations with the channels of the sensors.
+    The filter has h(x) = z - nu at the state x before the update, and the healthy record's model of the sensor expects
+    readings g there. Of a filter that reports the belief before the first of several updates only, x is from there to
+    the estimate, and h(x) may be between the readings at both ends. Neither the sensor nor the dynamics matter. Of
+    innovations with the channels of the sensors.
     """
     predicted = prediction(trace)
     if trace.innovation is None or predicted is None or trace.task.rotations:
         return {}
-    ends = [replace(trace.episode, states=x.astype(np.float32)) for x in (predicted[0], trace.estimate_mean)]
+    first, each = predicted[0][:, None], trace.predicted_mean
+    is_each = each is not None and not np.allclose(each, first, rtol=1e-3)
+    means = each if each is not None and is_each else np.repeat(first, len(trace.modalities), axis=1)
     keep = counted(trace)
     values: dict[str, float] = {}
     for k in range(len(trace.modalities)):
+        between = (means[:, k], means[:, k] if is_each else trace.estimate_mean)
+        ends = [replace(trace.episode, states=x.astype(np.float32)) for x in between]
         for model, columns in _sensors(trace, k, models):
             readings = readings_of(trace.episode, model.key)
             h = readings[:, model.channels] - trace.innovation[:, k, columns]
@@ -95,6 +104,10 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
             readings = readings_of(trace.episode, model.key)[steps, None]
             errors.append(model.relative(readings - model.expected(there).reshape(*states.shape[:2], -1)))
         e = np.concatenate(errors, axis=-1)  # (S, P, A)
+        near = (np.abs(e).min(1) < NEAR).all(-1)
+        if near.sum() < MIN_STEPS:
+            continue
+        e, steps = e[near], steps[near]
         columns = np.concatenate([e, -0.5 * np.square(e)], axis=-1)
         columns, y = (
             v - v.mean(1, keepdims=True) for v in (columns, likelihood[steps, k][:, every, None].astype(float))

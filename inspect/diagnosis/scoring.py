@@ -43,7 +43,8 @@ def strength(ratio: float) -> float:
 def support(symptom: Symptom, deviations: Sequence[Deviation]) -> float:
     """How well its statistics agree with a symptom, or with one in its place, -1 to 1; -1 if none deviates."""
     own = [deviation for deviation in deviations if matches(symptom.statistics, deviation.statistic)]
-    best = max((support(other, deviations) for other in symptom.otherwise), default=-1.0)
+    others = symptom.otherwise if own else (*symptom.otherwise, *symptom.unmeasured)
+    best = max((support(other, deviations) for other in others), default=-1.0)
     if not own:
         return best
     sizes = [strength(abs(deviation.t)) for deviation in own]
@@ -63,6 +64,10 @@ def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
     if target == "shifted":  # a single statistic cannot contradict it
         unequal = float(np.ptp(shift) / max(np.abs(shift).mean(), 1e-9))
         return max(-1.0, 1.0 - 2.0 * unequal) if len(shift) > 1 else 0.0
+    if target == "shrunk":
+        weights = np.square([d.t for d in deviations])
+        beyond = (np.abs(value) > np.abs(healthy)) | (value * healthy < -0.1 * np.square(healthy))
+        return 1.0 - 2.0 * float((weights * beyond).sum() / max(weights.sum(), 1e-9))
     if target == "mirrored":
         distance = np.abs(value + healthy) / np.maximum(np.abs(shift), 1e-9)
         # Statistics that hardly deviate may have no part in it.

@@ -15,7 +15,7 @@ from beliefscope.datasets.text import capitalised, percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.kalman_updates import expected_updates
+from beliefscope.inspect.diagnostics.kalman_updates import correction_slopes, expected_updates
 from beliefscope.inspect.diagnostics.repeated_steps import (
     RepeatedSteps,
     known_median,
@@ -53,7 +53,7 @@ class KalmanEquations(Diagnostic):
         dynamics: (n,) relative error, of the growth of the predicted covariance with the variance of a component.
         measurement: (K,) relative error, of the growth of the innovations' covariance.
         columns: (n + 1, K) errors as ``measurement`` with the variance of one component, and of all together.
-        slopes: (K,) median slope of the corrections on ``P+ H^T R^-1 nu``, from -1 to 1.
+        slopes: (K,) median ``correction_slopes``, from -1 to 1.
         covariance, correction: (K,) relative errors of the reduction of the covariance and of the correction of the
             mean, in steps with the modality.
         process_noise: (n,) standard deviations of Q per step, SI units; NaN if unknown. process_lack: smallest
@@ -196,8 +196,7 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 
     ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality: slope of the corrections on ``P+ H^T R^-1 nu``, from -1 to 1, as these products
-    do not show the sign of the filter's H. It is 1 with joint updates, and nearly so with others.
+    ``correction slope``, by modality: of ``correction_slopes``.
     """
     repeated = None if why_not(trace, checkpoint) else repeat_steps(trace, checkpoint)
     if repeated is None:
@@ -206,7 +205,7 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
     columns = {"prediction jacobian": (components, known_median(repeated.dynamics_errors()))}
     if trace.innovation is not None:
         columns["measurement jacobian"] = (list(trace.modalities), known_median(repeated.measurement_errors()))
-        columns["correction slope"] = (list(trace.modalities), repeated.slopes())
+        columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated))
     return {
         f"{kind}/{name}/all": float(value)
         for kind, (names, values) in columns.items()
@@ -241,7 +240,7 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
         channels=tuple(map(tuple, channels)),
         measurement=errors(RepeatedSteps.measurement_errors),
         columns=errors(RepeatedSteps.measurement_errors_by_component),
-        slopes=known_median(np.stack([steps.slopes() for steps in repeated])),
+        slopes=known_median(np.stack([*map(correction_slopes, repeated)])),
         dynamics=errors(RepeatedSteps.dynamics_errors),
         process_noise=np.sqrt(np.maximum(known_median(np.diagonal(process, axis1=-2, axis2=-1)), 0.0)),
         process_lack=float(_lack(process, np.concatenate([steps.covariance[:, 0] for steps in repeated]))),

@@ -24,11 +24,13 @@ class Updates:
 
     Attributes:
         noise: (J, K, m, m) measurement noise R that follows from S and H; 0 without a measurement.
+        corrections: (J, K, n) of the mean, by each modality.
         covariance_error: (J, K) relative error of the reduction of the covariance, NaN without the measurement.
         correction_error: (J, K) relative error of the correction of the mean, as before.
     """
 
     noise: Array
+    corrections: Array
     covariance_error: Array
     correction_error: Array
 
@@ -41,6 +43,18 @@ def expected_updates(steps: RepeatedSteps) -> Updates:
     """
     results = [_together(steps), *(_in_turn(steps, order) for order in _orders(steps.size.shape[2]))]
     return min(results, key=lambda r: _size(r.covariance_error) + _size(r.correction_error))
+
+
+def correction_slopes(steps: RepeatedSteps) -> Array:
+    """(K,) slopes of the filter's corrections on those of ``expected_updates``, -1 to 1; NaN without a measurement.
+
+    They show the sign of the H of its gains, which the products ``H P H^T`` do not show.
+    """
+    scale = inverse_std(steps.covariance[:, 0])
+    parts = expected_updates(steps).corrections * scale[:, None]
+    columns = parts.swapaxes(1, 2).reshape(steps.correction.size, -1)
+    slopes = np.linalg.lstsq(columns, (steps.correction * scale).ravel(), rcond=1e-9)[0]
+    return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
 
 def _size(errors: Array) -> float:
@@ -65,23 +79,25 @@ def _together(steps: RepeatedSteps) -> Updates:
         block = slice(i * m, (i + 1) * m)
         size[:, block, block] = steps.size[:, 0, i]
     gain = prior @ rows.mT @ np.linalg.pinv(_invertible(size))
-    nu = np.nan_to_num(steps.innovation[:, 0]).reshape(j, k * m, 1)
-    return _compared(steps, noise, prior - gain @ rows @ prior, (gain @ nu)[..., 0])
+    nu = np.nan_to_num(steps.innovation[:, 0]).reshape(j, 1, k * m)
+    corrections = (gain * nu).reshape(j, h.shape[-1], k, m).sum(-1).swapaxes(1, 2)
+    return _compared(steps, noise, prior - gain @ rows @ prior, corrections)
 
 
 def _in_turn(steps: RepeatedSteps, order: tuple[int, ...]) -> Updates:
     prior, unit = steps.covariance[:, 0], np.eye(steps.covariance.shape[-1])
-    covariance, correction, noise = prior, np.zeros_like(prior[..., 0]), np.zeros_like(steps.size[:, 0])
+    covariance, noise = prior, np.zeros_like(steps.size[:, 0])
+    corrections = np.zeros((*noise.shape[:2], len(unit)))
     change = np.broadcast_to(unit, prior.shape)  # of the mean by the prediction
     for k in order:
         size, nu = steps.size[:, 0, k], np.nan_to_num(steps.innovation[:, 0, k])
         h = steps.measurement_jacobian[:, k] @ np.linalg.pinv(change)
         noise[:, k] = size - h @ covariance @ h.mT
         gain = covariance @ h.mT @ np.linalg.pinv(_invertible(size))
-        correction = correction + (gain @ nu[..., None])[..., 0]
+        corrections[:, k] = (gain @ nu[..., None])[..., 0]
         covariance = covariance - gain @ h @ covariance
         change = (unit - gain @ h) @ change
-    return _compared(steps, noise, covariance, correction)
+    return _compared(steps, noise, covariance, corrections)
 
 
 def _invertible(size: Array) -> Array:
@@ -90,8 +106,9 @@ def _invertible(size: Array) -> Array:
     return np.asarray(size + absent[..., None] * np.eye(size.shape[-1]))
 
 
-def _compared(steps: RepeatedSteps, noise: Array, covariance: Array, correction: Array) -> Updates:
+def _compared(steps: RepeatedSteps, noise: Array, covariance: Array, corrections: Array) -> Updates:
     """The errors of the filter's posterior, relative to the expected covariance and correction."""
+    correction = corrections.sum(1)
     prior, scale = steps.covariance[:, 0], inverse_std(steps.covariance[:, 0])
     weights = weights_of(prior)
     used = np.isfinite(steps.innovation[:, 0]).any(-1)  # (J, K)
@@ -99,6 +116,7 @@ def _compared(steps: RepeatedSteps, noise: Array, covariance: Array, correction:
     moved, expected = scale * (steps.correction - correction), scale * correction
     return Updates(
         noise,
+        corrections,
         np.where(used, relative(difference, reduction, (-2, -1), SMALLEST_UPDATE)[:, None], np.nan),
         np.where(used, relative(moved, expected, (-1,), SMALLEST_UPDATE)[:, None], np.nan),
     )

@@ -182,16 +182,6 @@ class RepeatedSteps:
         largest = np.sqrt(np.square(expected).sum((-2, -1)).max(1, keepdims=True))
         return relative(difference, expected, (-2, -1), SMALLEST_CHANGE * largest)
 
-    def slopes(self) -> Array:
-        """(K,) of the corrections; NaN without a measurement."""
-        h, prior = self.measurement_jacobian, self.covariance[:, :1]
-        noise, innovation = self.size[:, 0] - h @ prior @ h.mT, np.nan_to_num(self.innovation[:, 0])
-        parts = (self.posterior[:, None] @ h.mT @ np.linalg.pinv(noise) @ innovation[..., None])[..., 0]  # (J, K, n)
-        scale = inverse_std(prior[:, 0])
-        columns = (parts * scale[:, None]).swapaxes(1, 2).reshape(self.correction.size, -1)
-        slopes = np.linalg.lstsq(columns, (self.correction * scale).ravel(), rcond=1e-9)[0]
-        return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
-
     def process_noise(self) -> Array:
         """(J, n, n) ``P - F P F^T`` of the prediction; NaN if it is after another update."""
         f = self.dynamics_jacobian

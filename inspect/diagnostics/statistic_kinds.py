@@ -48,6 +48,7 @@ KINDS = {
     "correction slope": ("slope of the corrections{of} on those of a correct update", False, 0.2),
     "innovation turns": ("share of innovations of about a full turn", False, 0.002),
     "updates": ("share of steps with an accepted measurement", False, 0.02),
+    "absent updates": ("share of steps without a reading that have a measurement", False, 0.02),
     "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
     "fusion variance": ("log-ratio of the used variance to that of the fusion rule", False, 0.02),
     "fusion mean": ("distance of the estimate from the fusion rule", True, 1.0),

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import bdtr, stdtrit
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.number[Any]]
@@ -62,7 +62,8 @@ def mean_interval(sums: Numbers, counts: Numbers, level: float = LEVEL) -> tuple
     The outer limits of two intervals of the logarithm: the jackknife, and the log-normal one of Cox with Student's t,
     ``m + s^2/2 -+ t_(R-1) sqrt(s^2/R + s^4 / (2 (R - 1)))``, m and s^2 mean and variance of the logarithms of the
     trajectory means (Olsson, Journal of Statistics Education 13(1), 2005). The first holds its level for light tails,
-    the second for log-normal ones.
+    the second for log-normal ones. Of trajectories that differ by more than factors of about e, such as those of a
+    filter that diverges, the lower limit is at least that of the median, which the mean of a skewed quantity exceeds.
 
     Args:
         sums, counts: (R, ...) sum of the quantity and number of steps by trajectory; counts above 0.
@@ -81,6 +82,9 @@ def mean_interval(sums: Numbers, counts: Numbers, level: float = LEVEL) -> tuple
         half = stdtrit(count - 1, 0.5 + level / 2.0) * np.sqrt(variance / size + variance**2 / (2.0 * (size - 1.0)))
         low = np.minimum(low, mean + variance / 2.0 - half)
         high = np.maximum(high, mean + variance / 2.0 + half)
+        below = int((bdtr(np.arange(count), count, 0.5) <= 0.5 * (1.0 - level)).sum())
+        if below:
+            low = np.where(variance > 1.0, np.maximum(low, np.sort(logs, axis=0)[below - 1]), low)
     return np.exp(value), np.exp(low), np.exp(high)
 
 

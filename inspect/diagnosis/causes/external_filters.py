@@ -8,7 +8,7 @@ from typing import Literal
 
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS
 
 
 def _dynamics(*kinds: str) -> str:
@@ -23,11 +23,14 @@ DRIFT = Cause(
     "dynamics.drift",
     "Dynamics biased, differently in each episode",
     (Symptom("dynamics scatter/*"),),
-    f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|{FILTER}",
+    f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|measurement noise/*|{FILTER}",
     "Check the bias of its inputs that the filter should estimate.",
     prior=0.1,
 )
-"""A bias that the filter does not estimate, such as that of a gyroscope."""
+"""A bias that the filter does not estimate, such as that of a gyroscope.
+
+If it has a state for it and no gain, its updates are not those from which the measurement noise is determined.
+"""
 
 JACOBIAN = Cause(
     "dynamics.jacobian",
@@ -55,7 +58,8 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         DRIFT,
         JACOBIAN,
         LARGE,
-        *(cause for modality, keys in task.modalities.items() for cause in _of_updates(modality, keys)),
+        *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
+        *(cause for modality in task.modalities for cause in _of_updates(modality)),
     )
 
 
@@ -67,10 +71,11 @@ def in_predictions(cause: Cause) -> Cause:
         "measurement": _dynamics("bias", "error", "nis", "offset", "scatter", "spread"),
     }
     others = f"{DYNAMICS}|process noise/*|measurement function/*"
-    consequences = f"{cause.consequences}|{changed.get(cause.name.partition('.')[0], others)}"
+    # The labels are compared with updates of the belief, which mean nothing once the filter has lost the state.
+    consequences = f"{cause.consequences}|{changed.get(cause.name.partition('.')[0], others)}|{LABELS}"
     # Predicted changes that are too small, such as those of a shorter time step, add too little noise as well.
     if cause.name == "dynamics.frozen":  # the spread of predictions depends on the process noise of particles
-        cause = replace(cause, symptoms=(Symptom("dynamics slope/*", -1),))
+        cause = replace(cause, symptoms=(Symptom("dynamics slope/*", -1, target="shrunk"),))
         consequences += "|dynamics spread/*"
     if cause.name not in ("dynamics.frozen", "dynamics.inverted"):
         return replace(cause, consequences=consequences)
@@ -78,8 +83,8 @@ def in_predictions(cause: Cause) -> Cause:
     return replace(cause, consequences=consequences, lowers=f"{cause.lowers}|process noise/*")
 
 
-def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
-    """Causes in the updates with a modality.
+def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
+    """Causes in the measurement noise, measurement function and Jacobian of a modality.
 
     Where modalities are always used together, only the mean of their measurement noise is known, and the innovations
     show whose it is.
@@ -126,11 +131,25 @@ def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             (
                 Symptom(
                     f"measurement jacobian/{modality}/*",
-                    otherwise=(Symptom(f"correction slope/{modality}/*", -1),),
+                    otherwise=(Symptom(f"correction slope/{modality}/*", -1, target="mirrored"),),
                 ),
             ),
             f"{JACOBIANS}|dynamics slope/*|measurement function/*|process noise/*|{FILTER}",
             f"Compare the Jacobian of {name} with finite differences of h: signs, columns, units.",
+        ),
+    )
+
+
+def _of_updates(modality: str) -> tuple[Cause, ...]:
+    """Causes in the updates with a modality: their innovations, gains and steps."""
+    name = display_name(modality)
+    return (
+        Cause(
+            f"updates.{modality}.gain",
+            f"Gain of updates with {name} too small",
+            (Symptom(f"correction slope/{modality}/*", -1, target="shrunk"),),
+            f"{JACOBIANS}|process noise/*|measurement noise/*|{FILTER}",
+            f"Compare the gain of {name} with P Hᵀ S⁻¹.",
         ),
         Cause(
             f"innovation.{modality}.turns",
@@ -145,5 +164,12 @@ def _of_updates(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             (Symptom(f"updates/{modality}/*", -1),),
             f"measurement noise//*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
+        ),
+        Cause(
+            f"updates.{modality}.absent",
+            f"Updates with {name} where it has no reading",
+            (Symptom(f"absent updates/{modality}/*", 1),),
+            f"{JACOBIANS}|{DYNAMICS}|process noise/*|measurement noise/*|measurement function/*|{FILTER}",
+            f"Update with {name} only at steps with a reading: observations of a masked sensor have its mask.",
         ),
     )

@@ -64,7 +64,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         Cause(
             "control.delay",
             "Controls delayed",
-            (Symptom("reading lag/control/*", otherwise=(Symptom("lag/dynamics/*", -1),)),),
+            (Symptom("reading lag/control/*", unmeasured=(Symptom("lag/dynamics/*", -1),)),),
             f"inverted/control*|exchanged/control*|{changed}",
             "Synchronise the controls with the sensors.",
             "advance control",

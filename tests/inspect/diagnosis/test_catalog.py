@@ -129,6 +129,8 @@ def test_mirrored_and_shifted_statistics_are_told_apart_by_their_values() -> Non
         ]
 
     assert support(mirrored, deviations((-11.0, -5.0))) > 0.9 > 0.0 > support(shifted, deviations((-11.0, -5.0)))
+    shrunk = Symptom("beta logit/*", target="shrunk")
+    assert support(shrunk, deviations((1.0, 0.5))) > 0.9 > 0.0 > support(shrunk, deviations((-11.0, -5.0)))
     assert support(shifted, deviations((3.0, -3.0))) > 0.9 > 0.0 > support(mirrored, deviations((3.0, -3.0)))
 
 

@@ -39,8 +39,14 @@ def ride(seed: int, steps: int = 40) -> bs.Episode:
 
 
 class Particles:
-    def __init__(self, count: int = 100, powers: Mapping[str, float] | None = None, resample: bool = True) -> None:
-        self.count, self.powers, self.resample = count, powers or {}, resample
+    def __init__(
+        self,
+        count: int = 100,
+        powers: Mapping[str, float] | None = None,
+        resample: bool = True,
+        best_only: bool = False,
+    ) -> None:
+        self.count, self.powers, self.resample, self.best_only = count, powers or {}, resample, best_only
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.rng = np.random.default_rng(0)
@@ -56,10 +62,13 @@ class Particles:
         values = {"particles": self.x, "log_weights": posterior, "prior_log_weights": prior}
         values |= {"log_likelihood": likelihood, "estimate_mean": np.exp(posterior) @ self.x}
         self.log_weights = posterior
+        ancestors = np.arange(self.count)
         if self.resample and 1 / np.exp(2 * posterior).sum() < 0.5 * self.count:
-            self.x = self.x[self.rng.choice(self.count, self.count, p=np.exp(posterior))]
+            weights = np.eye(self.count)[posterior.argmax()] if self.best_only else np.exp(posterior)
+            ancestors = self.rng.choice(self.count, self.count, p=weights)
+            self.x = self.x[ancestors]
             self.log_weights = np.full(self.count, -np.log(self.count))
-        return values
+        return values | {"ancestors": ancestors}
 
 
 def filter_of(module: Particles) -> Any:
@@ -83,6 +92,10 @@ def test_statistics_of_particles_that_a_filter_reports() -> None:
     assert healthy["particles//all"] == 100.0
     assert healthy["prior ess//all"] == pytest.approx(1.0)
     assert off["prior ess//all"] < 0.3
+    # Multinomial: the variance M w (1 - w) of each number of offspring, which sums to less than M.
+    assert 0.3 < healthy["offspring//all"] < 1.0
+    assert 0.2 < healthy["ancestors//all"] < 0.64
+    assert "offspring//all" not in off
     shares = [{k: values[f"likelihood share/{k}/all"] for k in STD} for values in (healthy, half, off)]
     assert shares[0] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
     assert shares[1] == pytest.approx({"near": 1.0, "far": 0.5}, abs=1e-3)
@@ -96,6 +109,7 @@ def test_statistics_of_particles_that_a_filter_reports() -> None:
         (Particles(count=8), "particles.few"),
         (Particles(powers={"far": 0.0}), "weights.ignores_likelihood"),
         (Particles(resample=False), "resampling.off"),
+        (Particles(best_only=True), "particles.deprived"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

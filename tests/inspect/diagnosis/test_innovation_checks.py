@@ -16,6 +16,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.model_checks import reported_dynamics_statistics
+from beliefscope.inspect.diagnosis.vector_checks import stuck
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.trace import Trace
@@ -92,11 +93,14 @@ class Boat:
         separate: bool = False,
         jacobian: float | Array = 1.0,
         heading_jacobian: float = 1.0,
+        gain: float = 1.0,
+        absent: bool = False,
     ) -> None:
         self.factors = {"radar": radar, "compass": compass}
         self.wraps, self.has_bias, self.updates = wraps, has_bias, updates
         self.turn, self.offset, self.separate = turn, offset, separate
         self.jacobian, self.heading_jacobian = np.asarray(jacobian), heading_jacobian
+        self.gain, self.absent = gain, absent
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.mean, self.covariance, self.random = mean, covariance, np.random.default_rng(0)
@@ -113,9 +117,8 @@ class Boat:
         beliefs, innovations, covariances = [], [], []
         for key in STD:
             beliefs.append((mean, covariance))
-            if not observations.get(f"{key}.present", True) or (
-                key == "compass" and self.random.random() > self.updates
-            ):
+            is_absent = not observations.get(f"{key}.present", True) and not self.absent
+            if is_absent or (key == "compass" and self.random.random() > self.updates):
                 innovations.append(None)
                 covariances.append(None)
                 continue
@@ -126,7 +129,8 @@ class Boat:
             r = self.factors[key] * np.diag(np.square(STD[key]))
             size = h @ covariance @ h.T + r
             gain = covariance @ h.T @ np.linalg.inv(size)
-            mean, covariance = mean + gain @ innovation, covariance - gain @ size @ gain.T
+            used = self.gain if key == "radar" else 1.0
+            mean, covariance = mean + used * gain @ innovation, covariance - gain @ size @ gain.T
             innovations.append(innovation)
             covariances.append(size)
         mean[2] = wrapped(mean[2])
@@ -198,6 +202,22 @@ def test_rejected_measurements_change_no_covariance() -> None:
     assert innovation_statistics(gated)["updates/compass/all"] == 0.0
 
 
+@pytest.mark.parametrize("readings", [0, 1, 2])
+def test_repeated_readings_of_a_masked_sensor_are_those_of_its_readings(readings: int) -> None:
+    """What stands in the steps without a reading does not matter."""
+    episode = sail(3)
+    present = np.zeros(len(episode), dtype=bool)
+    present[: 20 * readings : 20] = True
+    held = np.maximum.accumulate(np.where(present, np.arange(len(episode)), 0))
+    episode.covariates["radar_reading"][:] = present
+    episode.observations["radar"][:] = episode.observations["radar"][held]
+    assert not stuck(episode, "radar", 0).any()
+    episode.covariates["radar_reading"][:] = np.arange(len(episode)) % 4 == 0
+    episode.observations["radar"][:] = np.where(np.arange(len(episode)) < 20, episode.observations["radar"].T, 7.0).T
+    episode.observations["radar"][1::4] = 0.0
+    assert stuck(episode, "radar", 0).sum() == 19
+
+
 def test_predictions_before_each_update_have_the_statistics_of_those_before_all() -> None:
     shared, separate = run(Boat()), run(Boat(separate=True))
     assert not np.array_equal(shared.predicted_mean, separate.predicted_mean)
@@ -227,6 +247,8 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         pytest.param(Boat(jacobian=-1.0), "measurement.radar.jacobian", marks=pytest.mark.long),
         pytest.param(Boat(jacobian=0.5), "measurement.radar.jacobian", marks=pytest.mark.long),
         (Boat(heading_jacobian=-1.0), "dynamics.jacobian"),
+        (Boat(gain=0.5), "updates.radar.gain"),
+        (Boat(absent=True), "updates.radar.absent"),
     ],
 )
 def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:

@@ -52,6 +52,15 @@ def test_an_offset_of_the_measurement_function_shows_whatever_the_readings() -> 
     assert rms(measurement_model_statistics(shifted, models())) == pytest.approx([radar_range, bearing], rel=1e-3)
 
 
+def test_a_belief_before_each_update_is_that_of_its_measurement_function() -> None:
+    """The estimate after all updates does not matter then: h is not between its readings and those of a belief."""
+    shared, separate = run(Boat()), run(Boat(separate=True))
+    moved = [replace(trace, estimate_mean=trace.estimate_mean + np.float32(1.0)) for trace in (shared, separate)]
+    changed, same = (measurement_model_statistics(trace, models()) for trace in moved)
+    assert same == measurement_model_statistics(separate, models())
+    assert changed != measurement_model_statistics(shared, models())
+
+
 def with_likelihoods(trace: Trace, scale: float, offset: float) -> Trace:
     """Particles around the estimates with Gaussian likelihoods of a scaled noise and of ranges with an offset, m."""
     rng = np.random.default_rng(0)

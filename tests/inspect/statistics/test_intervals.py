@@ -52,6 +52,13 @@ def test_mean_interval_scales_with_the_unit_and_ignores_the_order() -> None:
     assert interval[0] == pytest.approx(sums.sum() / counts.sum())
 
 
+def test_the_mean_of_a_diverging_quantity_is_above_its_median() -> None:
+    """Six trajectories above 1, four of them by orders of magnitude: the log-normal limit alone would be below 1e-3."""
+    value, low, high = mean_interval(np.array([3.0, 8.0, 1e3, 1e5, 1e8, 1e11]), np.ones(6))
+    assert low == pytest.approx(3.0)
+    assert low < value < high
+
+
 def test_too_few_trajectories() -> None:
     value, low, high = mean_interval(np.ones(4), np.ones(4))
     assert value == 1.0
