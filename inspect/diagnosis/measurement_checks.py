@@ -47,22 +47,20 @@ def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple
 def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
     """``measurement function/CHANNEL/all``: root mean square error of h(x) in the noise of the readings, by channel.
 
-    The filter has h(x) = z - nu at the state x before the update, and the healthy record's model of the sensor expects
-    readings g there. Of a filter that reports the belief before the first of several updates only, x is from there to
-    the estimate, and h(x) may be between the readings at both ends. Neither the sensor nor the dynamics matter. Of
-    innovations with the channels of the sensors.
+    The filter has h(x) = z - nu at a state x from the prediction, or the reported belief before the update, to the
+    estimate: other updates may come first. The healthy record's model of the sensor expects readings g there, and h(x)
+    may be between those at both ends. Neither the sensor nor the dynamics matter. Of innovations with the channels of
+    the sensors.
     """
     predicted = prediction(trace)
     if trace.innovation is None or predicted is None or trace.task.rotations:
         return {}
-    first, each = predicted[0][:, None], trace.predicted_mean
-    is_each = each is not None and not np.allclose(each, first, rtol=1e-3)
-    means = each if each is not None and is_each else np.repeat(first, len(trace.modalities), axis=1)
+    count = len(trace.modalities)
+    means = np.repeat(predicted[0][:, None], count, axis=1) if trace.predicted_mean is None else trace.predicted_mean
     keep = counted(trace)
     values: dict[str, float] = {}
-    for k in range(len(trace.modalities)):
-        between = (means[:, k], means[:, k] if is_each else trace.estimate_mean)
-        ends = [replace(trace.episode, states=x.astype(np.float32)) for x in between]
+    for k in range(count):
+        ends = [replace(trace.episode, states=x.astype(np.float32)) for x in (means[:, k], trace.estimate_mean)]
         for model, columns in _sensors(trace, k, models):
             readings = readings_of(trace.episode, model.key)
             h = readings[:, model.channels] - trace.innovation[:, k, columns]

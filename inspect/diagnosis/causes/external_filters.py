@@ -68,7 +68,7 @@ def in_predictions(cause: Cause) -> Cause:
     changed = {
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
         "process_noise": _dynamics("bias", "error", "offset", "spread"),
-        "measurement": _dynamics("bias", "error", "nis", "offset", "scatter", "spread"),
+        "measurement": f"{_dynamics('bias', 'error', 'nis', 'offset', 'scatter', 'slope', 'spread')}|process noise/*",
     }
     others = f"{DYNAMICS}|process noise/*|measurement function/*"
     # The labels are compared with updates of the belief, which mean nothing once the filter has lost the state.
@@ -169,7 +169,8 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"updates.{modality}.absent",
             f"Updates with {name} where it has no reading",
             (Symptom(f"absent updates/{modality}/*", 1),),
-            f"{JACOBIANS}|{DYNAMICS}|process noise/*|measurement noise/*|measurement function/*|{FILTER}",
+            f"{JACOBIANS}|{DYNAMICS}|lag/dynamics/*|process noise/*|measurement noise/*|measurement function/*"
+            f"|{FILTER}",
             f"Update with {name} only at steps with a reading: observations of a masked sensor have its mask.",
         ),
     )

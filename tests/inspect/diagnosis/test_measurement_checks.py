@@ -53,12 +53,19 @@ def test_an_offset_of_the_measurement_function_shows_whatever_the_readings() -> 
 
 
 def test_a_belief_before_each_update_is_that_of_its_measurement_function() -> None:
-    """The estimate after all updates does not matter then: h is not between its readings and those of a belief."""
-    shared, separate = run(Boat()), run(Boat(separate=True))
-    moved = [replace(trace, estimate_mean=trace.estimate_mean + np.float32(1.0)) for trace in (shared, separate)]
-    changed, same = (measurement_model_statistics(trace, models()) for trace in moved)
-    assert same == measurement_model_statistics(separate, models())
-    assert changed != measurement_model_statistics(shared, models())
+    """An update that comes first may move the belief away from both ends, the prediction and the estimate."""
+    separate = run(Boat(separate=True))
+    moved = separate.predicted_mean - np.float32([0, 0, 0.5, 0]) * np.arange(2, dtype=np.float32)[:, None]
+    trace = replace(
+        separate,
+        predicted_mean=moved,
+        innovation=separate.innovation + np.float32([[0, 0], [0.5, np.nan]]),
+        estimate_mean=separate.predicted_mean[:, 0],
+    )
+    compass = "measurement function/compass/all"
+    assert measurement_model_statistics(trace, models())[compass] < 0.2
+    shared = replace(trace, predicted_mean=separate.predicted_mean)
+    assert measurement_model_statistics(shared, models())[compass] > 5.0
 
 
 def with_likelihoods(trace: Trace, scale: float, offset: float) -> Trace:
