@@ -81,12 +81,17 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
 
 
 def error_statistics(trace: Trace) -> dict[str, float]:
-    """Root mean square errors of the estimate: ``error`` of the position in m, ``angle error`` of the angles in rad."""
+    """Root mean square errors of the estimate: ``error``, the task's main error; ``angle error`` of all angles, rad;
+    ``component error``, of each other component, such as a velocity.
+    """
     at = measures.counted(trace)
     values = {"error//all": float(np.sqrt(np.square(measures.main_error(trace)[at, -1]).mean()))}
     angles = list(trace.task.angles)
     if angles:
         values["angle error//all"] = float(np.sqrt(np.square(measures.errors(trace)[at, -1][:, angles]).mean()))
+    for i in measures.other_errors(trace.task):
+        error = measures.errors(trace)[at, -1, i]
+        values[f"component error/{trace.task.components[i].name}/all"] = float(np.sqrt(np.square(error).mean()))
     return values
 
 

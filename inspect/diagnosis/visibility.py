@@ -9,16 +9,16 @@ import numpy as np
 
 from beliefscope.inspect.diagnosis.cause import Recovery
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
-from beliefscope.inspect.statistics.measures import counted, errors, nees
+from beliefscope.inspect.statistics.measures import counted, errors, nees, other_errors
 from beliefscope.inspect.trace import Trace
 
 NEES = "nees/fused/all"
 
-VISIBLE = {"error//all": 1.2, "angle error//all": 1.2, NEES: 2.0}
-"""Statistic -> ratio to its healthy value, or inverse ratio of the NEES, from which a fault affects the filter."""
+VISIBLE_ERROR, VISIBLE_NEES = 1.2, 2.0
+"""Ratios of errors, and of the NEES or its inverse, to healthy values from which a fault affects the filter."""
 
 BY_UNIT = {"m": "error//all", "rad": "angle error//all"}
-"""Unit of state components -> statistic of ``VISIBLE``."""
+"""Unit of state components -> statistic of their errors; the others have one each."""
 
 UNUSED = 1.05
 """Largest ratio of these statistics with and without a sensor that a filter hardly uses."""
@@ -30,7 +30,7 @@ class Effect:
 
     Attributes:
         restored: share of all deviations that disappears.
-        ratios: statistic of ``VISIBLE`` -> value with the fault relative to that without it, over all episodes.
+        ratios: statistic of an error, or ``NEES`` -> value with the fault relative to that without, over all episodes.
         complete: whether the undo brings back healthy readings, modules or equations; else it removes a sensor.
     """
 
@@ -42,7 +42,7 @@ class Effect:
     @property
     def failed(self) -> bool:
         """Whether errors are clearly larger after undoing the cause, which does not show the run without it."""
-        return any(ratio < 1.0 / VISIBLE[name] for name, ratio in self.ratios.items() if name != NEES)
+        return any(ratio < 1.0 / VISIBLE_ERROR for name, ratio in self.ratios.items() if name != NEES)
 
 
 def effect_ratios(before: Sequence[Trace], after: Sequence[Trace]) -> dict[str, float]:
@@ -56,10 +56,12 @@ def effect_ratios(before: Sequence[Trace], after: Sequence[Trace]) -> dict[str, 
 
 
 def _totals(traces: Sequence[Trace]) -> dict[str, float]:
-    """Statistic of ``VISIBLE`` -> sum of the squared errors or of the NEES over the counted steps."""
-    units = np.array([component.unit for component in traces[0].task.components])
+    """Statistic of an error, or ``NEES`` -> sum of the squared errors or of the NEES over the counted steps."""
+    task = traces[0].task
+    units = np.array([component.unit for component in task.components])
     squares = sum(np.square(errors(trace)[counted(trace), -1]).sum(0) for trace in traces)
     totals = {name: float(np.sum(squares[units == unit])) for unit, name in BY_UNIT.items() if unit in units}
+    totals |= {f"component error/{task.components[i].name}/all": float(squares[i]) for i in other_errors(task)}
     if all(trace.has_covariance for trace in traces):
         totals[NEES] = float(sum(nees(trace)[counted(trace), -1].sum() for trace in traces))
     return totals
@@ -83,15 +85,15 @@ def is_visible(deviations: Mapping[str, Deviation], effect: Effect | None) -> bo
             return True
         unused = bool(effect.ratios) and all(1.0 / UNUSED < ratio < UNUSED for ratio in effect.ratios.values())
         explained = effect.complete or unused
-    candidates = (deviations.get(name) for name in VISIBLE)
     return any(
-        _large(d.statistic, d.value / d.healthy) and (d.alarm if explained else not d.low <= d.value <= d.high)
-        for d in candidates
-        if d is not None
+        _large(name, d.value / d.healthy) and (d.alarm if explained else not d.low <= d.value <= d.high)
+        for name, d in deviations.items()
+        if name in (NEES, *BY_UNIT.values()) or name.startswith("component error/")
     )
 
 
 def _large(statistic: str, ratio: float) -> bool:
-    """Whether a statistic of ``VISIBLE`` changes by its limit; errors that decrease do not count."""
-    limit = VISIBLE[statistic]
-    return ratio > limit or (statistic == NEES and ratio < 1.0 / limit)
+    """Whether an error or the NEES changes by its limit; errors that decrease do not count."""
+    if statistic == NEES:
+        return not 1.0 / VISIBLE_NEES <= ratio <= VISIBLE_NEES
+    return ratio > VISIBLE_ERROR

@@ -16,6 +16,7 @@ KINDS = {
     "ess": ("effective sample size", True, 0.05),
     "error": ("RMS position error", True, 0.02),
     "angle error": ("RMS error of angles", True, 0.02),
+    "component error": ("RMS error", True, 0.02),
     "module bias": ("bias of the measurement model", False, 5e-4),
     "module error": ("error of the measurement model", True, 0.02),
     "module std": ("predicted standard deviation of the measurement model", True, 0.02),
@@ -127,7 +128,19 @@ PHASES = {
 """Phase of a statistic -> how its label begins and ends; others are phases of the task."""
 
 RISING = frozenset(
-    {"error", "angle error", "regret", "outside", "black", "losses", "frozen", "stuck", "saturation", "occlusion"}
+    {
+        "error",
+        "angle error",
+        "component error",
+        "regret",
+        "outside",
+        "black",
+        "losses",
+        "frozen",
+        "stuck",
+        "saturation",
+        "occlusion",
+    }
     | {
         "change",
         "opposition",
@@ -167,7 +180,7 @@ OF_KINDS = {
 OF_COMPONENTS = frozenset(
     {f"module {value}" for value in ("bias", "error", "std", "spread", "scatter")}
     | {f"dynamics {value}" for value in ("bias", "error", "spread", "offset", "scatter")}
-    | {"process noise", "offset"}
+    | {"component error", "process noise", "offset"}
 )
 """Kinds of statistics in the unit of the state component that their subject ends with; else m, of the controls."""
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 FILTER = (
-    "error/*|angle error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*|ancestors/*"
-    "|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*"
+    "error/*|angle error/*|component error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*"
+    "|ancestors/*|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*"
 )
 """Belief of the filter, and the use of its modules."""
 

@@ -44,6 +44,12 @@ def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool
     assert is_visible(error(value, alarm), undone) is visible
 
 
+def test_errors_of_velocities_and_biases_count_as_well() -> None:
+    name = "component error/speed/all"
+    assert is_visible({name: Deviation(name, 1.5, 1.0, 0.9, 1.1, 0.01, True, 9.0)}, None)
+    assert is_visible({}, Effect(Recovery(0.0, 0.0, 0.0, 0.0, "position"), 0.0, {"error//all": 1.0, name: 1.5}, True))
+
+
 @pytest.mark.parametrize(("nees", "visible"), [(3.0, True), (0.4, True), (1.5, False)])
 def test_calibration_may_change_in_both_directions(nees: float, visible: bool) -> None:
     changed = Effect(Recovery(0.0, 0.0, 0.0, 0.0, "position"), 0.0, {"nees/fused/all": nees}, True)
