@@ -140,8 +140,6 @@ RISING = frozenset(
         "stuck",
         "saturation",
         "occlusion",
-    }
-    | {
         "change",
         "opposition",
         "opposed",
