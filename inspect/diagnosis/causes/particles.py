@@ -26,10 +26,10 @@ CAUSES = (
     ),
     Cause(
         "resampling.off",
-        "Resampling off",
+        "Resampling off, or weights kept after it",
         (Symptom("prior ess/*", -1),),
         f"fusion mean/*|fusion variance/*|{FILTER}",
-        "Resample at every step.",
+        "Resample at every step, and make all weights equal afterwards.",
         "restore equations",
     ),
     Cause(

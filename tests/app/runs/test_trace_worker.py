@@ -50,6 +50,12 @@ def pid(worker: TraceWorker) -> int:
     return worker._process.pid
 
 
+def stop(process: int) -> None:
+    """Stop a process, and wait until all of its threads are stopped: until then, it reads from its pipe."""
+    os.kill(process, signal.SIGSTOP)
+    os.waitpid(process, os.WUNTRACED)
+
+
 def wait_for_call(worker: TraceWorker) -> None:
     """Wait until a call waits in the pipe of the stopped process."""
     assert worker._process is not None
@@ -79,7 +85,7 @@ def test_traces_are_identical_and_a_killed_worker_is_replaced(
     assert len(list((settings.workspace / "traces").iterdir())) == 1, "traces of interventions are not kept"
 
     first = pid(worker)
-    os.kill(first, signal.SIGSTOP)  # during the next run
+    stop(first)  # during the next run
     run = store.request(OTHER)
     wait_for_call(worker)  # a process that is dead before is replaced
     os.kill(first, signal.SIGKILL)
@@ -95,7 +101,7 @@ def test_errors_are_reported_and_close_ends_a_run(store: TraceStore, worker: Tra
         worker.run(replace(invalid, checkpoint="missing"), lambda _: None)
     with pytest.raises(RuntimeError, match="RuntimeError: manual_seed"):
         worker.run(replace(invalid, seed="text"), lambda _: None)  # type: ignore[arg-type]
-    os.kill(pid(worker), signal.SIGSTOP)
+    stop(pid(worker))
     run = store.request(SELECTION)
     closing = threading.Thread(target=store.close)
     closing.start()
