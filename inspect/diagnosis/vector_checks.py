@@ -82,8 +82,7 @@ def stuck(episode: Episode, key: str, axis: int) -> Mask:
     """(T,): whether an axis repeats its reading while the hand moves."""
     present = episode.present(key)
     same = np.zeros(len(episode), dtype=bool)
-    if present.sum() > 1:
-        same[present] = repeats(episode.observations[key][present, axis], episode.task.held_steps(key))
+    same[present] = repeats(episode.observations[key][present, axis], episode.task.held_steps(key))
     return same & _moving(episode) if key != HAND else same
 
 

@@ -129,14 +129,15 @@ def repeats(values: NDArray[np.generic], held: int = 0) -> Mask:
     """(T,): whether a reading (T, ...) equals the previous one.
 
     At the start of an episode, up to ``MAX_LAG`` repetitions do not count: a delayed sensor repeats its first reading.
+    They count if no other reading follows.
 
     Args:
         held: consecutive repetitions that are no fault, of a slow sensor (``Task.held_steps``).
     """
     same = np.zeros(len(values), dtype=bool)
-    same[1:] = (values[1:] == values[:-1]).reshape(len(values) - 1, -1).all(1)
-    leading = int(np.argmin(same[1:])) if not same[1:].all() else len(values)
-    if leading <= MAX_LAG:
+    same[1:] = (values[1:] == values[:-1]).all(axis=tuple(range(1, values.ndim)))
+    leading = len(values) if same[1:].all() else int(np.argmin(same[1:]))
+    if leading <= MAX_LAG and leading < len(values):
         same[: leading + 1] = False
     return long_runs(same, held + 1) if held else same
 

@@ -218,6 +218,13 @@ def test_repeated_readings_of_a_masked_sensor_are_those_of_its_readings(readings
     assert stuck(episode, "radar", 0).sum() == 19
 
 
+def test_a_sensor_whose_few_readings_are_all_equal_is_stuck() -> None:
+    """A delay repeats as many at the start of an episode, but other readings follow."""
+    episode = sail(3, every=20)
+    episode.observations["radar"][:] = 3.0
+    assert stuck(episode, "radar", 0).sum() == 4
+
+
 def test_predictions_before_each_update_have_the_statistics_of_those_before_all() -> None:
     shared, separate = run(Boat()), run(Boat(separate=True))
     assert not np.array_equal(shared.predicted_mean, separate.predicted_mean)
