@@ -80,19 +80,24 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
+def component_errors(task: Task) -> dict[str, int]:
+    """``component error/NAME/all`` -> index of a component that is no length, no angle and not in the main error."""
+    known = task.main_error.indices
+    others = ((i, c.name) for i, c in enumerate(task.components) if c.unit not in ("m", "rad") and i not in known)
+    return {f"component error/{name}/all": i for i, name in others}
+
+
 def error_statistics(trace: Trace) -> dict[str, float]:
     """Root mean square errors of the estimate: ``error``, the task's main error; ``angle error`` of all angles, rad;
     ``component error``, of each other component, such as a velocity.
     """
     at = measures.counted(trace)
     values = {"error//all": float(np.sqrt(np.square(measures.main_error(trace)[at, -1]).mean()))}
-    angles = list(trace.task.angles)
+    angles, errors = list(trace.task.angles), measures.errors(trace)[at, -1]
     if angles:
-        values["angle error//all"] = float(np.sqrt(np.square(measures.errors(trace)[at, -1][:, angles]).mean()))
-    for i in measures.other_errors(trace.task):
-        error = measures.errors(trace)[at, -1, i]
-        values[f"component error/{trace.task.components[i].name}/all"] = float(np.sqrt(np.square(error).mean()))
-    return values
+        values["angle error//all"] = float(np.sqrt(np.square(errors[:, angles]).mean()))
+    others = component_errors(trace.task).items()
+    return values | {name: float(np.sqrt(np.square(errors[:, i]).mean())) for name, i in others}
 
 
 def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:

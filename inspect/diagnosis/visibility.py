@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.inspect.diagnosis.cause import Recovery
+from beliefscope.inspect.diagnosis.model_checks import component_errors
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
-from beliefscope.inspect.statistics.measures import counted, errors, nees, other_errors
+from beliefscope.inspect.statistics.measures import counted, errors, nees
 from beliefscope.inspect.trace import Trace
 
 NEES = "nees/fused/all"
@@ -61,7 +62,7 @@ def _totals(traces: Sequence[Trace]) -> dict[str, float]:
     units = np.array([component.unit for component in task.components])
     squares = sum(np.square(errors(trace)[counted(trace), -1]).sum(0) for trace in traces)
     totals = {name: float(np.sum(squares[units == unit])) for unit, name in BY_UNIT.items() if unit in units}
-    totals |= {f"component error/{task.components[i].name}/all": float(squares[i]) for i in other_errors(task)}
+    totals |= {name: float(squares[i]) for name, i in component_errors(task).items()}
     if all(trace.has_covariance for trace in traces):
         totals[NEES] = float(sum(nees(trace)[counted(trace), -1].sum() for trace in traces))
     return totals

@@ -15,7 +15,7 @@ from beliefscope.datasets.text import capitalised, percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.kalman_updates import correction_slopes, expected_updates
+from beliefscope.inspect.diagnostics.kalman_updates import Updates, correction_slopes, expected_updates
 from beliefscope.inspect.diagnostics.repeated_steps import (
     RepeatedSteps,
     known_median,
@@ -205,7 +205,7 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
     columns = {"prediction jacobian": (components, known_median(repeated.dynamics_errors()))}
     if trace.innovation is not None:
         columns["measurement jacobian"] = (list(trace.modalities), known_median(repeated.measurement_errors()))
-        columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated))
+        columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated, expected_updates(repeated)))
     return {
         f"{kind}/{name}/all": float(value)
         for kind, (names, values) in columns.items()
@@ -228,7 +228,7 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
     def errors(measure: Callable[[RepeatedSteps], Array]) -> Array:
         return known_median(np.stack([np.fmin.reduce(measure(steps)) for steps in repeated]))
 
-    first = traces[0]
+    first, updates = traces[0], [expected_updates(steps) for steps in repeated]
     process = np.concatenate([steps.process_noise() for steps in repeated])
     channels = [] if first.innovation is None else channel_names(first, first.innovation)
     return KalmanEquations(
@@ -240,17 +240,16 @@ def check_equations(traces: Sequence[Trace], checkpoint: ExternalFilter) -> Kalm
         channels=tuple(map(tuple, channels)),
         measurement=errors(RepeatedSteps.measurement_errors),
         columns=errors(RepeatedSteps.measurement_errors_by_component),
-        slopes=known_median(np.stack([*map(correction_slopes, repeated)])),
+        slopes=known_median(np.stack([*map(correction_slopes, repeated, updates)])),
         dynamics=errors(RepeatedSteps.dynamics_errors),
         process_noise=np.sqrt(np.maximum(known_median(np.diagonal(process, axis1=-2, axis2=-1)), 0.0)),
         process_lack=float(_lack(process, np.concatenate([steps.covariance[:, 0] for steps in repeated]))),
-        **_of_updates(repeated, has_weights=first.weights is not None),
+        **_of_updates(repeated, updates, has_weights=first.weights is not None),
     )
 
 
-def _of_updates(repeated: Sequence[RepeatedSteps], has_weights: bool) -> dict[str, Any]:
+def _of_updates(repeated: Sequence[RepeatedSteps], updates: Sequence[Updates], has_weights: bool) -> dict[str, Any]:
     """The fields about updates. Those of filters with fusion weights are no Kalman updates."""
-    updates = [expected_updates(steps) for steps in repeated]
     size = np.concatenate([steps.size[:, 0] for steps in repeated])
     noise = np.concatenate([update.noise for update in updates])
     variance, whole = (np.diagonal(x, axis1=-2, axis2=-1) for x in (noise, size))

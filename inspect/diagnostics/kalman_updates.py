@@ -45,13 +45,13 @@ def expected_updates(steps: RepeatedSteps) -> Updates:
     return min(results, key=lambda r: _size(r.covariance_error) + _size(r.correction_error))
 
 
-def correction_slopes(steps: RepeatedSteps) -> Array:
-    """(K,) slopes of the filter's corrections on those of ``expected_updates``, -1 to 1; NaN without a measurement.
+def correction_slopes(steps: RepeatedSteps, updates: Updates) -> Array:
+    """(K,) slopes of the filter's corrections on the expected ones, -1 to 1; NaN without a measurement.
 
     They show the sign of the H of its gains, which the products ``H P H^T`` do not show.
     """
     scale = inverse_std(steps.covariance[:, 0])
-    parts = expected_updates(steps).corrections * scale[:, None]
+    parts = updates.corrections * scale[:, None]
     columns = parts.swapaxes(1, 2).reshape(steps.correction.size, -1)
     slopes = np.linalg.lstsq(columns, (steps.correction * scale).ravel(), rcond=1e-9)[0]
     return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)

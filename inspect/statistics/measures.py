@@ -84,12 +84,6 @@ def main_error(trace: Trace) -> Array:
     return np.asarray(trace.task.main_error.norm(errors(trace)), dtype=np.float64)
 
 
-def other_errors(task: Task) -> list[int]:
-    """Indices of the components that are neither lengths, nor angles, nor in the main error, such as velocities."""
-    known = task.main_error.indices
-    return [i for i, c in enumerate(task.components) if c.unit not in ("m", "rad") and i not in known]
-
-
 def with_main(task: Task, error: NDArray[Any]) -> Array:
     """(..., 1 + n): length of the main error, followed by the errors (..., n) of the components."""
     return np.concatenate([task.main_error.norm(error)[..., None], error], axis=-1)

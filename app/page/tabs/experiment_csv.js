@@ -4,6 +4,7 @@
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
+import { csvField } from '../core/download.js';
 import { NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @typedef {{title: string, value: (row: ExperimentRow | SeedGroup) => unknown}} Field */
@@ -22,7 +23,7 @@ export function tableCsv(rows, columns) {
     fields.map(({ title }) => title),
     ...rows.map((row) => fields.map(({ value }) => value(row))),
   ];
-  return lines.map((line) => `${line.map(quoted).join(',')}\n`).join('');
+  return lines.map((line) => `${line.map(csvField).join(',')}\n`).join('');
 }
 
 /**
@@ -43,10 +44,4 @@ function fieldsOf(rows, { key, title, number, content }) {
       : undefined;
   const hasSpread = rows.some((row) => spread(row) !== undefined);
   return [field, ...(hasSpread ? [{ title: `${title}, standard deviation`, value: spread }] : [])];
-}
-
-/** @param {unknown} value */
-function quoted(value) {
-  const text = String(value ?? '');
-  return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }

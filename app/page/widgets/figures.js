@@ -5,6 +5,7 @@
 /** @import { Curve, DiagnosticResult, Table } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
+import { csvField } from '../core/download.js';
 import { scaled, swatch } from '../core/colours.js';
 import { sentence, significant, typeset } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
@@ -249,11 +250,4 @@ function curvesByChart(curves) {
   const groups = new Map();
   for (const curve of curves) groups.set(curve.chart, [...(groups.get(curve.chart) ?? []), curve]);
   return [...groups.values()];
-}
-
-/** @param {string | number | null} value */
-function csvField(value) {
-  if (value === null) return '';
-  const text = String(value);
-  return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
