@@ -13,20 +13,32 @@ from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
 from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import counted
+from beliefscope.inspect.statistics.reading_features import Indices
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
+from beliefscope.inspect.statistics.signals import TURN, Array, wrapped
 from beliefscope.inspect.trace import Trace
 
 LIKELIHOODS, PARTICLES = 40, 60
 """Largest numbers of steps and of particles whose likelihoods are compared, evenly spaced."""
 
+TURNED = 1000
+"""Largest number of particles by step whose likelihoods show a jump."""
+
 NEAR = 3.0
 """Largest error of the reading expected at the nearest particle, relative to its noise: far from the readings, the
 likelihoods of all particles are a line, which does not show where their maximum is."""
 
+MIN_PARTICLES = 3
+"""Smallest number of particles on either side of the angle at which readings jump by a turn."""
+
+JUMP = 0.1
+"""Smallest fall of the log-likelihood between them, relative to that of an innovation of a full turn."""
+
 
 def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
-    """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of the measurement noise."""
-    return _functions(trace, models) | _likelihoods(trace, models)
+    """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of noise and turns."""
+    models = [model.with_weak_channels() for model in models]
+    return _functions(trace, models) | _likelihoods(trace, models) | _turns(trace, models)
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
@@ -95,12 +107,10 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         steps = np.flatnonzero(at)[:: 1 + int(at.sum()) // LIKELIHOODS]
         if not sensors or len(sensors) < len(own) or len(steps) < MIN_STEPS:
             continue
-        states = particles[steps][:, every]
-        there = Episode(trace.task, states.reshape(-1, states.shape[-1]))
         errors = []
         for model in sensors:
             readings = readings_of(trace.episode, model.key)[steps, None]
-            errors.append(model.relative(readings - model.expected(there).reshape(*states.shape[:2], -1)))
+            errors.append(model.relative(readings - _expected(trace, model, steps, every)))
         e = np.concatenate(errors, axis=-1)  # (S, P, A)
         near = (np.abs(e).min(1) < NEAR).all(-1)
         if near.sum() < MIN_STEPS:
@@ -122,3 +132,49 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         names = [axis_name(m.key, i, len(m.channels)) for m in sensors for i in m.channels]
         values |= {f"measurement function/{name}/all": b for name, b in zip(names, bias, strict=True)}
     return values
+
+
+def _turns(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
+    """``innovation turns/MODALITY/all`` of a particle filter: share of steps at which a likelihood jumps (``JUMP``).
+
+    Of the steps with particles on both sides of the angle at which readings jump by a turn.
+    """
+    if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
+        return {}
+    likelihood, values = trace.log_likelihood.astype(np.float64), dict[str, float]()
+    for k, modality in enumerate(trace.modalities):
+        own = [model for model in models if model.key in trace.task.modalities.get(modality, ())]
+        angles = [replace(model, of_channels=(one,)) for model in own for one in model.of_channels if one.is_angle]
+        if falls := [fall for model in angles for fall in _falls(trace, model, likelihood[:, k])]:
+            values[f"innovation turns/{modality}/all"] = float((np.array(falls) > JUMP).mean())
+    return values
+
+
+def _falls(trace: Trace, model: ReadingModel, likelihood: Array) -> list[float]:
+    """Fall of log-likelihoods (T, P) between the two sides, where the readings of an angle are near the jump.
+
+    From particles whose expected readings, modulo a turn, are within the noise of the reading.
+    """
+    (noise,), every = model.noise, np.s_[:: 1 + likelihood.shape[1] // TURNED]
+    readings = wrapped(readings_of(trace.episode, model.key)[:, model.channels[0]])
+    likelihood = likelihood[:, every]
+    at = counted(trace) & trace.episode.present(model.key) & np.isfinite(likelihood).all(1)
+    steps = np.flatnonzero(at & (np.pi - np.abs(readings) < NEAR * noise))
+    if not len(steps):
+        return []
+    error = readings[steps, None] - wrapped(_expected(trace, model, steps, every)[..., 0])
+    near, beyond = np.abs(wrapped(error)) < noise, np.abs(error) > np.pi
+    sides = [near & ~beyond, near & beyond]
+    counts = [side.sum(1) for side in sides]
+    means = [(side * likelihood[steps]).sum(1) / np.maximum(n, 1) for side, n in zip(sides, counts, strict=True)]
+    fall = (means[0] - means[1]) / (0.5 * (TURN / noise) ** 2)
+    return fall[np.minimum(*counts) >= MIN_PARTICLES].tolist()
+
+
+def _expected(trace: Trace, model: ReadingModel, steps: Indices, every: slice) -> Array:
+    """(S, P, A) readings expected at some of the particles of some steps."""
+    assert trace.particles is not None
+    states = trace.particles[steps][:, every]
+    controls = np.repeat(trace.episode.controls[steps], states.shape[1], axis=0)
+    there = Episode(trace.task, states.reshape(-1, states.shape[-1]), controls)
+    return model.expected(there).reshape(*states.shape[:2], len(model.of_channels))

@@ -203,7 +203,7 @@ def permute_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
 def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings with the order and the signs of channels that best agree with the labels; None if they have them."""
     readings = () if inputs.healthy is None else inputs.healthy.readings
-    model = next((model for model in readings if model.key == key), None)
+    model = next((model for model in readings if model.key == key and model.channels), None)
     from scipy.optimize import linear_sum_assignment  # takes most of a second
 
     if model is None:

@@ -23,6 +23,9 @@ GRID = 15
 ZOOMS, ZOOM = 7, 0.35
 """Number of searches, and size of each relative to the one before; the first is twice as large as the positions."""
 
+MAX_FACTORS = 16
+"""Largest number of values whose products are features."""
+
 SEARCHED = 400
 """Largest number of positions that the search compares."""
 
@@ -47,6 +50,23 @@ def features(episode: Episode) -> tuple[Array, list[Indices]]:
         all_ = np.concatenate([all_, contact, contact * all_], axis=1)
     index, state = np.arange(all_.shape[1]), others.shape[1] + frames.shape[1]
     return all_, [index[:state], index[: state + 2 * states.shape[1]], index]
+
+
+def products(episode: Episode, with_controls: bool) -> Array:
+    """(T, F): the state at each step, the controls, and all products of two of them; (T, 0) of too many values.
+
+    Angles that wrap are their cosine and sine, rotations their matrices.
+    """
+    task, states = episode.task, episode.states.astype(np.float64)
+    others, frames = _values(task, states)
+    turned = {i for at in task.rotations for i in range(at.start, at.stop)}
+    wraps = np.array([c.wraps for i, c in enumerate(task.components) if i not in turned], dtype=bool)
+    controls = episode.controls.astype(np.float64) if with_controls else states[:, :0]
+    values = np.concatenate([others[:, ~wraps], frames, controls], axis=1)
+    if values.shape[1] > MAX_FACTORS:
+        return values[:, :0]
+    first, second = np.triu_indices(values.shape[1])
+    return np.concatenate([values, values[:, first] * values[:, second]], axis=1)
 
 
 def positions(task: Task, states: Array) -> Array:

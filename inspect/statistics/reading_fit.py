@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from beliefscope.inspect.statistics.reading_features import (
     find_landmark,
     landmark_features,
     positions,
+    products,
 )
 from beliefscope.inspect.statistics.reading_model import (
+    CONTROL,
     ChannelModel,
     ReadingModel,
     angle_of,
@@ -28,20 +30,32 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, is_angle, w
 EXPLAINED = 0.5
 """Smallest share of the variance of a channel within episodes that its model explains in other episodes."""
 
+WEAKLY_EXPLAINED = 0.05
+"""The same of a channel whose model is used to judge likelihoods and measurement functions only."""
+
 SMALLEST_NOISE = 0.01
 """Smallest noise of a channel, relative to the standard deviation of its readings within episodes."""
 
 RIDGE = 1e-3
 """Penalty of squared coefficients of standardised features, relative to the number of steps."""
 
+MORE_FEATURES = 0.99
+"""Largest share of the variance that changes of the state leave of what the state leaves: noise decides on others."""
+
 CLOSER = 0.8
-"""Largest share of the variance that a landmark leaves of what other features leave."""
+"""Largest share of the variance that a landmark, or products, leave of what simpler features leave."""
 
 MAX_STEPS = 20_000
 """Number of steps to which a model is fitted; of more, every second one and so on."""
 
 MIN_EPISODES = 4
 """Smallest number of episodes of a model."""
+
+NOWHERE: Array = np.empty(0)
+"""The landmark of fits to other features."""
+
+Fit = tuple[Array, Array, list[Array]]
+"""Coefficients (F, C) and constants (C,) of columns, and their predictions (S, C) for each episode."""
 
 
 def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
@@ -62,8 +76,13 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
             for x, episode, steps in zip(inputs, episodes, present, strict=True)
             if len(steps) // stride >= MIN_STEPS
         ]
-        if len(rows) >= MIN_EPISODES and (models := _fit(rows, groups, _options(episodes, key))):
-            result.append(ReadingModel(key, models))
+        fits = _fit(rows, groups, _options(episodes, key)) if len(rows) >= MIN_EPISODES else []
+        strong, weak = (
+            tuple(fitted.model(rows) for fitted in fits if low < fitted.explained(rows) <= high)
+            for low, high in ((EXPLAINED, 1.0), (WEAKLY_EXPLAINED, EXPLAINED))
+        )
+        if strong or weak:
+            result.append(ReadingModel(key, strong, weak))
     return tuple(result)
 
 
@@ -71,13 +90,14 @@ class Rows:
     """Some steps of an episode.
 
     Attributes:
-        features: (S, F). readings: (S, d). states: (S, n). places: (S, p) positions.
+        features: (S, F). products: (S, G). readings: (S, d). states: (S, n). places: (S, p) positions.
     """
 
     def __init__(self, episode: Episode, key: str, inputs: Array, steps: Indices) -> None:
         self.features, self.readings = inputs[steps], readings_of(episode, key)[steps]
         self.states = states_of(episode)[steps]
         self.places = positions(episode.task, self.states)
+        self.products = products(episode, key != CONTROL)[steps]
 
 
 @dataclass(frozen=True)
@@ -107,13 +127,13 @@ class Option:
             return readings - columns[:, 0]
         return wrapped(readings - angle_of(columns, rows.states, self.heading))
 
-    def fitted(
-        self, rows: Sequence[Rows], coefficients: Array, constants: Array, predicted: Sequence[Array], landmark: Array
-    ) -> _Fitted:
-        """The part of a fit to all columns that is about the channel. predicted: (S, C) of each episode."""
+    def fitted(self, rows: Sequence[Rows], fit: Fit, landmark: Array = NOWHERE, has_products: bool = False) -> _Fitted:
+        """The part of a fit to all columns that is about the channel."""
+        coefficients, constants, predicted = fit
         errors = [self.errors(row, columns) for row, columns in zip(rows, predicted, strict=True)]
         left = float(sum(len(e) * e.var() for e in errors))
-        return _Fitted(self, coefficients[:, self.columns], constants[self.columns], landmark, errors, left)
+        own = coefficients[:, self.columns], constants[self.columns]
+        return _Fitted(self, *own, landmark, has_products, errors, left)
 
     def variation(self, rows: Rows) -> float:
         """Sum of squared distances of the readings from their mean, or of angles from their mean direction."""
@@ -131,8 +151,27 @@ class _Fitted:
     coefficients: Array
     constants: Array
     landmark: Array
+    has_products: bool
     errors: Sequence[Array]
     left: float
+
+    def explained(self, rows: Sequence[Rows]) -> float:
+        """Share of the variance of the channel within episodes; 0 of a constant."""
+        total = self._total(rows)
+        return 1.0 - self.left / total if total > 0.0 else 0.0
+
+    def _total(self, rows: Sequence[Rows]) -> float:
+        return sum(self.option.variation(row) for row in rows)
+
+    def model(self, rows: Sequence[Rows]) -> ChannelModel:
+        """The model of the channel."""
+        total = self._total(rows)
+        steps = np.array([len(error) for error in self.errors], dtype=np.float64)
+        variance = max(self.left, SMALLEST_NOISE**2 * total) / steps.sum()
+        between = np.var([error.mean() for error in self.errors]) - variance * (1.0 / steps).mean()
+        noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
+        fit = self.option.channel, self.coefficients, self.constants, self.option.heading, self.landmark
+        return ChannelModel(*fit, noise, bias, self.has_products)
 
 
 def _options(episodes: Sequence[Episode], key: str) -> list[Option]:
@@ -149,50 +188,53 @@ def _options(episodes: Sequence[Episode], key: str) -> list[Option]:
     return options
 
 
-def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Option]) -> tuple[ChannelModel, ...]:
-    """The channels that the labels explain, each by the option and the features that leave the least of it.
+def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Option]) -> list[_Fitted]:
+    """The fit to each channel, by the option and the features that leave the least of it.
 
     Further features, fitted to noise, would change the expected readings from step to step.
     """
     y = [np.concatenate([option.targets(row) for option in options], axis=1) for row in rows]
-    fits = _ridges([row.features for row in rows], y, groups)
+    stages = [
+        *(
+            (MORE_FEATURES, [option.fitted(rows, fit) for option in options])
+            for fit in _ridges([row.features for row in rows], y, groups)
+        ),
+        (CLOSER, list(_landmark_fits(rows, y, options))),
+        (CLOSER, _product_fits(rows, y, options)),
+    ]
     best: dict[int, _Fitted] = {}
-    for coefficients, constants, predicted in fits:
-        for option in options:
-            fitted = option.fitted(rows, coefficients, constants, predicted, np.empty(0))
-            if option.channel not in best or fitted.left < best[option.channel].left:
-                best[option.channel] = fitted
-    steps = np.array([len(row.readings) for row in rows], dtype=np.float64)
-    limits = {channel: CLOSER * fitted.left for channel, fitted in best.items()}
+    for share, fits in stages:
+        for channel in {option.channel for option in options}:
+            own = [fitted for fitted in fits if fitted.option.channel == channel]
+            least = min(own, key=lambda fitted: fitted.left, default=None)
+            if least is not None and (channel not in best or least.left < share * best[channel].left):
+                best[channel] = least
+    return list(best.values())
+
+
+def _landmark_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option]) -> Iterator[_Fitted]:
+    """Fits to the distance or direction of a landmark; none without positions."""
     for option in options if rows[0].places.shape[1] else ():
         targets = [targets[:, option.columns] for targets in y]
         landmark = find_landmark(np.concatenate([row.places for row in rows]), np.concatenate(targets))
-        alone = Option(option.channel, option.heading, slice(0, targets[0].shape[1]))
+        alone = replace(option, columns=slice(0, targets[0].shape[1]))
         inputs = [landmark_features(row.places, landmark) for row in rows]
         (fit,) = _ridges(inputs, targets, [np.array([1, 2] if option.is_angle else [0])])  # direction or distance
-        fitted = alone.fitted(rows, *fit, landmark)
-        if fitted.left < min(limits[option.channel], best[option.channel].left):
-            best[option.channel] = fitted
-    models = []
-    for channel, fitted in best.items():
-        total = sum(fitted.option.variation(row) for row in rows)
-        if fitted.left >= (1.0 - EXPLAINED) * total:
-            continue
-        variance = max(fitted.left, SMALLEST_NOISE**2 * total) / steps.sum()
-        between = np.var([error.mean() for error in fitted.errors]) - variance * (1.0 / steps).mean()
-        noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
-        heading, landmark = fitted.option.heading, fitted.landmark
-        models.append(ChannelModel(channel, fitted.coefficients, fitted.constants, heading, landmark, noise, bias))
-    return tuple(models)
+        yield alone.fitted(rows, fit, landmark)
 
 
-def _ridges(
-    x: Sequence[Array], y: Sequence[Array], groups: Sequence[Indices]
-) -> list[tuple[Array, Array, list[Array]]]:
+def _product_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option]) -> list[_Fitted]:
+    """Fits to products of state and controls; none of too many."""
+    if not (count := rows[0].products.shape[1]):
+        return []
+    (fit,) = _ridges([row.products for row in rows], y, [np.arange(count)])
+    return [option.fitted(rows, fit, has_products=True) for option in options]
+
+
+def _ridges(x: Sequence[Array], y: Sequence[Array], groups: Sequence[Indices]) -> list[Fit]:
     """Ridge regression of columns (S, C) on each group of the features (S, F) of several episodes.
 
-    Returns coefficients (F, C), constants (C,), and the predictions (S, C) for each episode, from coefficients that are
-    fitted to half of the others.
+    The predictions of an episode are from coefficients that are fitted to half of the others.
     """
     mean_x, mean_y = (np.mean([values.mean(0) for values in parts], axis=0) for parts in (x, y))
     deviation = np.concatenate(x).std(0)

@@ -19,6 +19,7 @@ from beliefscope.inspect.statistics.reading_features import (
     features,
     landmark_features,
     positions,
+    products,
 )
 from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, wrapped
 
@@ -79,13 +80,14 @@ class ChannelModel:
     Attributes:
         index: of the channel.
         coefficients: (F, 1), or (F, 2) of an angle, in units of the readings by those of the ``features``, or (3, 1)
-            and (3, 2) by those of a landmark.
+            and (3, 2) by those of a landmark; F is that of ``products`` where these are the features.
         constants: (1,) or (2,).
         heading: (n,) h, coefficients of the state x': 1 or -1 for one component that wraps around, or none; not used
             for channels that are no angles.
         landmark: (p,) position of the landmark whose distance or direction is measured; (0,) for other features.
         noise: standard deviation of the readings from the expected ones, in episodes to which it is not fitted.
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
+        has_products: whether the features are ``products``.
     """
 
     index: int
@@ -95,6 +97,7 @@ class ChannelModel:
     landmark: Array
     noise: float
     bias: float
+    has_products: bool = False
 
     @property
     def is_angle(self) -> bool:
@@ -120,6 +123,7 @@ class ChannelModel:
             "landmark": rounded(self.landmark),
             "noise": float(f"{self.noise:.{DIGITS}g}"),
             "bias": float(f"{self.bias:.{DIGITS}g}"),
+            **({"has_products": True} if self.has_products else {}),
         }
 
     @classmethod
@@ -130,7 +134,8 @@ class ChannelModel:
         if coefficients.ndim != 2 or len(coefficients) not in (1, 2) or constants.shape != (len(coefficients),):
             raise ValueError(f"coefficients {coefficients.shape}, constants {constants.shape}")
         noise, bias = float(value["noise"]), float(value["bias"])
-        return cls(int(value["index"]), coefficients.T, constants, heading, landmark, noise, bias)
+        has_products = bool(value.get("has_products"))  # absent in records of earlier versions
+        return cls(int(value["index"]), coefficients.T, constants, heading, landmark, noise, bias, has_products)
 
 
 @dataclass(frozen=True)
@@ -140,10 +145,12 @@ class ReadingModel:
     Attributes:
         key: observation key of the sensor, or ``CONTROL``.
         of_channels: models of the A channels that the labels explain (``EXPLAINED``).
+        of_weak_channels: models of those that they explain in part (``WEAKLY_EXPLAINED``).
     """
 
     key: str
     of_channels: tuple[ChannelModel, ...]
+    of_weak_channels: tuple[ChannelModel, ...] = ()
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -176,28 +183,39 @@ class ReadingModel:
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
-        return {"key": self.key, "of_channels": [model.to_json() for model in self.of_channels]}
+        weak = [model.to_json() for model in self.of_weak_channels]
+        own = {"key": self.key, "of_channels": [model.to_json() for model in self.of_channels]}
+        return own | ({"of_weak_channels": weak} if weak else {})
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReadingModel:
         """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
-        return cls(str(value["key"]), tuple(map(ChannelModel.from_json, value["of_channels"])))
+        models = (value["of_channels"], value.get("of_weak_channels", ()))
+        return cls(str(value["key"]), *(tuple(map(ChannelModel.from_json, of)) for of in models))
+
+    def with_weak_channels(self) -> ReadingModel:
+        """The model with all channels that the labels explain at least in part, in their order."""
+        both = sorted((*self.of_channels, *self.of_weak_channels), key=lambda model: model.index)
+        return ReadingModel(self.key, tuple(both))
 
     def is_complete(self, episode: Episode) -> bool:
-        """Whether all channels of the sensor have models, of the state at one step and neither changes nor contact."""
+        """Whether all channels have models, of the state and controls at one step: neither of changes nor contact."""
         _, (state, *_) = features(episode)
-        others = (np.delete(m.coefficients, state, axis=0) for m in self.of_channels if not len(m.landmark))
+        of_features = (m for m in self.of_channels if not len(m.landmark) and not m.has_products)
+        others = (np.delete(model.coefficients, state, axis=0) for model in of_features)
         count = readings_of(episode, self.key).shape[1]
         return len(self.of_channels) == count and not any(values.any() for values in others)
 
     def expected(self, episode: Episode) -> Array:
         """(T, A) expected readings of the states of an episode; NaN if the model has features of another version."""
-        inputs, _ = features(episode)
-        if any(len(m.coefficients) != inputs.shape[1] for m in self.of_channels if not len(m.landmark)):
+        inputs = {False: features(episode)[0], True: products(episode, self.key != CONTROL)}
+        of_features = (m for m in self.of_channels if not len(m.landmark))
+        if any(len(m.coefficients) != inputs[m.has_products].shape[1] for m in of_features):
             return np.full((len(episode), len(self.of_channels)), np.nan)
         states = states_of(episode)
         places = positions(episode.task, states)
-        return np.stack([model.expected(inputs, states, places) for model in self.of_channels], axis=1)
+        columns = [m.expected(inputs[m.has_products], states, places) for m in self.of_channels]
+        return np.stack(columns, axis=1)
 
     def compare(self, episode: Episode) -> ComparedReadings:
         """The readings of an episode beside the expected ones.

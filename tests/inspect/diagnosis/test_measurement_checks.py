@@ -91,5 +91,32 @@ def test_log_likelihoods_over_particles_show_noise_and_function(scale: float, of
     assert "measurement noise/compass/all" not in values, "likelihoods without evidence"
 
 
+@pytest.mark.parametrize("wraps", [True, False])
+def test_likelihoods_of_angles_that_are_not_wrapped_jump(wraps: bool) -> None:
+    """The heading is near half a turn, with particles on both sides of it."""
+    trace = run(Boat())
+    rng, (steps, n) = np.random.default_rng(0), trace.estimate_mean.shape
+    std = models()[1].noise[0]
+    states = trace.episode.states.copy()
+    shift = math.pi - trace.episode.observations["compass"][:, 0]
+    states[:, 2] = (states[:, 2] + shift + math.pi) % (2.0 * math.pi) - math.pi
+    compass = np.full((steps, 1), math.pi - 0.2 * std, np.float32)
+    particles = states[:, None] + rng.normal(0.0, std, (steps, 50, n))
+    particles[..., 2] = (particles[..., 2] + math.pi) % (2.0 * math.pi) - math.pi
+    error = compass - particles[..., 2]
+    error = (error + math.pi) % (2.0 * math.pi) - math.pi if wraps else error
+    likelihood = np.stack([0.0 * error, -0.5 * np.square(error / std)], axis=1).astype(np.float32)
+    observations = {**trace.episode.observations, "compass": compass}
+    changed = replace(
+        trace,
+        episode=replace(trace.episode, states=states, observations=observations),
+        particles=particles.astype(np.float32),
+        log_likelihood=likelihood,
+        innovation=None,
+    )
+    values = measurement_model_statistics(changed, models())
+    assert values["innovation turns/compass/all"] == (0.0 if wraps else 1.0)
+
+
 def test_sensors_without_models_have_no_statistics() -> None:
     assert measurement_model_statistics(run(Boat()), ()) == {}

@@ -1,0 +1,109 @@
+"""Models of nonlinear readings: products of the state and the controls, and channels that vary little."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from tests.inspect.statistics.test_reading_model import smooth
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnosis.reading_checks import modelled_keys, reading_statistics
+from beliefscope.inspect.statistics.reading_features import products
+from beliefscope.inspect.statistics.reading_fit import fit_reading_models
+from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
+
+CART = Task(
+    name="cart",
+    components=(Component("x", "m"), Component("v", "m/s")),
+    observations={"drag": (1,), "motor": (1,), "level": (2,)},
+    modalities={key: (key,) for key in ("drag", "motor", "level")},
+    control_size=1,
+    dt=0.05,
+)
+STD = {"drag": [0.05], "motor": [0.1], "level": [0.05, 0.6]}
+
+
+def drive(seed: int) -> Episode:
+    """A quadratic drag, a current of command and speed, and a level whose second channel is mostly noise."""
+    rng = np.random.default_rng(seed)
+    x, v, u = smooth(rng, 3).T
+    clean = {"drag": [v**2], "motor": [u - 0.5 * x * v], "level": [2.0 * x, 0.25 * v]}
+    observations = {key: np.stack(c, 1) + rng.normal(0.0, STD[key], (len(x), len(c))) for key, c in clean.items()}
+    return Episode(CART, np.stack([x, v], 1), u[:, None], observations)
+
+
+@cache
+def models() -> dict[str, ReadingModel]:
+    return {m.key: m for m in fit_reading_models([drive(seed) for seed in range(20)], modelled_keys(CART))}
+
+
+def test_products_are_those_of_the_step() -> None:
+    episode = drive(0)
+    x, v, u = *episode.states.T, episode.controls[:, 0]
+    np.testing.assert_allclose(
+        products(episode, True), np.stack([x, v, u, x * x, x * v, x * u, v * v, v * u, u * u], 1), rtol=1e-6
+    )
+    np.testing.assert_allclose(products(episode, False), np.stack([x, v, x * x, x * v, v * v], 1), rtol=1e-6)
+    many = replace(CART, control_size=20)
+    assert products(Episode(many, episode.states, np.zeros((len(x), 20))), True).shape == (len(x), 0)
+
+
+@pytest.mark.parametrize("key", ["drag", "motor"])
+def test_products_leave_the_noise(key: str) -> None:
+    model, episode = models()[key], drive(100)
+    assert model.of_channels[0].has_products
+    assert model.is_complete(episode)
+    np.testing.assert_allclose(model.noise, STD[key], rtol=0.1)
+    stored = ReadingModel.from_json(json.loads(json.dumps(model.to_json())))
+    np.testing.assert_allclose(stored.expected(episode), model.expected(episode), atol=1e-5)
+    gained = replace(episode, observations={**episode.observations, key: 1.2 * episode.observations[key]})
+    assert reading_statistics(gained, [model])[f"reading gain/{key}/all"] == pytest.approx(1.2, abs=0.03)
+
+
+def test_the_controls_do_not_explain_themselves() -> None:
+    assert CONTROL not in models(), "nothing else does"
+
+
+def test_readings_of_the_state_alone_have_a_model_of_it_alone() -> None:
+    """Noise would favour the model with its changes for about one of two sensors."""
+    for seed in range(12):
+        (level,) = fit_reading_models([drive(100 * seed + i) for i in range(8)], ["level"])
+        assert level.is_complete(drive(0)) == (len(level.of_channels) == 2)
+        assert level.with_weak_channels().is_complete(drive(0)), seed
+
+
+def test_channels_that_vary_little_are_for_likelihoods_only() -> None:
+    level = models()["level"]
+    assert (level.channels, [m.index for m in level.of_weak_channels]) == ((0,), [1])
+    assert level.with_weak_channels().channels == (0, 1)
+    np.testing.assert_allclose(level.with_weak_channels().noise, STD["level"], rtol=0.1)
+    assert not any("/level y/" in name for name in reading_statistics(drive(100), [level]))
+    stored = ReadingModel.from_json(json.loads(json.dumps(level.to_json())))
+    assert stored.with_weak_channels().channels == (0, 1)
+    only_weak = replace(level, of_channels=())
+    assert reading_statistics(drive(100), [only_weak]) == {}
+
+
+def test_a_constant_channel_has_no_model() -> None:
+    def constant(seed: int) -> Episode:
+        episode = drive(seed)
+        return replace(episode, observations={**episode.observations, "drag": np.full((len(episode), 1), 3.0)})
+
+    assert fit_reading_models([constant(seed) for seed in range(8)], ["drag"]) == ()
+
+
+def test_errors_that_depend_on_each_other_are_no_gain() -> None:
+    """A slow error along with the expected readings in a part of the episode, 10 white standard errors."""
+    episode, model = drive(100), models()["level"]
+    x = episode.states[:, 0]
+    part = np.arange(len(x)) < len(x) // 4
+    level = episode.observations["level"] + np.stack([np.where(part, 0.4 * x, 0.0), 0.0 * x], 1)
+    slow = replace(episode, observations={**episode.observations, "level": level.astype(np.float32)})
+    assert reading_statistics(slow, [model])["reading gain/level x/all"] == pytest.approx(1.0, abs=0.02)
+    whole = replace(episode, observations={**episode.observations, "level": 1.2 * episode.observations["level"]})
+    assert reading_statistics(whole, [model])["reading gain/level x/all"] == pytest.approx(1.2, abs=0.02)
