@@ -28,6 +28,9 @@ SIMPLER = 2.0
 SURELY = 4.0
 """Smallest number of standard errors of a slope."""
 
+BLOCKS = 10
+"""Number of parts of an episode that are taken as independent of each other."""
+
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
 
@@ -59,7 +62,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     whatever their signs, for the best other channel.
     """
     values: dict[str, float] = {}
-    for model in models:
+    for model in (model for model in models if model.channels):
         if model.key not in (*episode.observations, CONTROL) or not np.isfinite(episode.states).all():
             continue
         compared = model.compare(episode)
@@ -100,8 +103,8 @@ def _short_delay(compared: ComparedReadings) -> float:
 def _line(readings: Array, expected: Array) -> dict[str, Array]:
     """``bias``, ``gain`` and ``noise`` (A,) of readings (S, A): a line through the expected ones, and what it leaves.
 
-    NaN for too few steps. Gains are 1 unless they differ from it by ``SURELY`` standard errors: noise changes them as
-    well. The noise is that before the gain.
+    NaN for too few steps. Noise changes gains as well: they are shrunk towards 1, and are 1 unless they differ from it
+    by ``SURELY`` standard errors (positive-part James-Stein estimator). The noise is that before the gain.
     """
     if len(readings) < MIN_STEPS:
         return dict.fromkeys(("bias", "gain", "noise"), np.full(readings.shape[1], np.nan))
@@ -109,9 +112,16 @@ def _line(readings: Array, expected: Array) -> dict[str, Array]:
     power = np.maximum(np.square(x).sum(0), 1e-24)
     slope = (x * y).sum(0) / power
     rest = np.sqrt(np.square(y - slope * x).mean(0))
-    sure = np.abs(slope - 1.0) > SURELY * rest / np.sqrt(power)
-    before = np.where(sure, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
-    return {"bias": (readings - expected).mean(0), "gain": np.where(sure, slope, 1.0), "noise": rest / before}
+    error = SURELY * np.maximum(rest / np.sqrt(power), _clustered(x * (y - slope * x)) / power)
+    share = np.maximum(1.0 - np.square(error / np.maximum(np.abs(slope - 1.0), 1e-12)), 0.0)
+    before = np.where(share > 0.0, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
+    return {"bias": (readings - expected).mean(0), "gain": 1.0 + share * (slope - 1.0), "noise": rest / before}
+
+
+def _clustered(terms: Array) -> Array:
+    """(A,) standard errors of sums of terms (S, A) with a mean of 0, which depend on each other within ``BLOCKS``."""
+    starts = np.linspace(0, len(terms), BLOCKS, endpoint=False).astype(int)
+    return np.asarray(np.sqrt(np.square(np.add.reduceat(terms, starts, axis=0)).sum(0)))
 
 
 def _evidence(error: Array, other: Array, limit: float) -> Array:
