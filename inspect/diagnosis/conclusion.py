@@ -155,7 +155,16 @@ def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
     outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
-    return _other_lengths(case) + sensors + absent + (outdated if new else [])
+    return _other_lengths(case) + sensors + _likelihoods(case) + absent + (outdated if new else [])
+
+
+def _likelihoods(case: Case) -> list[str]:
+    """Likelihoods of an external particle filter that cannot be judged, since no model expects the readings."""
+    trace, checkpoint = case.traces[0], case.inputs.checkpoint
+    if trace.log_likelihood is None or not isinstance(checkpoint, ExternalFilter):
+        return []
+    names = (name for name in trace.modalities if f"measurement noise/{name}/all" not in case.by_statistic)
+    return [f"measurement noise and measurement function of {display_name(name)}" for name in names]
 
 
 def _other_lengths(case: Case) -> list[str]:

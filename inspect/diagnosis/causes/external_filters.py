@@ -24,7 +24,7 @@ DRIFT = Cause(
     "Dynamics biased, differently in each episode",
     (Symptom("dynamics scatter/*"),),
     f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|measurement noise/*|{FILTER}",
-    "Check the bias of its inputs that the filter should estimate.",
+    "Check the bias of its inputs that the filter should estimate, and its sign in the dynamics.",
     prior=0.1,
 )
 """A bias that the filter does not estimate, such as that of a gyroscope.
@@ -68,6 +68,7 @@ def in_predictions(cause: Cause) -> Cause:
     changed = {
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
         "process_noise": _dynamics("bias", "error", "offset", "spread"),
+        "measurement_noise": f"{DYNAMICS}|process noise/*",
         "measurement": f"{_dynamics('bias', 'error', 'nis', 'offset', 'scatter', 'slope', 'spread')}|process noise/*",
     }
     others = f"{DYNAMICS}|process noise/*|measurement function/*"
@@ -114,7 +115,7 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             f"measurement.{modality}.function",
             f"Measurement function of {name} wrong",
             (Symptom("|".join(f"measurement function/{key}/*|measurement function/{key} */*" for key in keys)),),
-            FILTER,
+            f"measurement noise/{modality}/*|{FILTER}",  # a likelihood of a wrong scale has another width
             f"Compare h of {name} at the true states with its readings: positions of landmarks, units, signs.",
         ),
         Cause(
