@@ -69,7 +69,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         delay, errors = delayed_errors(compared, episode.dt)
         is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())  # sign and order
         values[f"reading lag/{model.key}/all"] = _short_delay(compared) if delay == 0.0 and is_own else delay
-        line = _line(*compared.pairs(0 if np.isnan(delay) else int(delay)))
+        line = _line(*compared.pairs(0 if np.isnan(delay) else int(delay)), model.gain_spreads)
         least = errors.min(0)
         own = np.diagonal(least)
         exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
@@ -100,11 +100,12 @@ def _short_delay(compared: ComparedReadings) -> float:
     return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
 
 
-def _line(readings: Array, expected: Array) -> dict[str, Array]:
+def _line(readings: Array, expected: Array, spread: Array) -> dict[str, Array]:
     """``bias``, ``gain`` and ``noise`` (A,) of readings (S, A): a line through the expected ones, and what it leaves.
 
-    NaN for too few steps. Noise changes gains as well: they are shrunk towards 1, and are 1 unless they differ from it
-    by ``SURELY`` standard errors (positive-part James-Stein estimator). The noise is that before the gain.
+    NaN for too few steps. Noise changes slopes as well: gains are shrunk towards 1 if their standard errors exceed the
+    spread (A,) of healthy ones, but little if they differ from 1 by far more than ``SURELY`` of them (positive-part
+    James-Stein estimator). The noise is that before the gain.
     """
     if len(readings) < MIN_STEPS:
         return dict.fromkeys(("bias", "gain", "noise"), np.full(readings.shape[1], np.nan))
@@ -112,9 +113,10 @@ def _line(readings: Array, expected: Array) -> dict[str, Array]:
     power = np.maximum(np.square(x).sum(0), 1e-24)
     slope = (x * y).sum(0) / power
     rest = np.sqrt(np.square(y - slope * x).mean(0))
-    error = SURELY * np.maximum(rest / np.sqrt(power), _clustered(x * (y - slope * x)) / power)
-    share = np.maximum(1.0 - np.square(error / np.maximum(np.abs(slope - 1.0), 1e-12)), 0.0)
-    before = np.where(share > 0.0, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
+    error = np.maximum(np.maximum(rest / np.sqrt(power), _clustered(x * (y - slope * x)) / power), 1e-12)
+    sure = 1.0 - np.square(SURELY * error / np.maximum(np.abs(slope - 1.0), 1e-12))
+    share = np.maximum(np.minimum(np.square(spread / error), 1.0), sure)
+    before = np.where(sure > 0.0, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
     return {"bias": (readings - expected).mean(0), "gain": 1.0 + share * (slope - 1.0), "noise": rest / before}
 
 

@@ -135,6 +135,16 @@ class Option:
         own = coefficients[:, self.columns], constants[self.columns]
         return _Fitted(self, *own, landmark, has_products, errors, left)
 
+    def slopes(self, rows: Sequence[Rows], errors: Sequence[Array]) -> Array:
+        """(E,) slopes of the errors (S,) of each episode on the expected readings."""
+        result = []
+        for row, error in zip(rows, errors, strict=True):
+            expected = row.readings[:, self.channel] - error
+            expected = np.unwrap(expected) if self.is_angle else expected
+            around = expected - expected.mean()
+            result.append((around * error).sum() / max(np.square(around).sum(), 1e-24))
+        return np.array(result)
+
     def variation(self, rows: Rows) -> float:
         """Sum of squared distances of the readings from their mean, or of angles from their mean direction."""
         readings = rows.readings[:, self.channel]
@@ -171,7 +181,8 @@ class _Fitted:
         between = np.var([error.mean() for error in self.errors]) - variance * (1.0 / steps).mean()
         noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
         fit = self.option.channel, self.coefficients, self.constants, self.option.heading, self.landmark
-        return ChannelModel(*fit, noise, bias, self.has_products)
+        spread = float(self.option.slopes(rows, self.errors).std())
+        return ChannelModel(*fit, noise, bias, self.has_products, spread)
 
 
 def _options(episodes: Sequence[Episode], key: str) -> list[Option]:

@@ -88,6 +88,7 @@ class ChannelModel:
         noise: standard deviation of the readings from the expected ones, in episodes to which it is not fitted.
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
         has_products: whether the features are ``products``.
+        gain_spread: standard deviation between these episodes of the slope of the readings on the expected ones.
     """
 
     index: int
@@ -98,6 +99,7 @@ class ChannelModel:
     noise: float
     bias: float
     has_products: bool = False
+    gain_spread: float = 0.0
 
     @property
     def is_angle(self) -> bool:
@@ -123,7 +125,8 @@ class ChannelModel:
             "landmark": rounded(self.landmark),
             "noise": float(f"{self.noise:.{DIGITS}g}"),
             "bias": float(f"{self.bias:.{DIGITS}g}"),
-            **({"has_products": True} if self.has_products else {}),
+            "has_products": self.has_products,
+            "gain_spread": float(f"{self.gain_spread:.{DIGITS}g}"),
         }
 
     @classmethod
@@ -134,8 +137,11 @@ class ChannelModel:
         if coefficients.ndim != 2 or len(coefficients) not in (1, 2) or constants.shape != (len(coefficients),):
             raise ValueError(f"coefficients {coefficients.shape}, constants {constants.shape}")
         noise, bias = float(value["noise"]), float(value["bias"])
-        has_products = bool(value.get("has_products"))  # absent in records of earlier versions
-        return cls(int(value["index"]), coefficients.T, constants, heading, landmark, noise, bias, has_products)
+        new = (
+            bool(value.get("has_products")),
+            float(value.get("gain_spread", 0.0)),
+        )  # absent in records of earlier versions
+        return cls(int(value["index"]), coefficients.T, constants, heading, landmark, noise, bias, *new)
 
 
 @dataclass(frozen=True)
@@ -145,7 +151,7 @@ class ReadingModel:
     Attributes:
         key: observation key of the sensor, or ``CONTROL``.
         of_channels: models of the A channels that the labels explain (``EXPLAINED``).
-        of_weak_channels: models of those that they explain in part (``WEAKLY_EXPLAINED``).
+        of_weak_channels: models of other channels, which they explain in part (``WEAKLY_EXPLAINED``).
     """
 
     key: str
@@ -166,6 +172,11 @@ class ReadingModel:
     def biases(self) -> Array:
         """(A,) standard deviations between episodes of the mean noise."""
         return np.array([model.bias for model in self.of_channels])
+
+    @property
+    def gain_spreads(self) -> Array:
+        """(A,) standard deviations between episodes of the slope of the readings on the expected ones."""
+        return np.array([model.gain_spread for model in self.of_channels])
 
     @property
     def is_angle(self) -> Mask:

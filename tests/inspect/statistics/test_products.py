@@ -107,3 +107,26 @@ def test_errors_that_depend_on_each_other_are_no_gain() -> None:
     assert reading_statistics(slow, [model])["reading gain/level x/all"] == pytest.approx(1.0, abs=0.02)
     whole = replace(episode, observations={**episode.observations, "level": 1.2 * episode.observations["level"]})
     assert reading_statistics(whole, [model])["reading gain/level x/all"] == pytest.approx(1.2, abs=0.02)
+
+
+def test_noise_does_not_spread_gains_beyond_healthy_ones() -> None:
+    """Slopes of readings with 20 times the noise would have 20 times the spread."""
+    model = models()["drag"]
+    spread, noise = model.gain_spreads[0], STD["drag"][0]
+    gains = []
+    for seed in range(100, 120):
+        episode = drive(seed)
+        more = np.random.default_rng(seed).normal(0.0, 20.0 * noise, (len(episode), 1))
+        readings = (episode.observations["drag"] + more).astype(np.float32)
+        noisy = replace(episode, observations={**episode.observations, "drag": readings})
+        gains.append(reading_statistics(noisy, [model])["reading gain/drag/all"] - 1.0)
+    assert np.std(gains) < spread
+    healthy = [reading_statistics(drive(seed), [model])["reading gain/drag/all"] - 1.0 for seed in range(100, 120)]
+    assert np.std(healthy) == pytest.approx(spread, rel=0.5), "not shrunk"
+    old = ReadingModel.from_json(
+        {
+            "key": "drag",
+            "of_channels": [{k: v for k, v in model.of_channels[0].to_json().items() if k != "gain_spread"}],
+        }
+    )
+    assert reading_statistics(drive(100), [old])["reading gain/drag/all"] == 1.0, "of a record of an earlier version"
