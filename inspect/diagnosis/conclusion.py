@@ -41,7 +41,7 @@ from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
-from beliefscope.inspect.diagnostics.statistic_kinds import label_of, sensor_of
+from beliefscope.inspect.diagnostics.statistic_kinds import channel_of, label_of, sensor_of
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -311,7 +311,7 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"
-    text = f"{title}{_when(case, first)}{where}, probability {probability_text(first.probability)}"
+    text = f"{title}{channels_text(case, first.cause)}{_when(case, first)}{where}, probability {probability_text(first.probability)}"
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
         text += f"; and {_lower(second.cause.title)}, probability {probability_text(second.probability)}"
     if masked:
@@ -337,6 +337,21 @@ def search_action(checkpoint: Checkpoint, count: int, reports: bool = True) -> s
 def _lower(title: str) -> str:
     """A title within a sentence; abbreviations such as NLL keep their capitals."""
     return title if title[:2].isupper() else title[0].lower() + title[1:]
+
+
+def channels_text(case: Case, cause: Cause) -> str:
+    """The channels of a sensor or of the controls that a cause concerns: `` (elbow)``. Empty for all, or without names.
+
+    Those that deviate by at least half as much as the most deviating one.
+    """
+    task, key = case.inputs.checkpoint.task, cause.component.rpartition(".")[2]
+    largest: dict[str, float] = {}
+    for alarm in symptoms_of(cause, case.alarms):
+        if channel := channel_of(alarm.statistic.split("/")[1], task):
+            largest.setdefault(channel[1].name.removeprefix(f"{key} "), abs(alarm.t))
+    limit = 0.5 * max(largest.values(), default=0.0)
+    own = [channel.name for channel in task.channels.get(key, ()) if largest.get(channel.name, 0.0) > limit]
+    return f" ({', '.join(own)})" if 0 < len(own) < len(task.channels[key]) else ""
 
 
 def _when(case: Case, candidate: Candidate) -> str:

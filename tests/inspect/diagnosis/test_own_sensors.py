@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.conclusion import channels_text
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
@@ -228,3 +230,19 @@ def test_inverted_dynamics_are_not_frozen() -> None:
     wrong = ranked(WRENCH, *slope(-1.0), gain)
     assert wrong["control.sign"] > 0.7 > 0.3 > wrong["dynamics.inverted"], "the controls themselves are inverted"
     assert frozen["dynamics.frozen"] > 0.7 > 0.1 > frozen["dynamics.inverted"]
+
+
+@pytest.mark.parametrize(
+    ("t_values", "expected"),
+    [({"x": 9.0}, " (east)"), ({"x": -9.0, "y": 3.0}, " (east)"), ({"x": 9.0, "y": 5.0}, ""), ({}, "")],
+)
+def test_headlines_name_the_channels_of_a_cause(t_values: dict[str, float], expected: str) -> None:
+    """Those that deviate by more than half as much as the most deviating one, unless these are all of them."""
+    task = replace(TASK, channels={"gps": (Component("east", "m"), Component("north", "m"))})
+    alarms = [Deviation(f"reading bias/gps {c}/all", 1.0, 0.0, -0.1, 0.1, 0.0, True, t) for c, t in t_values.items()]
+    alarms.append(Deviation("error//all", 1.0, 0.0, -0.1, 0.1, 0.0, True, 50.0))
+    (cause,) = (cause for cause in causes_of(task) if cause.name == "gps.bias")
+    case = SimpleNamespace(alarms=alarms, inputs=SimpleNamespace(checkpoint=SimpleNamespace(task=task)))
+    assert channels_text(case, cause) == expected
+    unnamed = SimpleNamespace(alarms=alarms, inputs=SimpleNamespace(checkpoint=SimpleNamespace(task=TASK)))
+    assert channels_text(unnamed, cause) == ""
