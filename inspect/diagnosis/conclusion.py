@@ -311,7 +311,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"
-    text = f"{title}{channels_text(case, first.cause)}{_when(case, first)}{where}, probability {probability_text(first.probability)}"
+    where = channels_text(case, first.cause) + _when(case, first) + where
+    text = f"{title}{where}, probability {probability_text(first.probability)}"
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
         text += f"; and {_lower(second.cause.title)}, probability {probability_text(second.probability)}"
     if masked:
