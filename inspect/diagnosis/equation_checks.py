@@ -140,6 +140,7 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
         values["offspring//all"] = float(np.square(offspring - expected).mean())
     if trace.log_likelihood is None:
         return values
+    values |= _absent_updates(trace)
     weight = log_weights.exp()
     valid = torch.isfinite(log_weights - prior) & torch.isfinite(_tensor(trace.log_likelihood)).all(1)
     weight = torch.where(valid, weight, 0.0)
@@ -152,6 +153,23 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     share = torch.linalg.lstsq(flat[:, :-1], flat[:, -1:], driver="gelsd").solution[:, 0]
     names = trace.modalities if len(trace.modalities) == len(share) else ()
     return values | {f"likelihood share/{name}/all": float(x) for name, x in zip(names, share, strict=False)}
+
+
+def _absent_updates(trace: Trace) -> dict[str, float]:
+    """``absent updates/MODALITY/all``: share of steps without a reading whose likelihood distinguishes particles."""
+    assert trace.log_likelihood is not None
+    values = {}
+    for k, modality in enumerate(trace.modalities):
+        keys = trace.task.modalities.get(modality, ())
+        absent = (
+            np.logical_and.reduce([~trace.episode.present(key) for key in keys]) & measures.counted(trace)
+            if keys
+            else None
+        )
+        if absent is not None and absent.any():
+            used = np.ptp(trace.log_likelihood[absent, k], axis=-1) > NO_EVIDENCE
+            values[f"absent updates/{modality}/all"] = float(used.mean())
+    return values
 
 
 def _ess_after_resampling(log_weights: Tensor, prior: Tensor) -> float:

@@ -15,10 +15,10 @@ from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.statistics.reading_features import Indices
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
-from beliefscope.inspect.statistics.signals import TURN, Array, wrapped
+from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN, Array, wrapped
 from beliefscope.inspect.trace import Trace
 
-LIKELIHOODS, PARTICLES = 40, 60
+LIKELIHOODS, PARTICLES = 200, 60
 """Largest numbers of steps and of particles whose likelihoods are compared, evenly spaced."""
 
 TURNED = 1000
@@ -38,7 +38,9 @@ JUMP = 0.1
 def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of noise and turns."""
     models = [model.with_weak_channels() for model in models]
-    return _functions(trace, models) | _likelihoods(trace, models) | _turns(trace, models)
+    values, turns = _likelihoods(trace, models), _turns(trace, models)
+    turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
+    return _functions(trace, models) | values | turns
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
@@ -87,12 +89,15 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
 
 
 def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
-    """``measurement noise/MODALITY/all`` and ``measurement function/CHANNEL/all`` of a particle filter.
+    """``measurement noise/MODALITY/all``, ``measurement function/CHANNEL/all`` and ``innovation turns/MODALITY/all``.
+
+    Of a particle filter.
 
     Its log-likelihoods over the particles of a step are ``c + sum_i s_i (b_i e_i - e_i^2 / 2)``, with the errors e of
     the readings expected at the particles, relative to their noise: s are the inverse ratios of the variances, and b
     the errors of its measurement function. Medians over the steps, of b without its sign; the noise is the geometric
-    mean of the standard deviations of all channels. Of modalities whose readings follow from the state alone.
+    mean of the standard deviations of all channels. Turns: share of steps with a b close to a full turn, of angles. Of
+    modalities whose readings follow from the state and the controls of the step.
     """
     likelihood, particles = trace.log_likelihood, trace.particles
     if likelihood is None or particles is None or trace.task.rotations:
@@ -126,9 +131,14 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         power = np.median(fit[:, count:], axis=0)
         if not (power > 0.0).all():
             continue
-        noise = np.concatenate([model.noise for model in sensors]) / np.sqrt(power)
+        noise_of_readings = np.concatenate([model.noise for model in sensors])
+        noise = noise_of_readings / np.sqrt(power)
         values[f"measurement noise/{modality}/all"] = float(np.exp(np.log(noise).mean()))
-        bias = np.median(np.abs(fit[:, :count] / power), axis=0).tolist()
+        size = np.abs(fit[:, :count] / power)
+        bias = np.median(size, axis=0).tolist()
+        if (angles := np.concatenate([model.is_angle for model in sensors])).any():
+            turned = np.abs(size * noise_of_readings - TURN)[:, angles] < NEAR_TURN
+            values[f"innovation turns/{modality}/all"] = float(turned.any(1).mean())
         names = [axis_name(m.key, i, len(m.channels)) for m in sensors for i in m.channels]
         values |= {f"measurement function/{name}/all": b for name, b in zip(names, bias, strict=True)}
     return values

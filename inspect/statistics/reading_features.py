@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -23,8 +24,11 @@ GRID = 15
 ZOOMS, ZOOM = 7, 0.35
 """Number of searches, and size of each relative to the one before; the first is twice as large as the positions."""
 
-MAX_FACTORS = 16
-"""Largest number of values whose products are features."""
+DEGREES = (2, 3)
+"""Degrees of polynomials in the state and the controls."""
+
+MAX_TERMS = 200
+"""Largest number of terms of a polynomial."""
 
 SEARCHED = 400
 """Largest number of positions that the search compares."""
@@ -52,8 +56,8 @@ def features(episode: Episode) -> tuple[Array, list[Indices]]:
     return all_, [index[:state], index[: state + 2 * states.shape[1]], index]
 
 
-def products(episode: Episode, with_controls: bool) -> Array:
-    """(T, F): the state at each step, the controls, and all products of two of them; (T, 0) of too many values.
+def monomials(episode: Episode, with_controls: bool, degree: int) -> Array:
+    """(T, F): the state at each step, the controls, and all products of up to ``degree`` of them; (T, 0) of too many.
 
     Angles that wrap are their cosine and sine, rotations their matrices.
     """
@@ -63,10 +67,16 @@ def products(episode: Episode, with_controls: bool) -> Array:
     wraps = np.array([c.wraps for i, c in enumerate(task.components) if i not in turned], dtype=bool)
     controls = episode.controls.astype(np.float64) if with_controls else states[:, :0]
     values = np.concatenate([others[:, ~wraps], frames, controls], axis=1)
-    if values.shape[1] > MAX_FACTORS:
+    count = values.shape[1]
+    if math.comb(count + degree, degree) > MAX_TERMS:
         return values[:, :0]
-    first, second = np.triu_indices(values.shape[1])
-    return np.concatenate([values, values[:, first] * values[:, second]], axis=1)
+    terms = [values]
+    last = np.arange(count)  # of each product, its last factor: the next one is not before it
+    for _ in range(degree - 1):
+        before, factor = np.nonzero(last[:, None] <= np.arange(count))
+        terms.append(terms[-1][:, before] * values[:, factor])
+        last = factor
+    return np.concatenate(terms, axis=1)
 
 
 def positions(task: Task, states: Array) -> Array:

@@ -9,12 +9,13 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.inspect.statistics.reading_features import (
+    DEGREES,
     Indices,
     features,
     find_landmark,
     landmark_features,
+    monomials,
     positions,
-    products,
 )
 from beliefscope.inspect.statistics.reading_model import (
     CONTROL,
@@ -36,14 +37,15 @@ WEAKLY_EXPLAINED = 0.05
 SMALLEST_NOISE = 0.01
 """Smallest noise of a channel, relative to the standard deviation of its readings within episodes."""
 
-RIDGE = 1e-3
-"""Penalty of squared coefficients of standardised features, relative to the number of steps."""
+RIDGE, RIDGE_OF_MONOMIALS = 1e-3, 1e-6
+"""Penalty of squared coefficients of standardised features, relative to the number of steps. Monomials depend on each
+other: their coefficients are large."""
 
 MORE_FEATURES = 0.99
 """Largest share of the variance that changes of the state leave of what the state leaves: noise decides on others."""
 
 CLOSER = 0.8
-"""Largest share of the variance that a landmark, or products, leave of what simpler features leave."""
+"""Largest share of the variance that a landmark, or a polynomial, leaves of what simpler features leave."""
 
 MAX_STEPS = 20_000
 """Number of steps to which a model is fitted; of more, every second one and so on."""
@@ -90,14 +92,14 @@ class Rows:
     """Some steps of an episode.
 
     Attributes:
-        features: (S, F). products: (S, G). readings: (S, d). states: (S, n). places: (S, p) positions.
+        features: (S, F). monomials: (S, G) by degree. readings: (S, d). states: (S, n). places: (S, p) positions.
     """
 
     def __init__(self, episode: Episode, key: str, inputs: Array, steps: Indices) -> None:
         self.features, self.readings = inputs[steps], readings_of(episode, key)[steps]
         self.states = states_of(episode)[steps]
         self.places = positions(episode.task, self.states)
-        self.products = products(episode, key != CONTROL)[steps]
+        self.monomials = {degree: monomials(episode, key != CONTROL, degree)[steps] for degree in DEGREES}
 
 
 @dataclass(frozen=True)
@@ -127,13 +129,13 @@ class Option:
             return readings - columns[:, 0]
         return wrapped(readings - angle_of(columns, rows.states, self.heading))
 
-    def fitted(self, rows: Sequence[Rows], fit: Fit, landmark: Array = NOWHERE, has_products: bool = False) -> _Fitted:
+    def fitted(self, rows: Sequence[Rows], fit: Fit, landmark: Array = NOWHERE, degree: int = 0) -> _Fitted:
         """The part of a fit to all columns that is about the channel."""
         coefficients, constants, predicted = fit
         errors = [self.errors(row, columns) for row, columns in zip(rows, predicted, strict=True)]
         left = float(sum(len(e) * e.var() for e in errors))
         own = coefficients[:, self.columns], constants[self.columns]
-        return _Fitted(self, *own, landmark, has_products, errors, left)
+        return _Fitted(self, *own, landmark, degree, errors, left)
 
     def slopes(self, rows: Sequence[Rows], errors: Sequence[Array]) -> Array:
         """(E,) slopes of the errors (S,) of each episode on the expected readings."""
@@ -161,7 +163,7 @@ class _Fitted:
     coefficients: Array
     constants: Array
     landmark: Array
-    has_products: bool
+    degree: int
     errors: Sequence[Array]
     left: float
 
@@ -182,7 +184,7 @@ class _Fitted:
         noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
         fit = self.option.channel, self.coefficients, self.constants, self.option.heading, self.landmark
         spread = float(self.option.slopes(rows, self.errors).std())
-        return ChannelModel(*fit, noise, bias, self.has_products, spread)
+        return ChannelModel(*fit, noise, bias, self.degree, spread)
 
 
 def _options(episodes: Sequence[Episode], key: str) -> list[Option]:
@@ -211,7 +213,7 @@ def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Opti
             for fit in _ridges([row.features for row in rows], y, groups)
         ),
         (CLOSER, list(_landmark_fits(rows, y, options))),
-        (CLOSER, _product_fits(rows, y, options)),
+        *((CLOSER, _polynomial_fits(rows, y, options, degree)) for degree in DEGREES),
     ]
     best: dict[int, _Fitted] = {}
     for share, fits in stages:
@@ -234,15 +236,15 @@ def _landmark_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[O
         yield alone.fitted(rows, fit, landmark)
 
 
-def _product_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option]) -> list[_Fitted]:
-    """Fits to products of state and controls; none of too many."""
-    if not (count := rows[0].products.shape[1]):
+def _polynomial_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option], degree: int) -> list[_Fitted]:
+    """Fits to a polynomial in state and controls; none with too many terms."""
+    if not (count := rows[0].monomials[degree].shape[1]):
         return []
-    (fit,) = _ridges([row.products for row in rows], y, [np.arange(count)])
-    return [option.fitted(rows, fit, has_products=True) for option in options]
+    (fit,) = _ridges([row.monomials[degree] for row in rows], y, [np.arange(count)], RIDGE_OF_MONOMIALS)
+    return [option.fitted(rows, fit, degree=degree) for option in options]
 
 
-def _ridges(x: Sequence[Array], y: Sequence[Array], groups: Sequence[Indices]) -> list[Fit]:
+def _ridges(x: Sequence[Array], y: Sequence[Array], groups: Sequence[Indices], penalty: float = RIDGE) -> list[Fit]:
     """Ridge regression of columns (S, C) on each group of the features (S, F) of several episodes.
 
     The predictions of an episode are from coefficients that are fitted to half of the others.
@@ -256,9 +258,9 @@ def _ridges(x: Sequence[Array], y: Sequence[Array], groups: Sequence[Indices]) -
     both = gram + other_gram, products + other_products, count + other_count
     result = []
     for group in groups:
-        by_half = [_ridge(halves[i], group) for i in (1, 0)]
+        by_half = [_ridge(halves[i], group, penalty) for i in (1, 0)]
         predicted = [inputs[:, group] @ by_half[i % 2][group] + mean_y for i, inputs in enumerate(x)]
-        coefficients = _ridge(both, group) / scale[:, None]
+        coefficients = _ridge(both, group, penalty) / scale[:, None]
         result.append((coefficients, mean_y - mean_x @ coefficients, predicted))
     return result
 
@@ -269,10 +271,10 @@ def _moments(x: Sequence[Array], y: Sequence[Array]) -> tuple[Array, Array, int]
     return inputs.T @ inputs, inputs.T @ targets, len(inputs)
 
 
-def _ridge(moments: tuple[Array, Array, int], group: Indices) -> Array:
+def _ridge(moments: tuple[Array, Array, int], group: Indices, penalty: float) -> Array:
     """(F, C) coefficients of ridge regression on a group of features, from ``_moments``; zero for others."""
     gram, products, steps = moments
     result = np.zeros_like(products)
-    penalised = gram[np.ix_(group, group)] + RIDGE * steps * np.eye(len(group))
+    penalised = gram[np.ix_(group, group)] + penalty * steps * np.eye(len(group))
     result[group] = np.linalg.solve(penalised, products[group])
     return result

@@ -18,8 +18,8 @@ from beliefscope.inspect.statistics.reading_features import (
     Indices,
     features,
     landmark_features,
+    monomials,
     positions,
-    products,
 )
 from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, wrapped
 
@@ -80,14 +80,14 @@ class ChannelModel:
     Attributes:
         index: of the channel.
         coefficients: (F, 1), or (F, 2) of an angle, in units of the readings by those of the ``features``, or (3, 1)
-            and (3, 2) by those of a landmark; F is that of ``products`` where these are the features.
+            and (3, 2) by those of a landmark; F is that of ``monomials`` where these are the features.
         constants: (1,) or (2,).
         heading: (n,) h, coefficients of the state x': 1 or -1 for one component that wraps around, or none; not used
             for channels that are no angles.
         landmark: (p,) position of the landmark whose distance or direction is measured; (0,) for other features.
         noise: standard deviation of the readings from the expected ones, in episodes to which it is not fitted.
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
-        has_products: whether the features are ``products``.
+        degree: of the ``monomials`` that are the features; 0 for others.
         gain_spread: standard deviation between these episodes of the slope of the readings on the expected ones.
     """
 
@@ -98,7 +98,7 @@ class ChannelModel:
     landmark: Array
     noise: float
     bias: float
-    has_products: bool = False
+    degree: int = 0
     gain_spread: float = 0.0
 
     @property
@@ -125,7 +125,7 @@ class ChannelModel:
             "landmark": rounded(self.landmark),
             "noise": float(f"{self.noise:.{DIGITS}g}"),
             "bias": float(f"{self.bias:.{DIGITS}g}"),
-            "has_products": self.has_products,
+            "degree": self.degree,
             "gain_spread": float(f"{self.gain_spread:.{DIGITS}g}"),
         }
 
@@ -138,7 +138,7 @@ class ChannelModel:
             raise ValueError(f"coefficients {coefficients.shape}, constants {constants.shape}")
         noise, bias = float(value["noise"]), float(value["bias"])
         new = (
-            bool(value.get("has_products")),
+            int(value.get("degree", 0)),
             float(value.get("gain_spread", 0.0)),
         )  # absent in records of earlier versions
         return cls(int(value["index"]), coefficients.T, constants, heading, landmark, noise, bias, *new)
@@ -212,20 +212,22 @@ class ReadingModel:
     def is_complete(self, episode: Episode) -> bool:
         """Whether all channels have models, of the state and controls at one step: neither of changes nor contact."""
         _, (state, *_) = features(episode)
-        of_features = (m for m in self.of_channels if not len(m.landmark) and not m.has_products)
+        of_features = (m for m in self.of_channels if not len(m.landmark) and not m.degree)
         others = (np.delete(model.coefficients, state, axis=0) for model in of_features)
         count = readings_of(episode, self.key).shape[1]
         return len(self.of_channels) == count and not any(values.any() for values in others)
 
     def expected(self, episode: Episode) -> Array:
         """(T, A) expected readings of the states of an episode; NaN if the model has features of another version."""
-        inputs = {False: features(episode)[0], True: products(episode, self.key != CONTROL)}
+        degrees = {model.degree for model in self.of_channels} - {0}
+        inputs = {degree: monomials(episode, self.key != CONTROL, degree) for degree in degrees}
+        inputs[0] = features(episode)[0]
         of_features = (m for m in self.of_channels if not len(m.landmark))
-        if any(len(m.coefficients) != inputs[m.has_products].shape[1] for m in of_features):
+        if any(len(m.coefficients) != inputs[m.degree].shape[1] for m in of_features):
             return np.full((len(episode), len(self.of_channels)), np.nan)
         states = states_of(episode)
         places = positions(episode.task, states)
-        columns = [m.expected(inputs[m.has_products], states, places) for m in self.of_channels]
+        columns = [m.expected(inputs[m.degree], states, places) for m in self.of_channels]
         return np.stack(columns, axis=1)
 
     def compare(self, episode: Episode) -> ComparedReadings:

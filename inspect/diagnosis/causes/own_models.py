@@ -13,6 +13,9 @@ from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics.reference_images import HAND
 
+EXPECTED = "reading */*|inverted/*|exchanged/*"
+"""Readings and controls against the expected ones; those of sensors may depend on the controls."""
+
 MODALITIES = ("image", "haptics")
 """Modalities whose measurement models have causes in the catalog."""
 
@@ -58,14 +61,14 @@ def _controls(task: Task) -> tuple[Cause, ...]:
     if not task.control_size or commands_hand(task):
         return ()
     # Updates of single modalities, which stand in for measurements, depend on the prediction.
-    changed = f"reading */control*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
+    changed = f"{EXPECTED}|lag/dynamics/*|{LABELS}|{DYNAMICS}"
     used = Symptom("dynamics slope/*|dynamics spread/*|reading gain/control*", 0, optional=True)
     return (
         Cause(
             "control.delay",
             "Controls delayed",
             (Symptom("reading lag/control/*", unmeasured=(Symptom("lag/dynamics/*", -1),)),),
-            f"inverted/control*|exchanged/control*|{changed}",
+            changed,
             "Synchronise the controls with the sensors.",
             "advance control",
         ),
@@ -81,14 +84,14 @@ def _controls(task: Task) -> tuple[Cause, ...]:
             "control.bias",
             "Controls biased",
             (Symptom("reading bias/control*", 0),),
-            f"lag/dynamics/*|{LABELS}|{DYNAMICS}",
+            changed,
             "Calibrate the zero of the controls.",
         ),
         Cause(
             "control.axes",
             "Control channels exchanged",
             (Symptom("exchanged/control*"),),
-            f"inverted/control*|opposed/control*|size/control*|{changed}",
+            f"opposed/control*|size/control*|{changed}",
             "Check the order of the controls.",
             "rearrange control",
         ),

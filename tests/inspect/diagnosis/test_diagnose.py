@@ -108,11 +108,13 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     [
         ("image_frozen:from=30", "image.frozen", " from step 31 (3.1 s)"),
         pytest.param("image_frozen", "image.frozen", " at all steps", marks=pytest.mark.long),
-        ("blackout:from=20:to=40", "image.blackout", " from step 20 to 39 (2.0 to 3.9 s)"),
+        pytest.param(
+            "blackout:from=20:to=40", "image.blackout", " from step 20 to 39 (2.0 to 3.9 s)", marks=pytest.mark.long
+        ),
         pytest.param("force_stuck", "force.stuck", " at all steps", marks=pytest.mark.long),
         pytest.param("force_bias=3", "force.bias", "", marks=pytest.mark.long),
         pytest.param("force_bias=8:from=30", "force.bias", " from step 30 (3.0 s)", marks=pytest.mark.long),
-        ("force_drift=2", "force.drift", ""),
+        pytest.param("force_drift=2", "force.drift", "", marks=pytest.mark.long),
     ],
 )
 def test_a_planted_sensor_fault_is_named_with_its_steps(faults: str, cause: str, steps: str) -> None:

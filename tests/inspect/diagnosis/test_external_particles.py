@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import beliefscope as bs
 from beliefscope.datasets.catalog import load_task
+from beliefscope.datasets.covariate import CONTACT
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
@@ -100,6 +102,19 @@ def test_statistics_of_particles_that_a_filter_reports() -> None:
     assert shares[0] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
     assert shares[1] == pytest.approx({"near": 1.0, "far": 0.5}, abs=1e-3)
     assert shares[2] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
+
+
+def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
+    """The filter uses the held reading of a masked sensor; a flat likelihood is none."""
+    task = replace(TASK, masks={"far": "seen"}, covariates={"seen": CONTACT})
+    seen = (np.arange(40) % 2).astype(np.float32)
+    trace = bs.trace(filter_of(Particles()), [ride(0)], 0)
+    masked = replace(trace, episode=replace(trace.episode, task=task, covariates={"seen": seen}))
+    assert reported_particle_statistics(masked)["absent updates/far/all"] == 1.0
+    assert "absent updates/near/all" not in reported_particle_statistics(masked), "it always has a reading"
+    flat = masked.log_likelihood.copy()
+    flat[:, 1] *= seen[:, None]
+    assert reported_particle_statistics(replace(masked, log_likelihood=flat))["absent updates/far/all"] == 0.0
 
 
 @pytest.mark.slow

@@ -242,20 +242,20 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
     [
         (Boat(radar=0.1), "measurement_noise.radar.small"),
         pytest.param(Boat(compass=10.0), "measurement_noise.compass.large", marks=pytest.mark.long),
-        (Boat(wraps=False), "innovation.compass.turns"),
+        pytest.param(Boat(wraps=False), "innovation.compass.turns", marks=pytest.mark.long),
         pytest.param(Boat(has_bias=False), "dynamics.drift", marks=pytest.mark.long),
         pytest.param(Boat(updates=0.5), "updates.compass.missing", marks=pytest.mark.long),
         pytest.param(Boat(turn=-1.0), "dynamics.inverted", marks=pytest.mark.long),
         pytest.param(Boat(turn=0.6), "dynamics.frozen", marks=pytest.mark.long),
         pytest.param(Boat(turn=2.0), "dynamics.large", marks=pytest.mark.long),
-        (Boat(offset=0.5), "measurement.radar.function"),
+        pytest.param(Boat(offset=0.5), "measurement.radar.function", marks=pytest.mark.long),
         pytest.param(Boat(radar=0.1, separate=True), "measurement_noise.radar.small", marks=pytest.mark.long),
         (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),
         pytest.param(Boat(jacobian=-1.0), "measurement.radar.jacobian", marks=pytest.mark.long),
         pytest.param(Boat(jacobian=0.5), "measurement.radar.jacobian", marks=pytest.mark.long),
         (Boat(heading_jacobian=-1.0), "dynamics.jacobian"),
         (Boat(gain=0.5), "updates.radar.gain"),
-        (Boat(absent=True), "updates.radar.absent"),
+        pytest.param(Boat(absent=True), "updates.radar.absent", marks=pytest.mark.long),
     ],
 )
 def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:

@@ -118,5 +118,22 @@ def test_likelihoods_of_angles_that_are_not_wrapped_jump(wraps: bool) -> None:
     assert values["innovation turns/compass/all"] == (0.0 if wraps else 1.0)
 
 
+@pytest.mark.parametrize("turns", [0, 1])
+def test_likelihoods_of_particles_a_turn_away_show_it(turns: int) -> None:
+    """Particles whose heading is not wrapped have no jump between them, but innovations of a full turn."""
+    trace = run(Boat())
+    std = models()[1].noise[0]
+    offsets = np.random.default_rng(0).normal(0.0, std, (len(trace), 50, 4))
+    particles = trace.episode.states[:, None] + offsets
+    particles[..., 2] = trace.episode.observations["compass"] + offsets[..., 2]
+    error = -offsets[..., 2] - 2.0 * math.pi * turns
+    likelihood = np.stack([0.0 * error, -0.5 * np.square(error / std)], axis=1)
+    changed = replace(
+        trace, particles=particles.astype(np.float32), log_likelihood=likelihood.astype(np.float32), innovation=None
+    )
+    values = measurement_model_statistics(changed, models())
+    assert values["innovation turns/compass/all"] == turns
+
+
 def test_sensors_without_models_have_no_statistics() -> None:
     assert measurement_model_statistics(run(Boat()), ()) == {}

@@ -121,3 +121,16 @@ def test_undoing_restores_the_controls(episode: Episode, faults: str, undo: Undo
     assert result is not None
     assert np.array_equal(result.episodes[0].controls[:-3], episode.controls[:-3])
     assert undo(inputs, {}) is None
+
+
+@pytest.mark.parametrize(("of_controls", "cause"), [(9.0, "control.bias"), (0.0, "gps.bias")])
+def test_readings_that_depend_on_the_controls_show_their_bias(of_controls: float, cause: str) -> None:
+    """The controls of a current explain its expected readings; without a bias of their own they are not at fault."""
+    deviations = [
+        Deviation(f"reading bias/{channel}/all", t, 0.0, -0.5, 0.5, 0.0, t > 0.0, t)
+        for channel, t in (("control x", of_controls), ("gps x", 9.0))
+    ]
+    causes = applicable(causes_of(TASK), [deviation.statistic for deviation in deviations])
+    result = probabilities({c.name: explain(c, deviations) for c in causes})
+    assert max(result, key=lambda name: result[name]) == cause
+    assert result[cause] > 0.8

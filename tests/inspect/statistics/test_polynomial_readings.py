@@ -1,4 +1,4 @@
-"""Models of nonlinear readings: products of the state and the controls, and channels that vary little."""
+"""Models of nonlinear readings: polynomials in the state and the controls, and channels that vary little."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.inspect.statistics.test_reading_model import smooth
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.reading_checks import modelled_keys, reading_statistics
-from beliefscope.inspect.statistics.reading_features import products
+from beliefscope.inspect.statistics.reading_features import monomials
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
 
@@ -42,21 +42,22 @@ def models() -> dict[str, ReadingModel]:
     return {m.key: m for m in fit_reading_models([drive(seed) for seed in range(20)], modelled_keys(CART))}
 
 
-def test_products_are_those_of_the_step() -> None:
+def test_monomials_are_products_of_the_values_of_the_step() -> None:
     episode = drive(0)
     x, v, u = *episode.states.T, episode.controls[:, 0]
     np.testing.assert_allclose(
-        products(episode, True), np.stack([x, v, u, x * x, x * v, x * u, v * v, v * u, u * u], 1), rtol=1e-6
+        monomials(episode, True, 2), np.stack([x, v, u, x * x, x * v, x * u, v * v, v * u, u * u], 1), rtol=1e-6
     )
-    np.testing.assert_allclose(products(episode, False), np.stack([x, v, x * x, x * v, v * v], 1), rtol=1e-6)
+    cubic = [x, v, x * x, x * v, v * v, x**3, x * x * v, x * v * v, v**3]
+    np.testing.assert_allclose(monomials(episode, False, 3), np.stack(cubic, 1), rtol=1e-6)
     many = replace(CART, control_size=20)
-    assert products(Episode(many, episode.states, np.zeros((len(x), 20))), True).shape == (len(x), 0)
+    assert monomials(Episode(many, episode.states, np.zeros((len(x), 20))), True, 2).shape == (len(x), 0)
 
 
 @pytest.mark.parametrize("key", ["drag", "motor"])
-def test_products_leave_the_noise(key: str) -> None:
+def test_polynomials_leave_the_noise(key: str) -> None:
     model, episode = models()[key], drive(100)
-    assert model.of_channels[0].has_products
+    assert model.of_channels[0].degree == 2, "not more than needed"
     assert model.is_complete(episode)
     np.testing.assert_allclose(model.noise, STD[key], rtol=0.1)
     stored = ReadingModel.from_json(json.loads(json.dumps(model.to_json())))
