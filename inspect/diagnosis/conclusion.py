@@ -343,7 +343,7 @@ def _lower(title: str) -> str:
 def channels_text(case: Case, cause: Cause) -> str:
     """The channels of a sensor or of the controls that a cause concerns: `` (elbow)``. Empty for all, or without names.
 
-    Those that deviate by at least half as much as the most deviating one.
+    Channels with more than half of the largest deviation.
     """
     task, key = case.inputs.checkpoint.task, cause.component.rpartition(".")[2]
     largest: dict[str, float] = {}
