@@ -13,9 +13,6 @@ from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics.reference_images import HAND
 
-EXPECTED = "reading */*|inverted/*|exchanged/*"
-"""Readings and controls against the expected ones; those of sensors may depend on the controls."""
-
 MODALITIES = ("image", "haptics")
 """Modalities whose measurement models have causes in the catalog."""
 
@@ -61,14 +58,14 @@ def _controls(task: Task) -> tuple[Cause, ...]:
     if not task.control_size or commands_hand(task):
         return ()
     # Updates of single modalities, which stand in for measurements, depend on the prediction.
-    changed = f"{EXPECTED}|lag/dynamics/*|{LABELS}|{DYNAMICS}"
+    changed = f"reading */*|lag/dynamics/*|{LABELS}|{DYNAMICS}"  # expected readings may depend on the controls
     used = Symptom("dynamics slope/*|dynamics spread/*|reading gain/control*", 0, optional=True)
     return (
         Cause(
             "control.delay",
             "Controls delayed",
             (Symptom("reading lag/control/*", unmeasured=(Symptom("lag/dynamics/*", -1),)),),
-            changed,
+            f"inverted/control*|exchanged/control*|{changed}",
             "Synchronise the controls with the sensors.",
             "advance control",
         ),
@@ -91,7 +88,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
             "control.axes",
             "Control channels exchanged",
             (Symptom("exchanged/control*"),),
-            f"opposed/control*|size/control*|{changed}",
+            f"inverted/control*|opposed/control*|size/control*|{changed}",
             "Check the order of the controls.",
             "rearrange control",
         ),
