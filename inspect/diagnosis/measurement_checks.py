@@ -21,6 +21,9 @@ from beliefscope.inspect.trace import Trace
 LIKELIHOODS, PARTICLES = 200, 60
 """Largest numbers of steps and of particles whose likelihoods are compared, evenly spaced."""
 
+KNOWN = 0.5
+"""Smallest share of the particles of a step with expected readings."""
+
 TURNED = 1000
 """Largest number of particles by step whose likelihoods show a jump."""
 
@@ -117,13 +120,15 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
             readings = readings_of(trace.episode, model.key)[steps, None]
             errors.append(model.relative(readings - _expected(trace, model, steps, every)))
         e = np.concatenate(errors, axis=-1)  # (S, P, A)
-        near = (np.abs(e).min(1) < NEAR).all(-1)
+        known = np.asarray(np.isfinite(e).all(-1, keepdims=True))
+        near = (np.where(known, np.abs(e), np.inf).min(1) < NEAR).all(-1) & (known.mean((1, 2)) > KNOWN)
         if near.sum() < MIN_STEPS:
             continue
-        e, steps = e[near], steps[near]
+        e, steps, known = np.where(known, e, 0.0)[near], steps[near], known[near]
         columns = np.concatenate([e, -0.5 * np.square(e)], axis=-1)
         columns, y = (
-            v - v.mean(1, keepdims=True) for v in (columns, likelihood[steps, k][:, every, None].astype(float))
+            known * (v - (known * v).sum(1, keepdims=True) / known.sum(1, keepdims=True))
+            for v in (columns, likelihood[steps, k][:, every, None].astype(float))
         )
         scale = np.maximum(np.abs(columns).max(1, keepdims=True), 1e-12)
         fit = (np.linalg.pinv(columns / scale, rcond=1e-6) @ y / scale.mT)[..., 0]  # (S, 2 A): s b and s

@@ -47,6 +47,9 @@ MORE_FEATURES = 0.99
 CLOSER = 0.8
 """Largest share of the variance that a landmark, or a polynomial, leaves of what simpler features leave."""
 
+MARGIN = 0.1
+"""Distance beyond the values of the record, relative to their range, in which a polynomial is evaluated."""
+
 MAX_STEPS = 20_000
 """Number of steps to which a model is fitted; of more, every second one and so on."""
 
@@ -99,7 +102,7 @@ class Rows:
         self.features, self.readings = inputs[steps], readings_of(episode, key)[steps]
         self.states = states_of(episode)[steps]
         self.places = positions(episode.task, self.states)
-        self.monomials = {degree: monomials(episode, key != CONTROL, degree)[steps] for degree in DEGREES}
+        self.monomials = {degree: monomials(episode, key != CONTROL, degree)[steps] for degree in (1, *DEGREES)}
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,16 @@ class _Fitted:
         noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
         fit = self.option.channel, self.coefficients, self.constants, self.option.heading, self.landmark
         spread = float(self.option.slopes(rows, self.errors).std())
-        return ChannelModel(*fit, noise, bias, self.degree, spread)
+        return ChannelModel(*fit, noise, bias, self.degree, spread, _limits(rows, self.degree))
+
+
+def _limits(rows: Sequence[Rows], degree: int) -> Array:
+    """(2, V) range of the values of monomials, with a margin; V is 0 without any."""
+    if not degree:
+        return np.empty((2, 0))
+    values = np.concatenate([row.monomials[1] for row in rows])
+    low, high = values.min(0), values.max(0)
+    return np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)])
 
 
 def _options(episodes: Sequence[Episode], key: str) -> list[Option]:

@@ -7,7 +7,7 @@ exchanged, a gain, a bias, and a delay behind the labels.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -89,6 +89,7 @@ class ChannelModel:
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
         degree: of the ``monomials`` that are the features; 0 for others.
         gain_spread: standard deviation between these episodes of the slope of the readings on the expected ones.
+        limits: (2, V) range of the V values that the monomials are products of: a polynomial is not extrapolated.
     """
 
     index: int
@@ -100,16 +101,23 @@ class ChannelModel:
     bias: float
     degree: int = 0
     gain_spread: float = 0.0
+    limits: Array = field(default_factory=lambda: np.empty((2, 0)))
 
     @property
     def is_angle(self) -> bool:
         return len(self.constants) > 1
 
     def expected(self, inputs: Array, states: Array, places: Array) -> Array:
-        """(T,) from features (T, F), states (T, n) and positions (T, p); angles are continuous."""
+        """(T,) from features (T, F), states (T, n) and positions (T, p); NaN outside of the limits.
+
+        Angles are continuous.
+        """
         own = landmark_features(places, self.landmark) if len(self.landmark) else inputs
         columns = own @ self.coefficients + self.constants
-        return np.unwrap(angle_of(columns, states, self.heading)) if self.is_angle else columns[:, 0]
+        result = np.unwrap(angle_of(columns, states, self.heading)) if self.is_angle else columns[:, 0]
+        low, high = self.limits
+        values = inputs[:, : len(low)]
+        return np.where(((values < low) | (values > high)).any(1), np.nan, result)
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -127,6 +135,7 @@ class ChannelModel:
             "bias": float(f"{self.bias:.{DIGITS}g}"),
             "degree": self.degree,
             "gain_spread": float(f"{self.gain_spread:.{DIGITS}g}"),
+            "limits": [rounded(row) for row in self.limits],
         }
 
     @classmethod
@@ -137,11 +146,10 @@ class ChannelModel:
         if coefficients.ndim != 2 or len(coefficients) not in (1, 2) or constants.shape != (len(coefficients),):
             raise ValueError(f"coefficients {coefficients.shape}, constants {constants.shape}")
         noise, bias = float(value["noise"]), float(value["bias"])
-        new = (
-            int(value.get("degree", 0)),
-            float(value.get("gain_spread", 0.0)),
-        )  # absent in records of earlier versions
-        return cls(int(value["index"]), coefficients.T, constants, heading, landmark, noise, bias, *new)
+        degree, spread = int(value.get("degree", 0)), float(value.get("gain_spread", 0.0))  # absent in earlier versions
+        limits = np.array(value.get("limits", [[], []]), dtype=np.float64)
+        own = coefficients.T, constants, heading, landmark, noise, bias, degree, spread, limits
+        return cls(int(value["index"]), *own)
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,18 @@ def test_polynomials_leave_the_noise(key: str) -> None:
     assert reading_statistics(gained, [model])[f"reading gain/{key}/all"] == pytest.approx(1.2, abs=0.03)
 
 
+def test_polynomials_are_not_extrapolated() -> None:
+    model, episode = models()["motor"], drive(100)
+    low, high = model.of_channels[0].limits
+    values = np.concatenate([episode.states, episode.controls], axis=1)
+    assert (low < values.min(0)).all()
+    assert (high > values.max(0)).all()
+    controls = np.where(np.arange(len(episode))[:, None] < 5, high[2] + 0.1, episode.controls)
+    outside = replace(episode, controls=controls.astype(np.float32))
+    assert np.flatnonzero(np.isnan(model.expected(outside)[:, 0])).tolist() == [0, 1, 2, 3, 4]
+    assert model.compare(outside).present.sum() == len(episode) - 5
+
+
 def test_the_controls_do_not_explain_themselves() -> None:
     assert CONTROL not in models(), "nothing else does"
 
