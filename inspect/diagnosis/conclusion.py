@@ -352,7 +352,7 @@ def channels_text(case: Case, cause: Cause) -> str:
             largest.setdefault(channel[1].name.removeprefix(f"{key} "), abs(alarm.t))
     limit = 0.5 * max(largest.values(), default=0.0)
     own = [channel.name for channel in task.channels.get(key, ()) if largest.get(channel.name, 0.0) > limit]
-    return f" ({', '.join(own)})" if 0 < len(own) < len(task.channels[key]) else ""
+    return f" ({', '.join(map(display_name, own))})" if 0 < len(own) < len(task.channels[key]) else ""
 
 
 def _when(case: Case, candidate: Candidate) -> str:
