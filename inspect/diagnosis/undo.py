@@ -25,7 +25,7 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo, without_sensor
-from beliefscope.inspect.diagnosis.undo_readings import READINGS, advance, rearrange
+from beliefscope.inspect.diagnosis.undo_readings import READINGS, advance, rearrange, scale, tare
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 MIN_SLOPE = 0.2
@@ -282,6 +282,8 @@ BY_SUBJECT: dict[str, Callable[[str, RunInputs, Deviations], RunInputs | None]] 
     "shift": shift,
     "advance": advance,
     "rearrange": rearrange,
+    "scale": scale,
+    "tare": tare,
 }
 """Interventions that are followed by a modality or sensor."""
 

@@ -27,12 +27,15 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     lever,
 )
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
-from beliefscope.inspect.statistics.reading_model import CONTROL
+from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, wrapped
 
 CLEARLY = 2.0
 """Ratio of the force in contact to its 90 % quantile without contact."""
+
+SMALLEST_GAIN = 0.01
+"""Smallest slope of readings on the expected ones by which they are divided."""
 
 NUDGE = 1e-3
 """m: step of the difference quotient of the camera's map."""
@@ -145,10 +148,13 @@ def expose_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
 
 
 def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Force or torque without its excess level in free motion; that of some steps only is removed from these."""
+    """Force or torque without its excess level in free motion; that of some steps only is removed from these.
+
+    Other sensors without their mean error from the expected readings.
+    """
     levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
     if None in levels:
-        return None
+        return _as_expected(key, inputs, lambda readings, expected: np.ones(readings.shape[1]))
 
     def unbiased(readings: NDArray[Any], episode: Episode) -> NDArray[Any]:
         free = free_motion(episode) & episode.present(key)
@@ -163,6 +169,48 @@ def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
         return readings
 
     return _with_readings(inputs, key, unbiased)
+
+
+def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
+    """Readings without their mean error from the expected ones, and divided by their slope on these."""
+
+    def slope(readings: Array, expected: Array) -> Array:
+        around = expected - expected.mean(0)
+        return np.asarray((around * readings).sum(0) / np.maximum(np.square(around).sum(0), 1e-24))
+
+    return _as_expected(key, inputs, slope)
+
+
+def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], Array]) -> RunInputs | None:
+    """Readings (z - c) / g, which agree with the expected ones in the mean of the affected episodes.
+
+    None without a model of the sensor, and for a gain of about 0.
+
+    Args:
+        gain_of: g (A,) from readings and expected readings (S, A).
+    """
+    if (model := _reading_model(key, inputs)) is None:
+        return None
+    pairs = (model.compare(inputs.episodes[index]).pairs() for index in inputs.affected)
+    readings, expected = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+    gain = gain_of(readings, expected) if len(readings) >= MIN_STEPS else np.zeros(1)
+    if (np.abs(gain) < SMALLEST_GAIN).any():
+        return None
+    offset, channels = readings.mean(0) - gain * expected.mean(0), list(model.channels)
+
+    def restored(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
+        result = values.copy()
+        own = (values[:, channels] - offset) / gain
+        result[:, channels] = np.where(model.is_angle, wrapped(own), own)
+        return result
+
+    return _with_readings(inputs, key, restored)
+
+
+def _reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:
+    """The healthy record's model of a sensor; None if the labels explain none of its channels."""
+    readings = () if inputs.healthy is None else inputs.healthy.readings
+    return next((model for model in readings if model.key == key and model.channels), None)
 
 
 def detrend_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -202,12 +250,10 @@ def permute_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
 
 def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings with the order and the signs of channels that best agree with the labels; None if they have them."""
-    readings = () if inputs.healthy is None else inputs.healthy.readings
-    model = next((model for model in readings if model.key == key and model.channels), None)
+    if (model := _reading_model(key, inputs)) is None:
+        return None
     from scipy.optimize import linear_sum_assignment  # takes most of a second
 
-    if model is None:
-        return None
     affected = (inputs.episodes[index] for index in inputs.affected)
     total = np.sum([delayed_errors(model.compare(episode), episode.dt)[1] for episode in affected], axis=0)
     if not np.isfinite(total).all():

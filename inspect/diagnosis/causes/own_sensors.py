@@ -91,9 +91,9 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     gain = (Symptom(of("size"), 0, otherwise=slope), Symptom(of("noise"), 0, otherwise=slope))
     rough = f"{scaled}|{of('roughness', 'stuck')}"
     entries = (
-        ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor."),
-        ("bias", "biased", bias, of(*BIASED, *delays), "Tare the sensor."),
-        ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor."),
+        ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor.", ""),
+        ("bias", "biased", bias, of(*BIASED, *delays), "Tare the sensor.", f"tare {key}|"),
+        ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor.", f"scale {key}|"),
     )
     return [
         Cause(
@@ -102,9 +102,9 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             symptoms,
             f"{changed}|{_downstream(modality)}",
             action,
-            f"drop {modality}",
+            f"{undo}drop {modality}",
         )
-        for mechanism, words, symptoms, changed, action in entries
+        for mechanism, words, symptoms, changed, action, undo in entries
     ]
 
 

@@ -179,6 +179,25 @@ def test_wrong_channels_are_put_back() -> None:
     assert undo("rearrange wrench", replace(inputs, healthy=None), {}) is None
 
 
+@pytest.mark.parametrize(
+    ("name", "fault", "tolerance"),
+    [("tare wrench", "sensor_bias=wrench:offset=3", 0.2), ("scale wrench", "sensor_gain=wrench:factor=3", 0.2)],
+)
+def test_biases_and_gains_are_undone_by_the_expected_readings(name: str, fault: str, tolerance: float) -> None:
+    """Up to the mean error of an episode, in standard deviations of the readings; other episodes stay as they are."""
+    profile = HealthyProfile("peg", len(record().rows), None, {}, record().reference, record().readings)
+    episode = slide(50)
+    wrong = Faults.parse(fault).apply(episode, 0)
+    inputs = RunInputs(STILL, {0: wrong, 1: wrong}, 1, frozenset({0}), healthy=profile)
+    result = undo(name, inputs, {})
+    assert result is not None
+    readings, true = result.episodes[0].observations["wrench"], episode.observations["wrench"]
+    assert (np.abs(readings - true).max(0) < tolerance * true.std(0)).all()
+    assert (np.abs(wrong.observations["wrench"] - true).max(0) > 2.0 * tolerance * true.std(0)).any()
+    assert result.episodes[1] is wrong
+    assert undo(name, replace(inputs, healthy=None), {}) is None
+
+
 def test_scaled_controls_are_divided_by_their_factor() -> None:
     wrong = Faults.parse("control_scale=-2").apply(slide(0), 0)
     inputs = RunInputs(STILL, {0: wrong}, 1, frozenset({0}))
