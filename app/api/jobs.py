@@ -29,8 +29,9 @@ def add_routes(app: FastAPI, jobs: Jobs) -> None:
         return JobWithLog(**asdict(jobs[id]), log=jobs.log(id))
 
     @app.delete("/api/jobs/{id}")
-    def cancel_job(id: str) -> Job:
-        return jobs.cancel(id)
+    def cancel_job(id: str, only_active: bool = False) -> Job:
+        """Cancels an active job, or deletes an ended one: a page that displays it as active wants only the former."""
+        return jobs.cancel(id, only_active)
 
     @app.get("/api/jobs/{id}/result")
     def job_result(id: str) -> FileResponse:

@@ -206,15 +206,15 @@ class Jobs:
             begun.wait()
         return self[id]
 
-    def cancel(self, id: str) -> Job:
-        """Cancel an active job; delete an ended one with its files. Raises NotFound."""
+    def cancel(self, id: str, only_active: bool = False) -> Job:
+        """Cancel an active job; delete an ended one with its files, unless ``only_active``. Raises NotFound."""
         with self._lock:
             job = self[id]
             if job.state == "waiting":
                 self._end(job, "cancelled")
             elif job.state == "running":
                 self._stop(id, "cancelled")
-            else:
+            elif not only_active:
                 self._delete(id)
                 return job
             return self._jobs[id]

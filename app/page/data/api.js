@@ -400,11 +400,13 @@ export const jobs = () => get('/api/jobs');
 export const job = (id) => get(path(['jobs', id]));
 
 /**
- * Cancels a waiting or running job; removes a finished one.
+ * Cancels a waiting or running job; removes a finished one, unless only active jobs are meant.
  * @param {string} id
+ * @param {boolean} onlyActive
  * @returns {Promise<Job>}
  */
-export const cancelJob = (id) => send(path(['jobs', id]), undefined, 'DELETE');
+export const cancelJob = (id, onlyActive) =>
+  send(path(['jobs', id], { only_active: String(onlyActive) }), undefined, 'DELETE');
 
 /** @typedef {{events: number[], slow: boolean, pdf: boolean, title: string}} ReportOptions */
 

@@ -39,6 +39,9 @@ export class Finetune {
   #lastJob = ''; // state of the run's job as JSON
   #open = false;
   #loading = new AbortController();
+  /** @type {Promise<void>} */
+  #current = Promise.resolve();
+  #waits = false; // for the end of the current loading
 
   /**
    * @param {HTMLElement} host
@@ -79,7 +82,11 @@ export class Finetune {
   }
 
   /** Loads the options of the selected filter, and the selected run. */
-  async load() {
+  load() {
+    this.#current = this.#load();
+  }
+
+  async #load() {
     if (!this.#open) return;
     const { task, filter, data, episode, faults, run } = this.#store.state;
     const key = JSON.stringify([task, filter, data, ...(run ? [] : [episode, faults])]);
@@ -156,7 +163,16 @@ export class Finetune {
     const job = JSON.stringify(list.find((item) => item.id === id) ?? null);
     if (!this.#open || !this.#run || job === this.#lastJob) return;
     this.#lastJob = job;
-    if (!isActive(list.find((item) => item.id === id))) this.#offerKey = ''; // a run has ended
+    this.#reload();
+  }
+
+  /** Loads again after the current loading, which the frequent changes of a job would never let end on a slow machine. */
+  async #reload() {
+    if (this.#waits) return;
+    this.#waits = true;
+    await this.#current;
+    this.#waits = false;
+    if (!isActive(this.#jobs.find(this.#run?.job?.id))) this.#offerKey = ''; // a run has ended
     this.load();
   }
 

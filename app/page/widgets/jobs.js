@@ -106,11 +106,12 @@ export class Jobs {
   }
 
   /**
-   * Cancels an active job, or removes one that has ended.
+   * Cancels an active job, or removes one that is displayed as ended: a job may end just before it is cancelled.
    * @param {string} id
    */
   async cancel(id) {
-    await api.cancelJob(id).catch(() => {}); // already removed
+    const job = this.find(id);
+    await api.cancelJob(id, !job || isActive(job)).catch(() => {}); // already removed
     await this.refresh();
   }
 

@@ -134,6 +134,8 @@ def test_progress_and_cancellation(open_jobs: OpenJobs, tmp_path: Path) -> None:
     jobs.cancel(job.id)
     assert (wait_for(jobs, job.id).state, jobs[job.id].remaining) == ("cancelled", None)
     wait_until(lambda: not any(map(is_alive, pids)))
+    assert jobs.cancel(job.id, only_active=True).state == "cancelled"
+    assert [each.id for each in jobs.all()] == [job.id], "a job that ended just before stays"
     jobs.cancel(job.id)  # deletes an ended job
     assert jobs.all() == []
     assert not (tmp_path / "jobs" / job.id).exists()
