@@ -160,13 +160,8 @@ def _absent_updates(trace: Trace) -> dict[str, float]:
     assert trace.log_likelihood is not None
     values = {}
     for k, modality in enumerate(trace.modalities):
-        keys = trace.task.modalities.get(modality, ())
-        absent = (
-            np.logical_and.reduce([~trace.episode.present(key) for key in keys]) & measures.counted(trace)
-            if keys
-            else None
-        )
-        if absent is not None and absent.any():
+        absent = measures.absent(trace, modality) & measures.counted(trace)
+        if absent.any():
             used = np.ptp(trace.log_likelihood[absent, k], axis=-1) > NO_EVIDENCE
             values[f"absent updates/{modality}/all"] = float(used.mean())
     return values

@@ -8,7 +8,7 @@ import numpy as np
 
 from beliefscope.inspect.diagnosis.vector_checks import angle_channels
 from beliefscope.inspect.statistics.innovations import channel_names, innovations, prediction
-from beliefscope.inspect.statistics.measures import Array, Mask, counted
+from beliefscope.inspect.statistics.measures import Array, Mask, absent, counted
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN
 from beliefscope.inspect.trace import Trace
 
@@ -41,10 +41,8 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     for k, modality in enumerate(trace.modalities):
         updated = np.asarray(accepted[:, k].any(-1))
         values[f"updates/{modality}/all"] = float(updated.mean())
-        keys = trace.task.modalities.get(modality, ())
-        absent = np.logical_and.reduce([~trace.episode.present(key)[keep] for key in keys]) if keys else None
-        if absent is not None and absent.any():
-            values[f"absent updates/{modality}/all"] = float(updated[absent].mean())
+        if (without := absent(trace, modality)[keep]).any():
+            values[f"absent updates/{modality}/all"] = float(updated[without].mean())
         channels = np.flatnonzero(used[:, k].sum(0) >= MIN_STEPS)
         if not len(channels):
             continue

@@ -148,6 +148,12 @@ def counted(trace: Trace) -> Mask:
     return np.arange(len(trace)) >= trace.task.first_counted(len(trace))
 
 
+def absent(trace: Trace, modality: str) -> Mask:
+    """(T,): steps without a reading of any sensor of a modality; none of a modality without sensors."""
+    present = [trace.episode.present(key) for key in trace.task.modalities.get(modality, ())]
+    return ~np.logical_or.reduce(present) if present else np.zeros(len(trace), dtype=bool)
+
+
 def phases(trace: Trace) -> dict[str, Mask]:
     """Phase -> mask (T,) without warm-up steps: ``all``, groups of the task's covariates, and ``blackout``.
 
