@@ -8,7 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
 
 Run = Callable[..., tuple[int, str, str]]
+
+# One thread of PyTorch and NumPy, also in started processes: threads of parallel tests wait for each other's cores.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 ROOT = Path(__file__).resolve().parents[1]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -62,19 +65,6 @@ def pytest_collection_finish() -> None:
 def pytest_sessionfinish() -> None:
     if "duckdb" in sys.modules:
         gc.unfreeze()  # at exit, DuckDB reports objects that are never freed
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    """One thread of PyTorch, also in started processes: the threads of parallel tests wait for each other's cores."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("OMP_NUM_THREADS", "1")
-        yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(autouse=True)

@@ -41,7 +41,7 @@ def part(run: Trace, first: int, last: int) -> Trace:
     )
 
 
-@pytest.fixture(scope="module", params=["crossmodal-ekf", "crossmodal-pf"])
+@pytest.fixture(scope="module", params=[pytest.param("crossmodal-ekf", marks=pytest.mark.long), "crossmodal-pf"])
 def full_trace(request: pytest.FixtureRequest) -> Trace:
     checkpoint = load_checkpoint(pretrained_path("door", request.param))
     with open_dataset(sample_path("door")) as data:

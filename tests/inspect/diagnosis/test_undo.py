@@ -94,7 +94,7 @@ def inverted(filter_: Any) -> None:
     [
         ("crossmodal-ekf", biased, "shift image"),
         pytest.param("crossmodal-ekf", overconfident, "rescale image", marks=pytest.mark.long),
-        ("crossmodal-ekf", noisy, "rescale process noise"),
+        pytest.param("crossmodal-ekf", noisy, "rescale process noise", marks=pytest.mark.long),
         pytest.param("crossmodal-pf", noisy, "rescale process noise", marks=pytest.mark.long),
         ("crossmodal-ekf", inverted, "invert beta"),
         pytest.param("crossmodal-pf", inverted, "invert beta", marks=pytest.mark.long),
