@@ -23,6 +23,8 @@ Run = Callable[..., tuple[int, str, str]]
 # One thread of PyTorch and NumPy, also in started processes: threads of parallel tests wait for each other's cores.
 os.environ["OMP_NUM_THREADS"] = "1"
 
+gc.disable()  # until all tests are collected, which creates many objects and frees few
+
 ROOT = Path(__file__).resolve().parents[1]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -60,6 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Excludes the imported modules and the collected tests from garbage collections: 7 % of the CPU time."""
     gc.freeze()
+    gc.enable()
 
 
 def pytest_sessionfinish() -> None:
