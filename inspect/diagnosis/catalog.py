@@ -22,6 +22,7 @@ from beliefscope.inspect.diagnosis.causes import (
     particles,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
+from beliefscope.inspect.diagnosis.dynamics_checks import has_true_starts
 from beliefscope.inspect.statistics.reference_images import HAND
 
 CAUSES: tuple[Cause, ...] = (
@@ -53,7 +54,8 @@ def causes_in(checkpoint: Checkpoint) -> tuple[Cause, ...]:
     """All causes of a filter: those of its task, and those of external filters only."""
     causes = causes_of(checkpoint.task)
     if isinstance(checkpoint, ExternalFilter):
-        return tuple(map(in_predictions, (*causes, *external_causes(checkpoint.task))))
+        starts = has_true_starts(checkpoint)
+        return tuple(in_predictions(cause, starts) for cause in (*causes, *external_causes(checkpoint.task)))
     return causes
 
 

@@ -83,11 +83,11 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
         nu: (T, K, m) innovations. s: (T, K, m, m) their covariance.
     """
     predicted = prediction(trace)
-    if predicted is None or predicted[1] is None or not trace.has_covariance:
+    if predicted is None or predicted.covariance is None or not trace.has_covariance:
         return {}
     used = accepted_channels(trace, np.isfinite(nu))
     s = np.where(used[..., :, None] & used[..., None, :], s, np.eye(nu.shape[-1]))
-    before, after = predicted[1], trace.estimate_covariance.astype(np.float64)
+    before, after = predicted.covariance, trace.estimate_covariance.astype(np.float64)
     (sign_s, of_s), (sign, of_before), (sign_after, of_after) = map(np.linalg.slogdet, (s, before, after))
     channels = used.sum(-1)  # (T, K)
     keep = counted(trace) & (sign_s > 0).all(-1) & (sign > 0) & (sign_after > 0) & (channels.sum(-1) > 0)

@@ -73,7 +73,7 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
     if trace.innovation is None or predicted is None or trace.task.rotations:
         return {}
     count = len(trace.modalities)
-    means = np.repeat(predicted[0][:, None], count, axis=1) if trace.predicted_mean is None else trace.predicted_mean
+    means = np.repeat(predicted.mean[:, None], count, axis=1) if trace.predicted_mean is None else trace.predicted_mean
     keep = counted(trace)
     values: dict[str, float] = {}
     for k in range(count):

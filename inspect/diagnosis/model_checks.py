@@ -6,32 +6,28 @@ Measurement models are compared with the true state of their step; the dynamics 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import Task, axis_name
+from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.models.dynamics import Dynamics
-from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
+from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
-from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.reading_model import ReadingModel
-from beliefscope.inspect.statistics.signals import lag
 from beliefscope.inspect.trace import Trace
 
 EVERY = 4
@@ -52,12 +48,6 @@ POWER = 10.0
 LARGEST = 0.9999
 """Largest absolute log-odds of fusion weights, as a share of the network's bound."""
 
-MIN_PATH = 0.3
-"""Minimum path of a component for a slope of the dynamics, in standard deviations of the training data."""
-
-ROUNDING = 1e-12
-"""Largest variance that a prediction adds by rounding, relative to that of the states."""
-
 MIN_STEPS = 10
 """Minimum number of steps of a statistic."""
 
@@ -67,16 +57,14 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
 
     Statistics that do not apply are absent, such as those of measurement functions without models of the readings.
     """
-    has_truth, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
     if isinstance(checkpoint, ExternalFilter):
         values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
         values |= measurement_model_statistics(trace, readings) | jacobian_statistics(trace, checkpoint)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
-    if has_truth:
+    if np.isfinite(trace.episode.states).all():
         values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
-    if has_truth:
-        values |= reported_dynamics_statistics(trace) if external else dynamics_statistics(trace.episode, checkpoint)
+        values |= dynamics_statistics(trace, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
@@ -197,92 +185,6 @@ def proposal(n: int) -> tuple[Tensor, Tensor]:
     offsets = (unit * scales[:, None, None]).flatten(0, 1)
     log_each = -0.5 * (offsets.unsqueeze(1) / scales[:, None]).square().sum(-1) - n * scales.log()
     return offsets, torch.logsumexp(log_each, dim=-1) - math.log(len(SCALES)) - 0.5 * n * math.log(2.0 * math.pi)
-
-
-@torch.no_grad()
-def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, float]:
-    """Of the dynamics model from the true previous state, by component, with residual r and process noise q.
-
-    ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2, where the q of an information filter
-    grows with the motion. ``dynamics slope``: slope of the
-    predicted on the true change, for components that move enough. ``dynamics bias`` and ``dynamics spread``: mean and
-    standard deviation of r that the slope does not explain. ``process noise``: q. ``lag/dynamics``: steps by which the
-    true changes follow the predicted ones. ``opposed/control``, of controls that do not command a measured hand:
-    log-ratio of the size of r to that with the opposite sign of the channel; 0 if the present sign fits better.
-    """
-    filter_ = checkpoint.filter
-    if not isinstance(getattr(filter_, "dynamics", None), Dynamics) or len(episode) < MIN_STEPS:
-        return {}
-    si = filter_.statistics
-    states = si.standardise("state", torch.from_numpy(episode.states))
-    controls = si.standardise("control", torch.from_numpy(episode.controls))
-    before, after = states[:-1], states[1:]
-    predicted = filter_.dynamics(before, filter_.dynamics.control_part(controls[1:]))
-    std = si.mean_std("state")[1].double().numpy()
-    noise = filter_.dynamics.noise.double().numpy() * std
-    used = (
-        filter_.process_noise(predicted - before) if isinstance(filter_, InformationFilter) else filter_.dynamics.noise
-    )
-    residual = measures.wrapped(filter_.task, (predicted - after).double().numpy() * std)
-    change = measures.wrapped(filter_.task, (after - before).double().numpy() * std)
-    nis = (np.square(residual) / (used.double().numpy() * std) ** 2).mean(0)
-    values = _of_changes(filter_.task, residual, change, {"dynamics nis": nis, "process noise": noise}, std)
-    if commands_hand(episode.task):
-        return values
-    signs = 1.0 - 2.0 * torch.eye(controls.shape[1])[:, None]
-    controls = si.standardise("control", signs * torch.from_numpy(episode.controls[1:]))
-    opposite = filter_.dynamics(before, filter_.dynamics.control_part(controls))
-    other = measures.wrapped(filter_.task, (opposite - after).double().numpy() * std)
-    moved = np.abs(change).sum(0) > MIN_PATH * std
-    size, sizes = (np.square((r / std)[..., moved]).sum((-2, -1)) for r in (residual, other))
-    for i, ratio in enumerate(size / np.maximum(sizes, 1e-12)):
-        values[f"opposed/{axis_name('control', i, len(signs))}/all"] = 0.5 * math.log(max(ratio, 1.0))
-    return values
-
-
-def reported_dynamics_statistics(trace: Trace) -> dict[str, float]:
-    """Those of ``dynamics_statistics`` from the predictions of an external filter, which start at its estimates.
-
-    The process noise is what a prediction adds to the variance of the estimate. ``dynamics offset``: mean residual,
-    which differs between episodes if the filter does not estimate a bias.
-    """
-    belief = prediction(trace)
-    states, task = trace.episode.states.astype(np.float64), trace.task
-    keep = measures.counted(trace)[1:]
-    if belief is None or task.rotations or keep.sum() < MIN_STEPS:
-        return {}
-    mean, covariance = belief
-    predicted = task.difference(mean[1:], trace.estimate_mean[:-1].astype(np.float64))[keep]
-    change = task.difference(states[1:], states[:-1])[keep]
-    residual = measures.wrapped(task, predicted - change)
-    more: dict[str, Array] = {"dynamics offset": residual.mean(0)}
-    if covariance is not None and trace.has_covariance:
-        added = covariance[1:] - trace.estimate_covariance[:-1].astype(np.float64)
-        variance = np.median(np.diagonal(added, axis1=-2, axis2=-1)[keep], axis=0)
-        variance = np.where(variance > ROUNDING * np.square(states.std(0)), variance, np.nan)
-        more |= {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
-    return _of_changes(task, residual, change, more, states.std(0))
-
-
-def _of_changes(task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array) -> dict[str, float]:
-    """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,)."""
-    values: dict[str, float] = {}
-    moved = np.abs(change).sum(0) > MIN_PATH * std
-    centred, around = residual - residual.mean(0), change - change.mean(0)
-    excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
-    columns = {
-        "dynamics bias": residual.mean(0) - excess * change.mean(0),
-        "dynamics error": np.sqrt(np.square(residual).mean(0)),
-        "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
-        "dynamics spread": (centred - excess * around).std(0),
-    }
-    for kind, column in {**columns, **more}.items():
-        for component, value in zip(task.components, column, strict=True):
-            values[f"{kind}/{component.name}/all"] = float(value)
-    if moved.any():
-        scaled = (change + residual)[:, moved] / std[moved], change[:, moved] / std[moved]
-        values["lag/dynamics/all"] = lag(scaled[1], scaled[0])[0]
-    return values
 
 
 def weight_statistics(trace: Trace) -> dict[str, float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,14 +18,18 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference
 
 Array = NDArray[np.float64]
 
-FORMAT = 2
-"""Version 1 had no reference and no statistics of sensors and modules; it is still read."""
+FORMAT = 3
+"""Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 has other ``AT_ESTIMATES``."""
+
+AT_ESTIMATES = ("dynamics ", "process noise/", "measurement jacobian/", "prediction jacobian/", "correction slope/")
+"""Statistics of external filters that were those of its run; now those of its single steps from true states."""
 SUFFIX = ".profile.json"
 """Of the file beside a pretrained checkpoint."""
 SENSORS_SUFFIX = ".sensors.json"
@@ -74,8 +78,8 @@ class HealthyProfile:
     def from_json(cls, document: Any) -> HealthyProfile:
         """Inverse of ``to_json``. Raises BadInput for another format or malformed values."""
         try:
-            if document["format"] not in (1, FORMAT):
-                raise BadInput(f"healthy record of format {document['format']!r}; this version reads 1 and {FORMAT}")
+            if document["format"] not in (1, 2, FORMAT):
+                raise BadInput(f"healthy record of format {document['format']!r}; this version reads 1 to {FORMAT}")
             count, particles = int(document["episodes"]), document["particles"]
             rows = {
                 str(name): np.array([np.nan if value is None else value for value in values], dtype=np.float64)
@@ -99,7 +103,13 @@ class HealthyProfile:
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:
     """Profile of a checkpoint, or None; see ``profile_document``. Raises BadInput if it is malformed."""
     document = profile_document(task, filter_, checkpoint_hash, checkpoint)
-    return None if document is None else HealthyProfile.from_json(document)
+    if document is None:
+        return None
+    profile = HealthyProfile.from_json(document)
+    if document["format"] == FORMAT or not isinstance(checkpoint, ExternalFilter):
+        return profile
+    kept = {name: v for name, v in profile.statistics.items() if not name.startswith(AT_ESTIMATES)}
+    return replace(profile, statistics=kept)
 
 
 def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> Any:

@@ -198,7 +198,8 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
     ``correction slope``, by modality: of ``correction_slopes``.
     """
-    repeated = None if why_not(trace, checkpoint) else repeat_steps(trace, checkpoint)
+    has_truth = bool(np.isfinite(trace.episode.states).all())
+    repeated = None if why_not(trace, checkpoint) else repeat_steps(trace, checkpoint, at_truth=has_truth)
     if repeated is None:
         return {}
     components = [component.name for component in trace.task.components]

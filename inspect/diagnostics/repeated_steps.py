@@ -58,21 +58,26 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     return None
 
 
-def repeat_steps(trace: Trace, checkpoint: ExternalFilter) -> RepeatedSteps | None:
+def repeat_steps(trace: Trace, checkpoint: ExternalFilter, at_truth: bool = False) -> RepeatedSteps | None:
     """Steps of an episode, by one call of the filter or, if its first call does not predict, by two.
 
     Without steps of different results, from another state than the belief; None if all have them, or if the filter
     fails. Its properties must allow it (``why_not``).
+
+    Args:
+        at_truth: from beliefs with the true states as means, where functions are as curved as in other episodes,
+            although the filter may have lost the state.
     """
     steps = _steps(trace)
     if not len(steps):
         return None
     for calls in (1, 2):
         try:
-            repeated = RepeatedSteps(trace, checkpoint, steps, calls)
+            repeated = RepeatedSteps(trace, checkpoint, steps, calls, beliefs=1 if at_truth else None)
             same = repeated.are_same(trace)
             if same.any():
-                return repeated if same.all() else RepeatedSteps(trace, checkpoint, steps[same], calls)
+                known = same.all() and not at_truth
+                return repeated if known else RepeatedSteps(trace, checkpoint, steps[same], calls, at_truth)
         except (BadInput, KeyError):  # the filter refuses a changed belief, or does not report all values
             return None
     return None
@@ -100,23 +105,34 @@ class RepeatedSteps:
 
     Attributes:
         mean: (J, B, n) predictions. covariance: (J, B, n, n) of these.
+        prior_mean, prior_covariance: (J, B, K, n), (J, B, K, n, n) before each update: predictions, or updated before.
         innovation: (J, B, K, m), NaN without a measurement; K = 0 if they are not reported. size: (J, B, K, m, m) their
             covariance, 0 without a measurement.
         correction, posterior: (J, n) and (J, n, n), from the filter's own belief.
         before: (J, n, n) covariance of the filter's own belief before the calls. calls: their number.
     """
 
-    def __init__(self, trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], calls: int) -> None:
-        """Raises BadInput if the filter fails."""
+    def __init__(
+        self,
+        trace: Trace,
+        checkpoint: ExternalFilter,
+        steps: NDArray[np.intp],
+        calls: int,
+        at_truth: bool = False,
+        beliefs: int | None = None,
+    ) -> None:
+        """At the estimates or the true states, from all beliefs or the first few. BadInput if the filter fails."""
         self.steps, self.task, n = steps, trace.task, len(trace.task.components)
         before, covariance = _beliefs(trace, steps - 1, calls == 1)
+        before = trace.episode.states[steps - 1].astype(np.float64) if at_truth else before
         self.before, self.calls = covariance, calls
         variance = np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
         smallest = SMALLEST_SHIFT * np.maximum(np.abs(before).max(0), 1e-6)
         self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
         unit, none = np.eye(n), np.zeros((n + 1, n))
-        shifts = np.concatenate([none[:1], unit, -unit, none]) * self.shift[:, None]  # (J, B, n)
-        grown = np.concatenate([none, none[1:], unit, unit.sum(0, keepdims=True)]) * np.sqrt(self.growth)[:, None]
+        shifts = np.concatenate([none[:1], unit, -unit, none])[:beliefs] * self.shift[:, None]  # (J, B, n)
+        grown = np.concatenate([none, none[1:], unit, unit.sum(0, keepdims=True)])[:beliefs]
+        grown = grown * np.sqrt(self.growth)[:, None]
         start = Gaussian(
             torch.from_numpy((before[:, None] + shifts).reshape(-1, n)),
             torch.from_numpy((covariance[:, None] + grown[..., None] * grown[..., None, :]).reshape(-1, n, n)),
@@ -124,8 +140,9 @@ class RepeatedSteps:
         episodes = [trace.episode.part(step + 1 - calls, step + 1) for step in steps for _ in range(shifts.shape[1])]
         values, _ = checkpoint.run(episodes, start=start)
         arrays = {k: v[-1].unflatten(0, (len(steps), -1)).double().numpy() for k, v in values.items()}
-        rows, first = np.arange(len(steps)), least_certain(arrays["predicted_covariance"][:, 0])
-        self.mean, self.covariance = (arrays[f"predicted_{name}"][rows, :, first] for name in ("mean", "covariance"))
+        self.prior_mean, self.prior_covariance = arrays["predicted_mean"], arrays["predicted_covariance"]
+        rows, first = np.arange(len(steps)), least_certain(self.prior_covariance[:, 0])
+        self.mean, self.covariance = (a[rows, :, first] for a in (self.prior_mean, self.prior_covariance))
         self.correction = self.task.difference(arrays["estimate_mean"][:, 0], self.mean[:, 0])
         self.posterior = arrays["estimate_covariance"][:, 0]
         self.innovation, self.size = (np.empty((*shifts.shape[:2], *(0,) * axes)) for axes in (2, 3))
@@ -200,9 +217,15 @@ class RepeatedSteps:
 
     @cached_property
     def _measured_growth(self) -> tuple[Array, Array]:
-        """(J, n + 1, K, m, m) growth of the innovations' covariance less that by their derivatives, and the latter."""
-        h, weights = self.measurement_jacobian[:, None], weights_of(self.size[:, :1])
-        expected = h @ self._growth(self.covariance)[:, :, None] @ h.mT
+        """(J, n + 1, K, m, m) growth of the innovations' covariance less that by their derivatives, and the latter.
+
+        Both follow from the belief before the same update, which other updates may have changed.
+        """
+        count = self.innovation.shape[2]
+        means = self.task.difference(self.prior_mean, self.prior_mean[:, :1])[:, :, :count]
+        by_mean, change = (np.moveaxis(self._derivative(x), 1, -1) for x in (self.innovation, means))  # (J, K, ..., n)
+        h, weights = np.nan_to_num(-by_mean @ np.linalg.pinv(change))[:, None], weights_of(self.size[:, :1])
+        expected = h @ self._growth(self.prior_covariance[:, :, :count]) @ h.mT
         return weights * (self._growth(self.size) - expected), weights * expected
 
     def _derivative(self, values: Array) -> Array:

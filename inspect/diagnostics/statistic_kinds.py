@@ -45,7 +45,7 @@ KINDS = {
         0.05,
     ),
     "prediction jacobian": ("error of the Jacobian of the dynamics", False, 0.02),
-    "measurement jacobian": ("error of the Jacobian of the measurement function", False, 0.05),
+    "measurement jacobian": ("error of the Jacobian of the measurement function", False, 0.15),
     "correction slope": ("slope of the corrections{of} on those of a correct update", False, 0.2),
     "innovation turns": ("share of innovations of about a full turn", False, 0.002),
     "updates": ("share of steps with an accepted measurement", False, 0.02),

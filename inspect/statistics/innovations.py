@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.statistics.measures import Array, counted
 from beliefscope.inspect.traces.data import Trace
+
+AnyArray = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -76,22 +79,45 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
     return trace.task.difference(z, predicted), p + r
 
 
-def prediction(trace: Trace) -> tuple[Array, Array | None] | None:
-    """Mean (T, n) and covariance (T, n, n) of the belief before all updates of a step; None if it is not reported.
+@dataclass(frozen=True)
+class Moments:
+    """mean (T, n), covariance (T, n, n), None if unknown."""
+
+    mean: Array
+    covariance: Array | None
+
+
+def prediction(trace: Trace) -> Moments | None:
+    """Moments of the belief before all updates of each step; None if it is not reported, or its particles are not kept.
 
     Of a filter that reports the belief before each of several updates, it is the least certain one, and of a particle
     filter that of the particles with their weights before the observation.
     """
-    if trace.predicted_mean is None:
-        return _predicted_particles(trace)
-    mean = trace.predicted_mean.astype(np.float64)
-    covariance = None if trace.predicted_covariance is None else trace.predicted_covariance.astype(np.float64)
-    if np.allclose(mean, mean[:, :1], rtol=1e-3):
-        return mean[:, 0], None if covariance is None else covariance[:, 0]
-    if covariance is None or not np.isfinite(covariance).all():
+    particles = trace.particles if trace.all_particles_ess is None else None
+    return prediction_of(
+        trace.task, trace.predicted_mean, trace.predicted_covariance, particles, trace.prior_log_weights
+    )
+
+
+def prediction_of(
+    task: Task,
+    mean: AnyArray | None = None,
+    covariance: AnyArray | None = None,
+    particles: AnyArray | None = None,
+    log_weights: AnyArray | None = None,
+) -> Moments | None:
+    """As ``prediction``, from mean (T, K, n) and covariance (T, K, n, n) before each of K updates, or from particles
+    (T, M, n) with their prior log-weights (T, M).
+    """
+    if mean is None:
+        return None if particles is None or log_weights is None else _particle_moments(task, particles, log_weights)
+    means, covariances = mean.astype(np.float64), None if covariance is None else covariance.astype(np.float64)
+    if np.allclose(means, means[:, :1], rtol=1e-3):
+        return Moments(means[:, 0], None if covariances is None else covariances[:, 0])
+    if covariances is None or not np.isfinite(covariances).all():
         return None
-    steps, first = np.arange(len(mean)), least_certain(covariance)
-    return mean[steps, first], covariance[steps, first]
+    steps, first = np.arange(len(means)), least_certain(covariances)
+    return Moments(means[steps, first], covariances[steps, first])
 
 
 def least_certain(covariance: Array) -> NDArray[np.intp]:
@@ -99,16 +125,12 @@ def least_certain(covariance: Array) -> NDArray[np.intp]:
     return np.asarray(np.linalg.slogdet(covariance)[1].argmax(-1))
 
 
-def _predicted_particles(trace: Trace) -> tuple[Array, Array] | None:
-    """Moments of the particles with their prior weights; None without these, or if not all particles are kept."""
-    if trace.particles is None or trace.prior_log_weights is None or trace.all_particles_ess is not None:
-        return None
-    particles, start = trace.particles.astype(np.float64), trace.particles[:, 0].astype(np.float64)
-    weights = np.exp(trace.prior_log_weights.astype(np.float64))
-    from_start = trace.task.difference(particles, start[:, None])  # angles may wrap around
+def _particle_moments(task: Task, particles: AnyArray, log_weights: AnyArray) -> Moments:
+    start, weights = particles[:, 0].astype(np.float64), np.exp(log_weights.astype(np.float64))
+    from_start = task.difference(particles.astype(np.float64), start[:, None])  # angles may wrap around
     mean = np.einsum("tm,tmn->tn", weights, from_start)
     around = from_start - mean[:, None]
-    return start + mean, np.einsum("tm,tmi,tmj->tij", weights, around, around)
+    return Moments(start + mean, np.einsum("tm,tmi,tmj->tij", weights, around, around))
 
 
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:

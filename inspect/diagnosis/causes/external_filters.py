@@ -19,6 +19,12 @@ def _dynamics(*kinds: str) -> str:
 JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*"
 """The derivative of the prediction may include the update of the step before."""
 
+OF_TRUE_STATES = (*(f"dynamics {kind}/" for kind in ("bias", "error", "nis", "slope", "spread")), "process noise/")
+"""Statistics of predictions that start at true states."""
+
+OF_DYNAMICS = ("dynamics", "process_noise", "control", "labels", "data")
+"""Components of causes that change them as well."""
+
 DRIFT = Cause(
     "dynamics.drift",
     "Dynamics biased, differently in each episode",
@@ -63,8 +69,21 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
     )
 
 
-def in_predictions(cause: Cause) -> Cause:
-    """A cause with its consequences in the predictions of an external filter, which start at its estimates."""
+def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
+    """A cause with its consequences in the predictions of an external filter, which start at its estimates.
+
+    has_true_starts: most statistics of the dynamics are of predictions that start at true states, which other parts of
+    the filter, and the sensors, do not change.
+    """
+    cause = _in_predictions_of_run(cause)
+    if not has_true_starts or (cause.component in OF_DYNAMICS and cause.name != JACOBIAN.name):
+        return cause
+    patterns = cause.consequences.replace(DYNAMICS, f"{_dynamics('offset', 'scatter')}|{FILTER}").split("|")
+    kept = (p for p in patterns if not p.startswith(OF_TRUE_STATES))
+    return replace(cause, consequences="|".join(kept))
+
+
+def _in_predictions_of_run(cause: Cause) -> Cause:
     changed = {
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
         "process_noise": _dynamics("bias", "error", "offset", "spread"),

@@ -97,7 +97,7 @@ def test_a_healthy_external_filter_is_healthy() -> None:
 
 
 @pytest.mark.slow
-def test_a_faulty_sensor_is_not_broken_dynamics_although_predictions_start_at_wrong_estimates() -> None:
+def test_a_faulty_sensor_is_not_broken_dynamics() -> None:
     faulty = {seed: Faults.parse("sensor_gain=rear:factor=-1").apply(drive(seed), seed) for seed in range(50, 56)}
     result = diagnose(loaded(Cart(weight=0.5)), faulty, profile=profile())
     probability = {c.cause.name: c.probability for c in result.causes}

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 import beliefscope as bs
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.dynamics_checks import external_dynamics_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
-from beliefscope.inspect.diagnosis.model_checks import reported_dynamics_statistics
 from beliefscope.inspect.diagnosis.vector_checks import stuck
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
@@ -228,8 +228,10 @@ def test_a_sensor_whose_few_readings_are_all_equal_is_stuck() -> None:
 def test_predictions_before_each_update_have_the_statistics_of_those_before_all() -> None:
     shared, separate = run(Boat()), run(Boat(separate=True))
     assert not np.array_equal(shared.predicted_mean, separate.predicted_mean)
-    for statistics in (innovation_statistics, reported_dynamics_statistics):
-        assert statistics(separate) == pytest.approx(statistics(shared), nan_ok=True)
+    assert innovation_statistics(separate) == pytest.approx(innovation_statistics(shared))
+    of_dynamics = external_dynamics_statistics(shared, loaded(Boat()))
+    of_separate = external_dynamics_statistics(separate, loaded(Boat(separate=True)))
+    assert of_separate == pytest.approx(of_dynamics, nan_ok=True)
 
 
 def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None:

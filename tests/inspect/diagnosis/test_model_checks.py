@@ -14,9 +14,9 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.models.pf import MixtureParticleFilter
+from beliefscope.inspect.diagnosis.dynamics_checks import module_dynamics_statistics
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.diagnosis.model_checks import (
-    dynamics_statistics,
     likelihood_moments,
     measurement_statistics,
     model_statistics,
@@ -63,12 +63,12 @@ def test_measurement_statistics_are_moments_of_the_residuals() -> None:
 
 def test_a_bias_of_the_dynamics_changes_only_bias_error_and_nis() -> None:
     checkpoint, _ = run("crossmodal-ekf")
-    before = dynamics_statistics(episode(), checkpoint)
+    before = module_dynamics_statistics(episode(), checkpoint)
     biased = copy.deepcopy(checkpoint.filter)
     forward = biased.dynamics.forward
     std = checkpoint.filter.statistics.mean_std("state")[1]
     biased.dynamics.forward = lambda states, control: forward(states, control) + 0.004 / std
-    after = dynamics_statistics(episode(), replace(checkpoint, filter=biased))
+    after = module_dynamics_statistics(episode(), replace(checkpoint, filter=biased))
     for component in (c.name for c in checkpoint.task.components):
         shift = after[f"dynamics bias/{component}/all"] - before[f"dynamics bias/{component}/all"]
         assert shift == pytest.approx(0.004, rel=1e-3)
@@ -81,7 +81,7 @@ def test_frozen_dynamics_have_slope_zero_and_process_noise_is_reported() -> None
     checkpoint, _ = run("crossmodal-ekf")
     frozen = copy.deepcopy(checkpoint.filter)
     frozen.dynamics.forward = lambda states, control: states
-    values = dynamics_statistics(episode(), replace(checkpoint, filter=frozen))
+    values = module_dynamics_statistics(episode(), replace(checkpoint, filter=frozen))
     assert values["dynamics slope/angle/all"] == pytest.approx(0.0, abs=1e-4)
     assert values["dynamics spread/angle/all"] == pytest.approx(0.0, abs=1e-6)
     assert values["dynamics bias/angle/all"] == pytest.approx(0.0, abs=1e-6)  # the slope explains the missing change
@@ -94,7 +94,7 @@ def test_delayed_states_follow_the_predicted_changes() -> None:
     for steps in (0, 3):
         states = np.concatenate([np.repeat(episode().states[:1], steps, axis=0), episode().states[: 100 - steps]])
         late = replace(episode(), states=states)
-        assert dynamics_statistics(late, checkpoint)["lag/dynamics/all"] == steps
+        assert module_dynamics_statistics(late, checkpoint)["lag/dynamics/all"] == steps
 
 
 def test_moments_of_a_gaussian_likelihood(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.external.load import as_external
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.model_checks import dynamics_statistics
+from beliefscope.inspect.diagnosis.dynamics_checks import module_dynamics_statistics
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs, Undo
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
 from beliefscope.inspect.diagnosis.undo_readings import advance, negate_control, scale_control
@@ -52,7 +52,7 @@ def statistics(episode: Episode, faults: str = "") -> dict[str, float]:
     filter_ = build(architecture(TASK, "gps-ekf"))
     cast(Any, filter_).dynamics = Driven(2, 2, 4)
     faulty = Faults.parse(faults).apply(episode)
-    return law_statistics(faulty) | dynamics_statistics(faulty, cast(Any, SimpleNamespace(filter=filter_)))
+    return law_statistics(faulty) | module_dynamics_statistics(faulty, cast(Any, SimpleNamespace(filter=filter_)))
 
 
 @pytest.mark.parametrize("channel", [0, 1])

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart
 
+import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, pretrained_path, save_checkpoint
@@ -134,6 +136,20 @@ def test_profiles_of_format_1_have_no_reference() -> None:
     again = HealthyProfile.from_json(document | {"format": 1})
     assert again.reference is None
     assert set(again.statistics) == set(NAMES)
+
+
+def test_records_of_format_2_lack_the_dynamics_of_external_filters() -> None:
+    """These were statistics of predictions from estimates."""
+    names = ("dynamics slope/x/all", "process noise/x/all", "nees/fused/all")
+    new = HealthyProfile("simulated", 3, None, {name: np.arange(3.0) for name in names}).to_json()
+    adapter = bs.Adapter(Cart(), batched=False, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
+    external, own = bs.load_filter(adapter, TASK, name="cart"), load_checkpoint(pretrained_path("door", "image-ekf"))
+    old = new | {"format": 2}
+    for checkpoint, document, expected in ((external, old, names[2:]), (external, new, names), (own, old, names)):
+        object.__setattr__(checkpoint, "healthy_profile", document)  # a checkpoint is frozen
+        found = find_profile("cart", "cart", checkpoint.hash, checkpoint)
+        assert found is not None
+        assert tuple(found.statistics) == expected
 
 
 @pytest.mark.long

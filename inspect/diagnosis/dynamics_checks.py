@@ -1,0 +1,211 @@
+"""Statistics of a filter's dynamics, from predictions of single steps that start at the true previous state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task, axis_name
+from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.calls import has_own_start, is_stepwise
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.information import InformationFilter
+from beliefscope.inspect.diagnosis.vector_checks import commands_hand
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.innovations import prediction, prediction_of
+from beliefscope.inspect.statistics.measures import Array, Mask
+from beliefscope.inspect.statistics.signals import lag
+from beliefscope.inspect.trace import Trace
+
+MIN_PATH = 0.3
+"""Minimum path of a component for a slope of the dynamics, in standard deviations of the training data."""
+
+MIN_STEPS = 10
+"""Minimum number of steps of a statistic."""
+
+ROUNDING = 1e-12
+"""Largest variance that a prediction adds by rounding, relative to that of the states."""
+
+START_STD, PRECISION = 1e-3, 1e-5
+"""Standard deviation of the belief at a true state, relative to that of the states and to their largest value, since
+beliefs may have single precision. What a prediction adds to it is the process noise."""
+
+MOVED = 5.0
+"""Smallest predicted change in standard deviations of the belief at a true state, which are also those of particles."""
+
+MOST_CALLS, MOST_PARTICLES = 60, 100_000
+"""Largest number of calls of a filter of single trajectories, and of particles of all steps together."""
+
+
+def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
+    """``KIND/COMPONENT/all`` -> value, SI units, with residual r of the predicted change, and process noise q.
+
+    ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2, where the q of an information filter
+    grows with the motion. ``dynamics slope``: slope of the predicted on the true change, for components that move
+    enough. ``dynamics bias`` and ``dynamics spread``: mean and standard deviation of r that the slope does not explain.
+    ``process noise``: q. ``lag/dynamics``: steps by which the true changes follow the predicted ones.
+
+    Of this project's filters also ``opposed/control``, of controls that do not command a measured hand: log-ratio of
+    the size of r to that with the opposite sign of the channel; 0 if the present sign fits better. Of external filters
+    also ``dynamics offset``: mean residual of the run's predictions, which start at the filter's estimates; it differs
+    between episodes if the filter does not estimate a bias.
+    """
+    if isinstance(checkpoint, ExternalFilter):
+        return external_dynamics_statistics(trace, checkpoint)
+    return module_dynamics_statistics(trace.episode, checkpoint)
+
+
+@torch.no_grad()
+def module_dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, float]:
+    """Those of ``dynamics_statistics`` of a dynamics model."""
+    filter_ = checkpoint.filter
+    if not isinstance(getattr(filter_, "dynamics", None), Dynamics) or len(episode) < MIN_STEPS:
+        return {}
+    si = filter_.statistics
+    states = si.standardise("state", torch.from_numpy(episode.states))
+    controls = si.standardise("control", torch.from_numpy(episode.controls))
+    before, after = states[:-1], states[1:]
+    predicted = filter_.dynamics(before, filter_.dynamics.control_part(controls[1:]))
+    std = si.mean_std("state")[1].double().numpy()
+    noise = filter_.dynamics.noise.double().numpy() * std
+    used = (
+        filter_.process_noise(predicted - before) if isinstance(filter_, InformationFilter) else filter_.dynamics.noise
+    )
+    residual = measures.wrapped(filter_.task, (predicted - after).double().numpy() * std)
+    change = measures.wrapped(filter_.task, (after - before).double().numpy() * std)
+    nis = (np.square(residual) / (used.double().numpy() * std) ** 2).mean(0)
+    values = _of_changes(filter_.task, residual, change, {"dynamics nis": nis, "process noise": noise}, std)
+    values |= _lag(change, change + residual, std)
+    if commands_hand(episode.task):
+        return values
+    signs = 1.0 - 2.0 * torch.eye(controls.shape[1])[:, None]
+    controls = si.standardise("control", signs * torch.from_numpy(episode.controls[1:]))
+    opposite = filter_.dynamics(before, filter_.dynamics.control_part(controls))
+    other = measures.wrapped(filter_.task, (opposite - after).double().numpy() * std)
+    moved = _moved(change, std)
+    size, sizes = (np.square((r / std)[..., moved]).sum((-2, -1)) for r in (residual, other))
+    for i, ratio in enumerate(size / np.maximum(sizes, 1e-12)):
+        values[f"opposed/{axis_name('control', i, len(signs))}/all"] = 0.5 * math.log(max(ratio, 1.0))
+    return values
+
+
+def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
+    """Those of ``dynamics_statistics`` of an external filter.
+
+    If its steps cannot start at a given belief, the predictions are those of the run.
+    """
+    belief = prediction(trace)
+    states, task = trace.episode.states.astype(np.float64), trace.task
+    steps = 1 + np.flatnonzero(measures.counted(trace)[1:])
+    if belief is None or task.rotations or len(steps) < MIN_STEPS:
+        return {}
+    change = task.difference(states[steps], states[steps - 1])
+    predicted = task.difference(belief.mean[steps], trace.estimate_mean[steps - 1].astype(np.float64))
+    values = _lag(change, predicted, states.std(0))
+    values |= _by_component(task, {"dynamics offset": measures.wrapped(task, predicted - change).mean(0)})
+    if has_true_starts(checkpoint):
+        steps = steps[:: -(-len(steps) // most_steps(trace, checkpoint))]
+        started = predictions_from_truth(trace, checkpoint, steps)
+        if started is None:
+            return values
+        change, predicted, added = task.difference(states[steps], states[steps - 1]), *started
+    else:
+        added = None
+        if belief.covariance is not None and trace.has_covariance:
+            added = belief.covariance[steps] - trace.estimate_covariance[steps - 1].astype(np.float64)
+    residual = measures.wrapped(task, predicted - change)
+    more: dict[str, Array] = {}
+    if added is not None:
+        variance = np.median(np.diagonal(added, axis1=-2, axis2=-1), axis=0)
+        variance = np.where(variance > ROUNDING * np.square(states.std(0)), variance, np.nan)
+        more = {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
+    return values | _of_changes(task, residual, change, more, states.std(0))
+
+
+def has_true_starts(checkpoint: ExternalFilter) -> bool:
+    """Whether the filter is here, and can start a single step at a given belief."""
+    module = checkpoint.adapter.module
+    return not isinstance(checkpoint, UnavailableFilter) and is_stepwise(module) and not has_own_start(module)
+
+
+def most_steps(trace: Trace, checkpoint: ExternalFilter) -> int:
+    """Largest number of steps to start at true states."""
+    calls = len(trace) if checkpoint.adapter.batched else MOST_CALLS
+    particles = 1 if trace.particles is None else trace.particles.shape[1]
+    return max(MIN_STEPS, min(calls, MOST_PARTICLES // particles))
+
+
+def predictions_from_truth(
+    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]
+) -> tuple[Array, Array | None] | None:
+    """Predicted changes (S, n) from the true states before the steps (S,), and the added covariance (S, n, n).
+
+    Each step is a call of the filter, or the second one if the first only updates the belief, as the belief is too
+    certain to be changed by an update. None if the filter fails or reports no predictions.
+    """
+    states, n = trace.episode.states.astype(np.float64), len(trace.task.components)
+    start_std = np.maximum(START_STD * states.std(0), PRECISION * np.maximum(np.abs(states).max(0), 1e-3))
+    before = states[steps - 1]
+    covariance = np.diag(np.square(start_std))
+    start = Gaussian(torch.from_numpy(before), torch.from_numpy(covariance).expand(len(steps), n, n))
+    for calls in (1, 2):
+        episodes = [trace.episode.part(int(step) + 1 - calls, int(step) + 1) for step in steps]
+        try:
+            values, _ = checkpoint.run(episodes, trace.seed, start=start)
+        except BadInput:
+            return None
+        names = ("predicted_mean", "predicted_covariance", "particles", "prior_log_weights")
+        belief = prediction_of(trace.task, *(values[n][-1].numpy() if n in values else None for n in names))
+        if belief is None:
+            return None
+        change = trace.task.difference(belief.mean, before)
+        added = None if belief.covariance is None else belief.covariance - covariance
+        is_noisy = added is not None and (np.diagonal(added, axis1=-2, axis2=-1) > np.square(start_std)).any()
+        if is_noisy or (np.abs(change) > MOVED * start_std).any():
+            break
+    return change, added
+
+
+def _lag(change: Array, predicted: Array, std: Array) -> dict[str, float]:
+    """``lag/dynamics`` of predicted and true changes (T, n), of components that move."""
+    moved = _moved(change, std)
+    if not moved.any():
+        return {}
+    return {"lag/dynamics/all": lag(change[:, moved] / std[moved], predicted[:, moved] / std[moved])[0]}
+
+
+def _moved(change: Array, std: Array) -> Mask:
+    """(n,) components that move enough for a slope."""
+    return np.asarray(np.abs(change).sum(0) > MIN_PATH * std)
+
+
+def _of_changes(task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array) -> dict[str, float]:
+    """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,)."""
+    moved = _moved(change, std)
+    centred, around = residual - residual.mean(0), change - change.mean(0)
+    excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
+    columns = {
+        "dynamics bias": residual.mean(0) - excess * change.mean(0),
+        "dynamics error": np.sqrt(np.square(residual).mean(0)),
+        "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
+        "dynamics spread": (centred - excess * around).std(0),
+    }
+    return _by_component(task, columns | dict(more))
+
+
+def _by_component(task: Task, columns: Mapping[str, Array]) -> dict[str, float]:
+    """``KIND/COMPONENT/all`` -> value, from columns (n,) by kind."""
+    return {
+        f"{kind}/{component.name}/all": float(value)
+        for kind, column in columns.items()
+        for component, value in zip(task.components, column, strict=True)
+    }

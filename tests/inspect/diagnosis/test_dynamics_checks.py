@@ -1,0 +1,146 @@
+"""Statistics of predictions that start at true states: those of the dynamics, whatever the rest of the filter does."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart, drive
+from tests.inspect.diagnosis.test_innovation_checks import Boat, loaded, sail
+
+import beliefscope as bs
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.diagnosis.dynamics_checks import (
+    dynamics_statistics,
+    has_true_starts,
+    most_steps,
+    predictions_from_truth,
+)
+from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
+
+STD = 0.005
+"""Standard deviation of the cart's process noise, m."""
+
+
+def of_boat(boat: Boat, faulty: bool = False) -> dict[str, float]:
+    """Its statistics; faulty: with readings of the radar that are too large, so that the filter loses the state."""
+    checkpoint, episode = loaded(boat), sail(3)
+    if faulty:
+        episode.observations["radar"] *= np.float32(1.4)
+    return dynamics_statistics(bs.trace(checkpoint, [episode]), checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("boat", "faulty"), [(Boat(), True), (Boat(radar=0.01), False), (Boat(offset=2.0), False), (Boat(gain=0.1), False)]
+)
+def test_other_faults_do_not_change_them(boat: Boat, faulty: bool) -> None:
+    """Only those that start at the estimates: the offset of the run's predictions, and their lag."""
+    healthy, values = of_boat(Boat()), of_boat(boat, faulty)
+    assert values.keys() == healthy.keys()
+    same = [name for name in healthy if not name.startswith(("dynamics offset/", "lag/"))]
+    assert [values[name] for name in same] == pytest.approx([healthy[name] for name in same], rel=1e-6, nan_ok=True)
+    changed = [name for name in healthy if name.startswith("dynamics offset/")]
+    assert [values[name] for name in changed] != pytest.approx([healthy[name] for name in changed], rel=1e-3)
+
+
+def test_process_noise_is_that_of_the_filter() -> None:
+    values = of_boat(Boat())
+    for name, std in (("x", 1e-2), ("y", 1e-2), ("heading", 2e-3)):
+        # What remains is the belief at the start, whose variance the prediction turns from one component to another.
+        assert values[f"process noise/{name}/all"] == pytest.approx(std, rel=0.05)
+
+
+def test_slope_and_bias_are_those_of_the_dynamics() -> None:
+    healthy, inverted = of_boat(Boat()), of_boat(Boat(turn=-1.0))
+    assert healthy["dynamics slope/heading/all"] == pytest.approx(1.0, abs=0.05)
+    assert inverted["dynamics slope/heading/all"] == pytest.approx(-1.0, abs=0.05)
+    assert inverted["dynamics slope/x/all"] == pytest.approx(healthy["dynamics slope/x/all"], abs=1e-3)
+
+
+class LateCart(Cart):
+    """Its first call updates the belief without a prediction."""
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        super().initialize_beliefs(mean=mean, covariance=covariance)
+        self.first = True
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        noise, self.noise = self.noise, 0.0 if self.first else self.noise
+        result = super().__call__(observations=observations, controls=0.0 * controls if self.first else controls)
+        self.first, self.noise = False, noise
+        return result
+
+
+class ParticleCart(torch.nn.Module):
+    """A particle filter of N trajectories; every reading has the same likelihood, so that the filter drifts."""
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        root = torch.linalg.cholesky(covariance)
+        self.particles = mean[:, None] + torch.randn(len(mean), 2000, 2) @ root.mT
+
+    def forward(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        self.particles = self.particles + controls[:, None] + STD * torch.randn_like(self.particles)
+        equal = torch.full(self.particles.shape[:2], -math.log(2000))
+        return {
+            "estimate_mean": self.particles.mean(1),
+            "particles": self.particles,
+            "log_weights": equal,
+            "prior_log_weights": equal,
+            "log_likelihood": torch.zeros(len(controls), len(SENSORS), 2000),
+        }
+
+
+def cart(filter_: Any) -> ExternalFilter:
+    is_batched = isinstance(filter_, torch.nn.Module)
+    adapter = bs.Adapter(filter_, batched=is_batched, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
+    checkpoint = bs.load_filter(adapter, TASK, name="cart")
+    assert isinstance(checkpoint, ExternalFilter)
+    return checkpoint
+
+
+@pytest.mark.parametrize(("filter_", "error"), [(Cart(), 1e-6), (LateCart(), 5e-5), (ParticleCart(), 5e-4)])
+def test_predicted_changes_are_the_controls_with_the_process_noise(filter_: Any, error: float) -> None:
+    """Errors: an update of the belief at the start, and 4 standard deviations of a mean, ``4 * 0.005 / sqrt(2000)``."""
+    checkpoint, episode, steps = cart(filter_), drive(0), np.arange(1, 60, 7)
+    result = predictions_from_truth(bs.trace(checkpoint, [episode]), checkpoint, steps)
+    assert result is not None
+    change, added = result
+    np.testing.assert_allclose(change, episode.controls[steps], atol=error)
+    assert added is not None
+    np.testing.assert_allclose(np.sqrt(np.diagonal(added, axis1=1, axis2=2)), STD, rtol=0.1)
+
+
+def test_their_number_is_limited() -> None:
+    """By the calls of a filter of single trajectories, and by the particles of one of many."""
+    for filter_, most in ((Cart(), 60), (ParticleCart(), 50)):
+        checkpoint = cart(filter_)
+        assert most_steps(bs.trace(checkpoint, [drive(0)]), checkpoint) == most
+
+
+class Started(Cart):
+    """Starts at a belief of its own."""
+
+    def initialize_beliefs(self) -> None:  # type: ignore[override]
+        self.mean, self.covariance = np.zeros(2), 4e-4 * np.eye(2)
+
+
+def test_a_filter_with_a_start_of_its_own_has_those_of_its_run() -> None:
+    checkpoint, with_starts = cart(Started()), cart(Cart())
+    assert has_true_starts(with_starts)
+    assert not has_true_starts(checkpoint)
+    values = dynamics_statistics(bs.trace(checkpoint, [drive(0)]), checkpoint)
+    assert values["process noise/x/all"] > 0.0
+    assert values["dynamics slope/x/all"] == pytest.approx(1.0, abs=0.2)
+
+
+def test_jacobians_do_not_depend_on_wrong_readings_of_other_sensors() -> None:
+    """An update before another one changes the state at which the latter is linear."""
+    checkpoint, wrong = loaded(Boat(separate=True)), sail(3, every=1)
+    wrong.observations["radar"][:, 0] *= np.float32(1.4)
+    for episode in (sail(3, every=1), wrong):
+        values = jacobian_statistics(bs.trace(checkpoint, [episode]), checkpoint)
+        for key in ("radar", "compass"):
+            assert values[f"measurement jacobian/{key}/all"] < 0.02
