@@ -11,7 +11,6 @@ import re
 import secrets
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from http import HTTPStatus
 
 from starlette.datastructures import URL, Headers, MutableHeaders, QueryParams
 from starlette.exceptions import HTTPException
@@ -79,6 +78,13 @@ class Reply:
     headers: Mapping[str, str] = field(default_factory=dict)
     page: str = ""
 
+    @property
+    def response(self) -> Response:
+        """The response; of a refused WebSocket, too."""
+        if self.page:
+            return HTMLResponse(self.page, self.status, self.headers)
+        return JSONResponse({"error": self.reason}, self.status, self.headers)
+
 
 class Guard:
     """ASGI middleware that checks all requests and WebSockets and adds security headers to all responses.
@@ -103,7 +109,7 @@ class Guard:
             if reply.status >= 400:
                 event = {"status": reply.status, "path": scope["path"], "client": _address(scope)}
                 log.warning("refused: %s", reply.reason, extra={"event": event})
-            await _send_reply(scope, receive, response.send, reply)
+            await reply.response(scope, receive, response.send)
             return
         try:
             await self.app(scope, _limit_body(scope, receive), response.send)
@@ -112,9 +118,8 @@ class Guard:
             log.exception("failed: %s", error, extra={"event": {"error": id, "path": scope["path"]}})
             if response.started or scope["type"] == "websocket":
                 raise
-            await _send_reply(
-                scope, receive, response.send, Reply(500, f"{error or type(error).__name__} (error {id})")
-            )
+            failure = Reply(500, f"{error or type(error).__name__} (error {id})")
+            await failure.response(scope, receive, response.send)
 
     def reply(self, scope: Scope) -> Reply | None:
         """The response to a refused request, or None if it is allowed."""
@@ -243,17 +248,3 @@ class _Response:
             for name, value in self._extra.items():
                 headers.setdefault(name, value)
         await self._send(message)
-
-
-async def _send_reply(scope: Scope, receive: Receive, send: Send, reply: Reply) -> None:
-    if scope["type"] == "websocket":
-        await receive()
-        if "websocket.http.response" not in scope.get("extensions", {}):
-            reason = reply.reason or HTTPStatus(reply.status).phrase
-            await send({"type": "websocket.close", "code": 1008, "reason": reason[:120]})
-            return
-    if reply.page:
-        response: Response = HTMLResponse(reply.page, reply.status, reply.headers)
-    else:
-        response = JSONResponse({"error": reply.reason}, reply.status, reply.headers)
-    await response(scope, receive, send)
