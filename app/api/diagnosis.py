@@ -167,10 +167,10 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     def get_record(task: str, filter: str, data: str = "", healthy_filter: str = "") -> Response:
         """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
         job = jobs.find("healthy", _record_arguments(store, task, filter, data, healthy_filter))
-        measured = store.measured_record(task, filter)
-        if measured and not (job and job.active):
-            return JSONResponse({"data": measured})
-        return JSONResponse({"job": job and asdict(job)}, status_code=202)
+        if store.record_version(task, filter) is None or (job and job.active):
+            return JSONResponse({"job": job and asdict(job)}, status_code=202)
+        record = store.checkpoint(task, filter).healthy_profile or {}
+        return JSONResponse({"data": str(record.get("data"))})
 
     @app.post("/api/healthy-record/{task}/{filter}", status_code=202)
     def measure_record(task: str, filter: str, data: str = "", healthy_filter: str = "") -> JobReply:

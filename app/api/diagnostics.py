@@ -1,6 +1,7 @@
 """Routes under ``/api/diagnostics``: diagnostics of one episode or of all held-out episodes; slow ones as jobs."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -122,7 +123,8 @@ def _arguments(
     store: TraceStore, entry: Entry, selection: Selection, options: Mapping[str, Any], episodes: Episodes
 ) -> dict[str, Any]:
     """Arguments of the job, with everything that its result depends on."""
-    selections = store.held_out(selection) if episodes else [selection]
+    indices = store.dataset(selection.task, selection.data)[1].held_out() if episodes else [selection.episode]
+    selections = [replace(selection, episode=index) for index in indices]
     return {
         "diagnostic": entry.name,
         "options": dict(sorted(options.items())),

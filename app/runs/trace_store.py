@@ -183,12 +183,6 @@ class TraceStore:
         with self._lock:
             return self._key(selection)
 
-    def held_out(self, selection: Selection) -> list[Selection]:
-        """The same run for each held-out episode. Raises BadInput for an unknown task or data set."""
-        with self._lock:
-            episodes = self.dataset(selection.task, selection.data)[1].held_out()
-            return [replace(selection, episode=episode) for episode in episodes]
-
     def filters(self, task: str) -> dict[str, Checkpoint]:
         """The filters of a task by name. Raises BadInput for an unknown task."""
         with self._lock:
@@ -208,12 +202,6 @@ class TraceStore:
                 checkpoint = copy.copy(checkpoint)
                 object.__setattr__(checkpoint, "healthy_profile", record)  # a checkpoint is frozen
             return checkpoint
-
-    def measured_record(self, task: str, filter_: str) -> str | None:
-        """Which data the healthy record of the workspace is from; None if there is none. Raises as ``checkpoint``."""
-        with self._lock:
-            record = self._records.get(self._record_path(self._filter(task, filter_)))
-            return None if record is None else str(record.get("data"))
 
     def record_version(self, task: str, filter_: str) -> int | None:
         """Differs between measurements of the record in the workspace; None without. Raises as ``checkpoint``."""
