@@ -83,22 +83,30 @@ def profile_of(
     sensors: SensorRecord | None = None,
     progress: Progress | None = None,
     indices: Sequence[int] | None = None,
+    reference: Reference | None = None,
 ) -> HealthyProfile:
     """The healthy profile of a filter over clean episodes.
 
     Args:
         data: where the episodes come from.
         sensors: record of their sensors, if it is known.
-        progress: called with the completed fraction of the runs, 0..1.
+        progress: called with the completed fraction, 0..1.
         indices: of the episodes in their data set, for messages.
+        reference: as for ``sensor_record``.
 
     Raises BadInput if the filter fails; an external one in an episode, which is named.
     """
-    sensors = sensors or sensor_record(episodes)
+    report = progress or (lambda share: None)
+    measured = SENSOR_SHARE if sensors is None else 0.0
+    sensors = sensors or sensor_record(episodes, reference, lambda share: report(measured * share))
     rows: list[dict[str, float]] = []
     particles = None
+
+    def on_run(share: float) -> None:
+        report(measured + (1.0 - measured) * share)
+
     try:
-        for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=progress):
+        for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=on_run):
             own = sensors.rows[trace.episode_index]
             rows.append(episode_statistics(trace, checkpoint, own, sensors.readings))
             particles = trace.particle_count
@@ -139,17 +147,9 @@ def measure_profile(
     data: where the episodes come from. is_sample: whether they have the images of the pretrained filters' camera.
     progress: called with the completed fraction, 0..1.
     """
-    report = progress or (lambda share: None)
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
     reference = pretrained_reference(filter_.task) if is_sample else None
-    sensors = sensor_record(held_out, reference, lambda share: report(SENSOR_SHARE * share))
-    profile = profile_of(
-        Checkpoint(filter_, name, "", {}),
-        held_out,
-        data,
-        sensors,
-        lambda share: report(SENSOR_SHARE + (1 - SENSOR_SHARE) * share),
-    )
-    return profile.to_json()
+    checkpoint = Checkpoint(filter_, name, "", {})
+    return profile_of(checkpoint, held_out, data, progress=progress, reference=reference).to_json()

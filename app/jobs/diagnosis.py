@@ -11,7 +11,7 @@ from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
 from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.healthy_profile import pretrained_reference
 from beliefscope.inspect.diagnostics.views import as_json
-from beliefscope.inspect.healthy import profile_of, sensor_record
+from beliefscope.inspect.healthy import profile_of
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> Any:
@@ -56,18 +56,16 @@ def measure_record(arguments: Mapping[str, Any], report: Report) -> Any:
         checkpoint, healthy_filter = (store.checkpoint(arguments["task"], name) for name in names)
         by = "" if names[0] == names[1] else f", run by {names[1]}"
         data = store.dataset(arguments["task"], arguments["data"])[1]
-        report(0.0, "measuring the sensors")
-        episodes = [data[index] for index in arguments["episodes"]]
         is_sample = arguments["data"] not in store.settings.data
-        images = pretrained_reference(checkpoint.task) if is_sample else None  # of the same camera
-        sensors = sensor_record(episodes, images, lambda share: report(0.5 * share, "measuring the sensors"))
+        message = "measuring the healthy record"
+        report(0.0, message)
         profile = profile_of(
             healthy_filter,
-            episodes,
-            f"{len(episodes)} held-out episodes of {arguments['data']}{by}",
-            sensors,
-            lambda share: report(0.5 + 0.5 * share, "running the filter over the healthy episodes"),
-            arguments["episodes"],
+            [data[index] for index in arguments["episodes"]],
+            f"{len(arguments['episodes'])} held-out episodes of {arguments['data']}{by}",
+            progress=lambda share: report(share, message),
+            indices=arguments["episodes"],
+            reference=pretrained_reference(checkpoint.task) if is_sample else None,  # of the same camera
         )
         store.write_record(checkpoint, profile.to_json())
     return {"data": profile.data}

@@ -21,10 +21,6 @@ ALARM_RATE = (
 )
 
 
-SENSORS, HEALTHY_RUNS = "Measuring the sensors", "Measuring the healthy record"
-"""Labels of the progress bars of ``--profile-from``, in order."""
-
-
 def diagnose(
     runs: opt.Runs,
     episode: int | None = opt.option(
@@ -130,18 +126,15 @@ def _profile(
     from beliefscope.datasets.store import open_dataset
     from beliefscope.inspect.diagnosis.case import checked_alarm_rate
     from beliefscope.inspect.diagnosis.diagnose import required_profile
-    from beliefscope.inspect.healthy import overlap_warning, profile_of, sensor_record
+    from beliefscope.inspect.healthy import overlap_warning, profile_of
 
     if clean is None:
         return required_profile(checkpoint)
-    with open_dataset(clean) as data, console.bars() as advance:
+    with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
         checked_alarm_rate(len(indices), count, alarm_rate)
-        advance(SENSORS, 0.0, "")
+        advance(0.0)
         episodes = [data[index] for index in indices]
         if warning := overlap_warning(episodes, diagnosed):
             console.note(f"Warning: {warning}")
-        sensors = sensor_record(episodes, progress=lambda share: advance(SENSORS, share, ""))
-        return profile_of(
-            checkpoint, episodes, str(clean), sensors, lambda share: advance(HEALTHY_RUNS, share, ""), indices
-        )
+        return profile_of(checkpoint, episodes, str(clean), progress=advance, indices=indices)
