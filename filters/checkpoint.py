@@ -80,6 +80,11 @@ class Checkpoint:
             raise BadInput(f"filter {self.name!r} is for task {self.task.name!r}, the episode is of {other}")
 
 
+def partial_path(path: Path) -> Path:
+    """The file from which the interrupted training of a checkpoint resumes."""
+    return path.with_name(f"{path.name}.partial")
+
+
 def save_checkpoint(
     filter_: Filter,
     name: str,
@@ -87,7 +92,10 @@ def save_checkpoint(
     path: Path,
     healthy_profile: Mapping[str, Any] | None = None,
 ) -> str:
-    """Writes the checkpoint atomically and returns its hash. Raises BadInput if the folder does not exist."""
+    """Writes the checkpoint atomically, deletes its ``partial_path``, and returns its hash.
+
+    Raises BadInput if the folder does not exist.
+    """
     header = {
         "format": FORMAT,
         "name": name,
@@ -100,6 +108,7 @@ def save_checkpoint(
     tensors = {key: value.detach().cpu().contiguous() for key, value in filter_.state_dict().items()}
     data = save(tensors, metadata={"beliefscope": json.dumps(header)})
     write_atomically(path, data)
+    partial_path(path).unlink(missing_ok=True)
     return hashlib.sha256(data).hexdigest()
 
 

@@ -9,7 +9,7 @@ from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.io.atomic_write import write_atomically
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, partial_path, save_checkpoint
 from beliefscope.filters.engine import one_thread
 from beliefscope.filters.finetuning.finetune import Callbacks, finetune
 from beliefscope.filters.finetuning.loop import Validation
@@ -32,7 +32,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     with store_of_job(arguments) as store, one_thread():
         settings = store.settings
         folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
-        path, partial = folder / "finetuned.safetensors", folder / "finetuned.partial"
+        path = folder / "finetuned.safetensors"
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         is_sample = data_name not in settings.data
@@ -62,7 +62,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
                 callbacks=Callbacks(on_step, on_validation, log.resume),
-                partial=partial,
+                partial=partial_path(path),
             )
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
@@ -74,7 +74,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         on_profile(0.0)
         profile = measure_profile(result.filter, base.name, episodes, source, is_sample, on_profile)
         save_checkpoint(result.filter, base.name, result.record, path, profile)
-        partial.unlink(missing_ok=True)
         finetuned = load_checkpoint(path)
         comparison = compare_checkpoints(
             base,

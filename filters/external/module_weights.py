@@ -16,12 +16,13 @@ from beliefscope.datasets.errors import BadInput, reason_unreadable, type_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
-from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
+from beliefscope.filters.checkpoint import load_checkpoint, partial_path, pretrained_path
 
 
 def save_weights(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Write the tensors of a module, for ``FILE.py:FUNCTION@PATH``."""
+    """Write the tensors of a module, for ``FILE.py:FUNCTION@PATH``, and delete the ``partial_path`` of the file."""
     write_atomically(path, save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}))
+    partial_path(path).unlink(missing_ok=True)
 
 
 def load_weights(module: object, path: Path, place: str) -> None:

@@ -78,7 +78,7 @@ def finetune(
     Args:
         episodes: of the whole data set; their positions are the indices in ``settings.events``. Episodes with events
             are trained on, whatever their split, and not evaluated on.
-        partial: file from which a paused or interrupted run resumes; to be deleted when the result is stored.
+        partial: file from which a paused or interrupted run resumes, such as ``partial_path`` of its checkpoint.
 
     Raises:
         BadInput: a pattern matches nothing, a slice or event does not fit, or there is no training episode.

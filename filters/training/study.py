@@ -25,7 +25,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters import legacy_names
 from beliefscope.filters.catalog import architecture, filters_of
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, partial_path, save_checkpoint
 from beliefscope.filters.engine import Engine, run_all
 from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.external.load import ExternalFilter
@@ -247,7 +247,6 @@ def _failure(cell: Cell, error: Exception) -> Document:
 def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
     episodes = _episodes(cell.source, cell.data, cell.skip_bad, cell.data_hash)
     checkpoint = cell.path(folder, ".safetensors")
-    partial = checkpoint.with_name(f"{checkpoint.name}.partial")
     trained = train(
         architecture(cell.definition, cell.filter),
         episodes,
@@ -257,11 +256,10 @@ def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
         command=f"beliefscope train {cell.task} --filter {cell.filter} --data {cell.data.name} "
         f"--preset {cell.preset} --seed {cell.seed}",
         report=report,
-        partial=partial,
+        partial=partial_path(checkpoint),
         shared=folder / "shared",
     )
     checkpoint_hash = save_checkpoint(trained.filter, cell.filter, trained.record, checkpoint)
-    partial.unlink(missing_ok=True)
     results = {"checkpoint_hash": checkpoint_hash, "trivial": trivial(cell.definition, episodes)}
     return trained.record | cell.inputs() | results | {OFFSET: offset_metrics(trained.filter, episodes)}
 

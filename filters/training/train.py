@@ -63,8 +63,8 @@ def train(
         blackouts: probabilities of an image blackout; one is drawn for each training window.
         on_validation: called like ``report`` with each validation loss. on_evaluation: with its completed share.
         on_resume: called with the name of the last finished stage if the training resumes.
-        partial: file of the finished stages, from which an interrupted training resumes; to be deleted when the result
-            is stored.
+        partial: file of the finished stages, from which an interrupted training resumes, such as ``partial_path`` of
+            its checkpoint.
         shared: folder of modules that other filters of the same task can use: dynamics, image encoders.
 
     Raises:

@@ -116,7 +116,7 @@ def finetune(
       beliefscope finetune door --filter crossmodal-ekf --train noise-only --rate 0.003 -o finetuned.safetensors
       beliefscope finetune push --filter crossmodal-ekf --slice contact --success contact -o finetuned.safetensors
     """
-    from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
+    from beliefscope.filters.checkpoint import load_checkpoint, partial_path, save_checkpoint
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.finetuning.finetune import finetune as tune
     from beliefscope.filters.open_filter import open_filter
@@ -136,7 +136,7 @@ def finetune(
     with opt.open_episodes(base.task, data, learning.skip_bad) as episodes:
         members, data_hash = _training_episodes(episodes, data, output.parent)
         command = finetune_command(target, filter, data, settings)
-        partial = output.with_name(f"{output.name}.partial")  # from which an interrupted run resumes
+        partial = partial_path(output)
         source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
             return _external(base, members, output, source, data)
@@ -146,7 +146,6 @@ def finetune(
         with console.progress("Measuring the healthy record") as advance:
             profile = measure_profile(tuned.filter, base.name, members, command, data is None, advance)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
-        partial.unlink(missing_ok=True)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
     lines = [*_summary(tuned.record), "", _change_command(filter or target, str(output), base.task.name, data)]
     lines += ["", verdict.statement, verdict.verdict] if verdict else []
@@ -211,7 +210,6 @@ def _external(
     assert result is not None, "runs without a stop callback always complete"
     tensors, record = result
     save_weights(tensors, output)
-    source["partial"].unlink(missing_ok=True)
     tuned = f"{base.source.partition('@')[0]}@{output}"
     digest = load_external(tuned, base.task).hash
     lines = [*_summary(record), "", _change_command(base.source, tuned, base.task.name, data)]

@@ -53,7 +53,7 @@ def train(
     target = load_task(opt.definition_of(task, data))
     check_trainable(target, task, filter)
     from beliefscope.filters.catalog import architecture
-    from beliefscope.filters.checkpoint import save_checkpoint
+    from beliefscope.filters.checkpoint import partial_path, save_checkpoint
     from beliefscope.filters.training.plan import BLACKOUTS, PLANS, parse_blackouts
     from beliefscope.filters.training.train import train as train_filter
     from beliefscope.inspect.healthy import measure_profile
@@ -63,7 +63,7 @@ def train(
     probabilities = parse_blackouts(blackouts)
     check_name("preset", preset, PLANS)
     injected = read_faults(faults, target)
-    partial = output.with_name(f"{output.name}.partial")
+    partial = partial_path(output)
     # The record has the name and hash of the data, but not their folder.
     source = _option("data", data and data.name) + _option("faults", injected and str(injected))
     source += _option("blackouts", probabilities != BLACKOUTS and blackouts)
@@ -97,7 +97,6 @@ def train(
 
         profile = measure_profile(trained.filter, filter, episodes, record["command"], data is None, report_record)
     checkpoint_hash = save_checkpoint(trained.filter, filter, record, output, profile)
-    partial.unlink(missing_ok=True)
     return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, _summary(filter, record))
 
 
