@@ -12,6 +12,7 @@ from beliefscope.filters.finetuning.module_selection import presets
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import CLEAN, Slice, fault_slice
 from beliefscope.filters.finetuning.success import Criterion
+from beliefscope.inspect.diagnosis.catalog import causes_of
 
 SENSOR_FAULTS = {
     "image.blackout": "blackout=0.8",
@@ -35,17 +36,8 @@ SENSOR_FAULTS = {
 }
 """Cause -> the sensor fault that a filter can learn to expect. Others, such as exchanged axes, must be repaired."""
 
-MODULES = {
-    "model.*.bias": "*-only",
-    "model.*.broken": "*-only",
-    "model.*.overconfident": "noise-only",
-    "model.*.underconfident": "noise-only",
-    "dynamics": "dynamics-only",
-    "process_noise": "noise-only",
-    "weights": "weights-only",
-    "data": "reliability-only",
-}
-"""Cause or component -> preset; ``*`` stands for the modality."""
+OTHER_PRESETS = {"data.shift": "reliability-only"}
+"""Cause -> preset, for causes whose command (``Cause.command``) names none."""
 
 CLEAN_SHARE = 0.8
 """Weight of clean data with a sensor fault. At equal weights, pretrained information filters lose accuracy on them."""
@@ -61,14 +53,16 @@ def training_for(cause: str, filter_: Filter, faults: Faults = NO_FAULTS) -> Fin
     if cause in SENSOR_FAULTS:
         injected = faults or Faults.parse(SENSOR_FAULTS[cause])
         return training_on(fault_slice(injected), filter_)
-    modality = component.removeprefix("model.") if component.startswith("model.") else "*"
-    preset = MODULES.get(cause.replace(modality, "*"), MODULES.get(component))
-    if preset is None:
+    command = next((known.command for known in causes_of(filter_.task) if known.name == cause), None)
+    preset = OTHER_PRESETS.get(cause) or (command and command.train)
+    if not preset:
         return None
-    slice_ = Slice(f"{modality} only", only=(modality,)) if modality != "*" and len(filter_.names) > 1 else CLEAN
+    modality = component.removeprefix("model.")
+    is_model = modality != component and len(filter_.names) > 1
+    slice_ = Slice(f"{modality} only", only=(modality,)) if is_model else CLEAN
     measure = "nees" if mechanism in ("overconfident", "underconfident", "small", "large") else "error"
     mix = () if slice_ == CLEAN else ((slice_, 1.0),)
-    settings = FineTune(train=(preset.replace("*", modality),), steps=150, mix=mix)
+    settings = FineTune(train=(preset,), steps=150, mix=mix)
     return _available(replace(settings, success=Criterion(slice_.name, measure)), filter_)
 
 

@@ -39,3 +39,20 @@ def test_the_criterion_is_about_the_error_that_the_cause_increases(
     assert weakness.settings.success is not None
     assert weakness.settings.success.measure == expected
     assert weakness.evidence == f"Probability above 0.99: the image is frozen{effect}."
+
+
+@pytest.mark.parametrize(
+    ("cause", "presets"),
+    [
+        ("model.haptics.bias", ["haptics-only"]),
+        ("process_noise.small", ["noise-only"]),
+        ("weights.constant", ["weights-only"]),
+        ("weights.ignores_likelihood", []),  # its next action is a correction of the code
+        ("data.shift", ["reliability-only"]),
+    ],
+)
+def test_the_trained_modules_are_those_of_the_command_of_the_cause(cause: str, presets: list[str]) -> None:
+    filter_ = load_checkpoint(pretrained_path("push", "crossmodal-pf")).filter
+    entry = {"cause": cause, "title": "", "probability": 1.0, "evidence": EVIDENCE, "recovered": None}
+    weaknesses = diagnosed({"causes": [entry], "headline": ""}, filter_, Faults(), 9)
+    assert [preset for weakness in weaknesses for preset in weakness.settings.train] == presets
