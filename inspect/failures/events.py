@@ -17,10 +17,9 @@ from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine
-from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
 from beliefscope.inspect.failures.step_scores import RECENT, ROUNDING, Survey
-from beliefscope.inspect.failures.survey import check_applies, find_score, survey_of
+from beliefscope.inspect.failures.survey import ScoredRuns, fields_of_runs, find_score, survey_of
 from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, layer_label
 
 HIGH = 0.9
@@ -101,14 +100,11 @@ class PhaseStatistics:
 
 
 @dataclass(frozen=True)
-class Failures(Diagnostic):
+class Failures(ScoredRuns):
     """Events of a data set with high scores; SI units.
 
     Attributes:
-        task, filter, checkpoint_hash, faults, seed, particles: of the runs.
-        by: name of the score.
-        title, unit: display name and unit of the score: of a component, sigma, x (ratio) or none.
-        conversion, error_conversion: units for display of the score and of the main error, and their factors.
+        error_conversion: unit for display of the main error, and its factor.
         threshold: minimum score of an event.
         episodes, steps: numbers of episodes and steps.
         timed: whether steps have times.
@@ -119,16 +115,6 @@ class Failures(Diagnostic):
         quantiles: phase or ``all`` -> (51,) quantiles of the scores, ascending.
     """
 
-    task: str
-    filter: str
-    checkpoint_hash: str
-    faults: str
-    seed: int
-    particles: int | None
-    by: str
-    title: str
-    unit: str
-    conversion: tuple[str, float]
     error_conversion: tuple[str, float]
     threshold: float
     episodes: int
@@ -285,8 +271,7 @@ def find_failures(
 
 def failures_of(survey: Survey, by: str = "error") -> Failures:
     """Rank the events of a survey. Raises BadInput with the reason for a score that does not apply."""
-    definition = find_score(by, survey.task)
-    check_applies(by, survey.refused.get(by))
+    runs = fields_of_runs(survey, by)
     score = survey.scores[by]
     threshold = float(np.nanquantile(score, HIGH)) if np.isfinite(score).any() else np.nan
     gap = max(1, round(RECENT / survey.task.dt))
@@ -298,16 +283,7 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
     quantiles = {"all": _quantiles(score)}
     quantiles |= {name: _quantiles(score[phase == i]) for i, name in enumerate(survey.phases) if (phase == i).any()}
     return Failures(
-        task=survey.task.name,
-        filter=survey.filter,
-        checkpoint_hash=survey.checkpoint_hash,
-        faults=survey.faults,
-        seed=survey.seed,
-        particles=survey.particles,
-        by=by,
-        title=definition.title,
-        unit=definition.unit,
-        conversion=definition.display,
+        **runs,
         error_conversion=survey.task.main_error.conversion,
         threshold=threshold,
         episodes=len(np.unique(survey.episode)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_blocks
+from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Score, Survey, scores_of
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -20,6 +22,38 @@ Episodes = Dataset | Mapping[int, Episode] | Sequence[Episode]
 
 BLOCK = 16
 """Episodes that a process runs at a time."""
+
+
+@dataclass(frozen=True)
+class ScoredRuns(Diagnostic):
+    """Runs of a filter, of which a result by one score is.
+
+    Attributes:
+        task, filter, checkpoint_hash, faults, seed, particles: of the runs.
+        by: name of the score.
+        title, unit: display name and unit of the score: of a component, sigma, x (ratio) or none.
+        conversion: unit for display of the score, and its factor.
+    """
+
+    task: str
+    filter: str
+    checkpoint_hash: str
+    faults: str
+    seed: int
+    particles: int | None
+    by: str
+    title: str
+    unit: str
+    conversion: tuple[str, float]
+
+
+def fields_of_runs(survey: Survey, by: str) -> dict[str, Any]:
+    """The fields of ``ScoredRuns``. Raises BadInput for an unknown score, and for one that does not apply."""
+    score = find_score(by, survey.task)
+    check_applies(by, survey.refused.get(by))
+    runs = {name: getattr(survey, name) for name in ("filter", "checkpoint_hash", "faults", "seed", "particles")}
+    by_score = {"by": by, "title": score.title, "unit": score.unit, "conversion": score.display}
+    return {"task": survey.task.name, **runs, **by_score}
 
 
 def survey_of(

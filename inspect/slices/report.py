@@ -15,10 +15,9 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import with_unit
 from beliefscope.datasets.text import capitalised, percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
-from beliefscope.inspect.failures.survey import check_applies, find_score
+from beliefscope.inspect.failures.survey import ScoredRuns, check_applies, fields_of_runs, find_score
 from beliefscope.inspect.slices.covariates import EpisodeCovariates, join_covariates
 from beliefscope.inspect.slices.search import ALPHA, Candidate, Condition, Index, find_candidates
 from beliefscope.inspect.statistics.intervals import jackknife
@@ -65,28 +64,16 @@ class ErrorSlice:
 
 
 @dataclass(frozen=True)
-class ErrorSlices(Diagnostic):
+class ErrorSlices(ScoredRuns):
     """The slices of a data set in which a score is larger.
 
     Attributes:
-        task, filter, checkpoint_hash, faults, seed, particles: of the runs.
-        by, title, unit: name of the score, its display name and unit. conversion: unit for display, and its factor.
         alpha: probability of any slice if no covariate is related to the score.
         episodes, steps: numbers of episodes, and of steps with a score.
         covariates: names of the covariates that were searched.
         slices: in the order of their discovery.
     """
 
-    task: str
-    filter: str
-    checkpoint_hash: str
-    faults: str
-    seed: int
-    particles: int | None
-    by: str
-    title: str
-    unit: str
-    conversion: tuple[str, float]
     alpha: float
     episodes: int
     steps: int
@@ -233,8 +220,7 @@ def slices_of_survey(
 
     Raises BadInput for an unknown score, one that does not apply, and one that is not finite.
     """
-    definition = find_score(by, survey.task)
-    check_applies(by, survey.refused.get(by))
+    runs = fields_of_runs(survey, by)
     ordered = sorted(episodes, key=lambda episode: episode.index)
     keep = np.concatenate([episode.counted for episode in ordered])
     score, episode, step = survey.scores[by][keep], survey.episode[keep], survey.step[keep]
@@ -249,16 +235,7 @@ def slices_of_survey(
         if not slice_.low <= 1.0:
             slices.append(slice_)
     return ErrorSlices(
-        task=survey.task.name,
-        filter=survey.filter,
-        checkpoint_hash=survey.checkpoint_hash,
-        faults=survey.faults,
-        seed=survey.seed,
-        particles=survey.particles,
-        by=by,
-        title=definition.title,
-        unit=definition.unit,
-        conversion=definition.display,
+        **runs,
         alpha=alpha,
         episodes=len(ordered),
         steps=len(score),
