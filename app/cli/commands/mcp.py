@@ -3,13 +3,12 @@ from contextlib import closing
 from pathlib import Path
 
 from beliefscope.app.cli import options as opt
+from beliefscope.app.cli.commands.serve import Served
 from beliefscope.datasets.errors import BadInput
 
 
 def mcp(
-    task: list[str] | None = opt.option("FILE.py:NAME", "Custom task. Repeatable.", None),
-    data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes. Repeatable.", None),
-    filter: list[str] | None = opt.option("CHECKPOINT|FILE.py:FUNCTION", "Additional filter. Repeatable.", None),
+    served: Served,
     url: str = opt.option("URL", "Address of a running dashboard, for the links in answers.", ""),
     particles: int = 300,
     seed: int = 0,
@@ -25,12 +24,11 @@ def mcp(
       beliefscope mcp
       beliefscope mcp --data door.h5 --filter mine.safetensors --url http://127.0.0.1:8000
     """
-    from beliefscope.app.cli.commands.serve import settings_of_command_line
     from beliefscope.app.runs.trace_store import TraceStore
     from beliefscope.app.server.assistant import Assistant, build_server
 
     with tempfile.TemporaryDirectory(prefix="beliefscope-") as workspace:
-        settings = settings_of_command_line(Path(workspace), task, data, filter, seed=seed, particles=particles)
+        settings = served.settings(Path(workspace), seed=seed, particles=particles)
         with closing(TraceStore(settings)) as store:
             if problems := store.problems():
                 raise BadInput("; ".join(problems))

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,7 +16,49 @@ if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
 
 
+@dataclass(frozen=True)
+class Served:
+    """Options for tasks, data sets and filters in addition to the included ones."""
+
+    task: list[str] | None = opt.option("FILE.py:NAME", "Custom task. Repeatable.", None)
+    data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes. Repeatable.", None)
+    filter: list[str] | None = opt.option(
+        "CHECKPOINT|FILE.py:FUNCTION",
+        "Additional filter. Repeatable. An external filter (docs/own_filter.md) is for its own task or, if it has "
+        "none, for that of --task or --data.",
+        None,
+    )
+
+    def settings(self, workspace: Path, **others: Any) -> Settings:
+        """Settings with tasks (names, definitions in files, or names that the data define), data sets and filters.
+
+        The page opens the first filter. others: further settings.
+        """
+        from beliefscope.app.runs.catalog import PRETRAINED, SAMPLE, short_names
+        from beliefscope.app.runs.settings import Settings
+        from beliefscope.datasets.catalog import load_task
+        from beliefscope.filters.external.load import load_external
+        from beliefscope.filters.names import is_code
+
+        tasks, data, filters = self.task or (), self.data or (), self.filter or ()
+        own = opt.own_definitions(data) if tasks or any(map(is_code, filters)) else {}
+        given = [own.get(name) or load_task(name) for name in tasks]
+        files = short_names((Path(name) for name in filters if not is_code(name)), PRETRAINED)
+        names = {path.resolve(): name for name, path in files.items()}
+        checkpoints: dict[str, Path | Checkpoint] = {}
+        for text in filters:
+            if is_code(text):
+                external = load_external(text, given=given or list(own.values()), named=list(own.values()))
+                checkpoints[external.name] = external
+            else:
+                name = names[Path(text).resolve()]
+                checkpoints[name] = files[name]
+        named = tuple(name for name in tasks if name not in own)
+        return Settings(workspace, short_names(data, {SAMPLE}), checkpoints, tasks=named, **others)
+
+
 def serve(
+    *,
     port: int = opt.option("N", "Port; 0 selects a free one.", 8000, parser=opt.integer(0, 65535)),
     host: str = opt.option(
         "ADDRESS", "Address to listen on. Any but the loopback address requires a token.", "127.0.0.1"
@@ -26,14 +69,7 @@ def serve(
     ),
     allow_host: list[str] | None = opt.option("NAME", "Additional host name of this machine. Repeatable.", None),
     workspace: Path = Path("workspace"),
-    task: list[str] | None = opt.option("FILE.py:NAME", "Custom task to serve. Repeatable.", None),
-    data: list[Path] | None = opt.option("FILE|DIR", "Additional episodes to serve. Repeatable.", None),
-    filter: list[str] | None = opt.option(
-        "CHECKPOINT|FILE.py:FUNCTION",
-        "Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, if it "
-        "has none, for that of --task or --data.",
-        None,
-    ),
+    served: Served,
     study: list[Path] | None = opt.option("DIR", "Folder of a study to serve. Repeatable.", None),
     sweep: list[Path] | None = opt.option("DIR", "Folder of a sweep to serve (docs/sweep.md). Repeatable.", None),
     views: int = opt.option("N", "Maximum number of open pages.", 32, parser=opt.integer(1, 1024)),
@@ -70,11 +106,8 @@ def serve(
     opt.check_workspace(workspace)
     access = Access(token_for(host, token, os.environ), read_only)
     logs.configure(log_level, log_format, access.token)
-    settings = settings_of_command_line(
+    settings = served.settings(
         workspace,
-        task,
-        data,
-        filter,
         hosts=(*host_names(host), *(allow_host or ())),
         seed=seed,
         views=views,
@@ -109,40 +142,6 @@ def serve_page(
         serve_until_signal(settings, host=host, port=port, on_start=listening, access=access)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the server has stopped; do not interrupt interpreter shutdown
-
-
-def settings_of_command_line(
-    workspace: Path,
-    tasks: Sequence[str] | None,
-    data: Sequence[Path] | None,
-    filters: Sequence[str] | None,
-    **others: Any,
-) -> Settings:
-    """Settings with tasks (names, definitions in files, or names that the data define), data sets and filters.
-
-    The page opens the first filter. others: further settings.
-    """
-    from beliefscope.app.runs.catalog import PRETRAINED, SAMPLE, short_names
-    from beliefscope.app.runs.settings import Settings
-    from beliefscope.datasets.catalog import load_task
-    from beliefscope.filters.external.load import load_external
-    from beliefscope.filters.names import is_code
-
-    tasks, data, filters = tasks or (), data or (), filters or ()
-    own = opt.own_definitions(data) if tasks or any(map(is_code, filters)) else {}
-    given = [own.get(name) or load_task(name) for name in tasks]
-    files = short_names((Path(name) for name in filters if not is_code(name)), PRETRAINED)
-    names = {path.resolve(): name for name, path in files.items()}
-    checkpoints: dict[str, Path | Checkpoint] = {}
-    for text in filters:
-        if is_code(text):
-            external = load_external(text, given=given or list(own.values()), named=list(own.values()))
-            checkpoints[external.name] = external
-        else:
-            name = names[Path(text).resolve()]
-            checkpoints[name] = files[name]
-    named = tuple(name for name in tasks if name not in own)
-    return Settings(workspace, short_names(data, {SAMPLE}), checkpoints, tasks=named, **others)
 
 
 @contextmanager

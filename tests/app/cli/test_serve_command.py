@@ -22,7 +22,7 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from beliefscope.app.cli.commands.serve import _browser_opener, settings_of_command_line
+from beliefscope.app.cli.commands.serve import Served, _browser_opener
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server import timeouts
@@ -103,7 +103,7 @@ def test_filters_keep_their_order(tmp_path: Path) -> None:
     """The page opens the first one, whether it is a file or code."""
     code = "examples/04_own_filter.py:build"
     texts = [str(tmp_path / "b.safetensors"), code, str(tmp_path / "a.safetensors")]
-    filters = settings_of_command_line(tmp_path, [], [], texts).checkpoints
+    filters = Served(task=[], data=[], filter=texts).settings(tmp_path).checkpoints
     assert [type(source).__name__ for source in filters.values()] == ["PosixPath", "ExternalFilter", "PosixPath"]
     assert [name for name in filters if len(name) == 1] == ["b", "a"]
 
@@ -126,9 +126,8 @@ def test_data_define_the_task_of_filters(tmp_path: Path) -> None:
     code.write_text(OWN)
 
     def filters(function: str, tasks: list[str]) -> Iterable[Path | Checkpoint]:
-        return settings_of_command_line(
-            tmp_path, tasks, [tmp_path / "own.h5"], [f"{code}:{function}"]
-        ).checkpoints.values()
+        served = Served(task=tasks, data=[tmp_path / "own.h5"], filter=[f"{code}:{function}"])
+        return served.settings(tmp_path).checkpoints.values()
 
     for function in ("build", "named"):
         for tasks in ([], ["own"]):
