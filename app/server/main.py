@@ -58,8 +58,6 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.maps.map_engine import COARSE
 from beliefscope.recordings.web_viewer import WebViewer, installed
 
-__all__ = ["Settings", "create_app", "serve"]
-
 PAGE = Path(__file__).parents[1] / "page"
 ERRORS: tuple[type[Exception], ...] = (InProgress, BadInput, RequestValidationError, HTTPException, OSError)
 STATUS: dict[type[Exception], int] = {QueueFull: 429, NotFound: 404, NameTaken: 409}

@@ -17,8 +17,9 @@ import pytest
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.auth import Access
-from beliefscope.app.server.main import PAGE, Settings, listen, serve
+from beliefscope.app.server.main import PAGE, listen, serve
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.vendor_files import viewer_wasm
 from beliefscope.datasets.errors import BadInput
@@ -169,7 +170,8 @@ def test_invalid_address_is_reported(settings: Settings, host: str, port: int) -
 def test_sigint_stops_the_server(settings: Settings) -> None:
     """Without the command line; see ``test_serve_command.py`` for other signals."""
     code = (
-        "from pathlib import Path; from beliefscope.app.server.main import Settings, serve; "
+        "from pathlib import Path; from beliefscope.app.runs.settings import Settings; "
+        "from beliefscope.app.server.main import serve; "
         f"data = {{'mine': Path({str(settings.data['mine'])!r})}}; "
         f"serve(Settings(Path({str(settings.workspace)!r}), data=data), port=0)"
     )
