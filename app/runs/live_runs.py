@@ -42,12 +42,9 @@ class GrowingRun(TracedRun):
 
     def __init__(self, run: LiveRun, checkpoint: Checkpoint) -> None:
         super().__init__(run.key, checkpoint)
-        self._run, self._steps = run, run.reader.steps
+        self._run, self._part, self._steps = run, run.reader.part, run.reader.steps
         self._last = self._part(max(0, self._steps - 1), self._steps)
         self.scene_key = f"{run.name} {run.inode}"
-
-    def _part(self, first: int, last: int) -> Trace:
-        return self._run.reader.part(first, last)
 
     @cached_property
     def trace(self) -> Trace:
@@ -124,12 +121,11 @@ class LiveRuns:
                 self._runs.pop(name).close()
         return sorted(times, key=lambda name: -times[name])[:LISTED_RUNS]
 
-    def traced_run(self, selection: Selection, filters: Mapping[str, Checkpoint]) -> TracedRun | None:
+    def traced_run(self, run: LiveRun, selection: Selection, filters: Mapping[str, Checkpoint]) -> TracedRun | None:
         """The live run, or None if the selection applies another filter, faults or an intervention to its episode.
 
-        Raises BadInput if the run does not exist or belongs to another task or episode.
+        Raises BadInput if the run belongs to another task or episode.
         """
-        run = self[selection.data.removeprefix(LIVE_PREFIX)]
         name, checkpoint = resolve_filter(run, filters)
         if (selection.task, selection.episode) != (run.task.name, run.template.episode_index):
             raise BadInput(

@@ -261,7 +261,7 @@ class TraceStore:
         if not selection.data.startswith(LIVE_PREFIX):
             return None
         run = self.live[selection.data.removeprefix(LIVE_PREFIX)]
-        return self.live.traced_run(selection, self.filters_of(run))
+        return self.live.traced_run(run, selection, self.filters_of(run))
 
     def _episode(self, selection: Selection) -> Episode:
         with self._lock:
