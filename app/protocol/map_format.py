@@ -1,13 +1,12 @@
 """Binary encoding of likelihood maps (docs/api.md): statistics, particles and cells."""
 
 import json
-import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.maps.map_statistics import measure_maps, particle_cloud
 from beliefscope.inspect.maps.shape import SHAPES
@@ -86,25 +85,26 @@ def encode_maps(trace: Trace, index: int, maps: LikelihoodMap) -> EncodedMaps:
         "rows": len(maps.offsets_y),
         "quantity": maps.quantity,
         "rule": maps.rule,
-        "angle": None if math.isnan(maps.angle) else float(maps.angle),
-        "layers": list(maps.layers),
+        "angle": maps.angle,
+        "layers": maps.layers,
         "axes": axes,
         "others": maps.others,
         "note": maps.note,
-        "centre": maps.centre.tolist(),
-        "truth": _json(trace.episode.states[index]),
-        "estimate": _json(task.near(trace.estimate_mean[index], trace.episode.states[index])),
-        "log_max": _json(log_max),
-        "log_range": _json(log_range),
-        "peak": maps.peaks().tolist(),
-        "effector": effector[index, :2].tolist() if effector is not None and on_floor else None,
-        "expected": _json(statistics.expected[0]),
+        "centre": maps.centre,
+        "truth": trace.episode.states[index],
+        "estimate": task.near(trace.estimate_mean[index], trace.episode.states[index]),
+        "log_max": log_max,
+        "log_range": log_range,
+        "peak": maps.peaks(),
+        "effector": effector[index, :2] if effector is not None and on_floor else None,
+        "expected": statistics.expected[0],
         "shape": [SHAPES[shape] if same_unit else None for shape in statistics.shape[0]],
-        "numbers": {name: _json(getattr(statistics, name)[0]) for name in NUMBERS} | unknown,
+        "numbers": {name: getattr(statistics, name)[0] for name in NUMBERS} | unknown,
         "particles": 0 if cloud is None else len(cloud[0]),
     }
     floats = [] if cloud is None else [np.ascontiguousarray(part, dtype="<f4").tobytes() for part in cloud]
-    return EncodedMaps(maps, on_floor, json.dumps(description), b"".join([*floats, cells.astype("<u2").tobytes()]))
+    content = b"".join([*floats, cells.astype("<u2").tobytes()])
+    return EncodedMaps(maps, on_floor, json.dumps(as_json(description)), content)
 
 
 def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
@@ -116,8 +116,3 @@ def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.f
     span = np.clip(top - log.min(axis=(1, 2), keepdims=True), 1e-6, LOG_RANGE)
     q = np.rint((np.maximum(log - top, -span) / span + 1.0) * LEVELS).astype(np.uint16)
     return q, top[:, 0, 0], span[:, 0, 0]
-
-
-def _json(array: NDArray[Any]) -> Any:
-    """Nested lists, with None for NaN and infinity, which JSON does not have."""
-    return np.where(np.isfinite(array), array.astype(object), np.array(None)).tolist()
