@@ -20,6 +20,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.failures import by_episode
 from beliefscope.inspect.failures.events import Event, PhaseStatistics
+from beliefscope.inspect.failures.survey_json import EVENT_FIELDS
 from beliefscope.inspect.slices.report import ErrorSlice
 from beliefscope.inspect.slices.search import Condition
 
@@ -33,9 +34,7 @@ class PhaseInfo(Reply):
     over_represented: bool
 
 
-@fields_of(
-    Event, "episode", "step", "first", "last", "time", "first_time", "last_time", "phase", "other_phases", "error"
-)
+@fields_of(Event, *EVENT_FIELDS)
 class FailureEvent(Reply):
     """A failure event. error: per layer, m. link: the page's address that opens it. Times: s, or None."""
 

@@ -15,6 +15,12 @@ from beliefscope.inspect.failures.step_scores import Survey, scores_of
 MAX_EVENTS = 500
 """Events listed per score, worst first; the totals include all."""
 
+EVENT_FIELDS = (
+    *("episode", "step", "first", "last", "time", "first_time", "last_time", "phase", "other_phases"),
+    *("error", "ess", "effective_weights"),
+)
+"""Fields of an event that are listed as they are."""
+
 
 def survey_document(survey: Survey, link: Callable[[Event, str], str]) -> dict[str, Any]:
     """A survey as JSON: its failures by each score of the task, and its episodes; SI units.
@@ -49,23 +55,8 @@ def survey_document(survey: Survey, link: Callable[[Event, str], str]) -> dict[s
 def _ranking(failures: Failures, link: Callable[[Event, str], str]) -> dict[str, Any]:
     over_represented = {phase.name for phase in failures.over_represented}
     events = [
-        {
-            "episode": event.episode,
-            "step": event.step,
-            "first": event.first,
-            "last": event.last,
-            "time": event.time,
-            "first_time": event.first_time,
-            "last_time": event.last_time,
-            "value": event.score,
-            "phase": event.phase,
-            "other_phases": event.other_phases,
-            "error": event.error,
-            "nees": event.nees[-1],
-            "ess": event.ess,
-            "effective_weights": event.effective_weights,
-            "link": link(event, failures.by),
-        }
+        {name: getattr(event, name) for name in EVENT_FIELDS}
+        | {"value": event.score, "nees": event.nees[-1], "link": link(event, failures.by)}
         for event in failures.worst(MAX_EVENTS)
     ]
     phases = [asdict(phase) | {"over_represented": phase.name in over_represented} for phase in failures.phases]
