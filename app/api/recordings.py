@@ -188,14 +188,11 @@ def _add_file_routes(app: FastAPI, files: RecordingFolder, matcher: RunMatcher) 
         await asyncio.to_thread(files.path_for_new, name)
         limit = max(0, min(MAX_UPLOAD, await asyncio.to_thread(free_space, files.folder) - RESERVED_SPACE))
         _check_size(int(request.headers.get("content-length", 0)), limit)
-        part = await asyncio.to_thread(files.partial_path)
-        try:
+        with files.partial_file() as part:
             await _receive(request, part, limit)
             info = await _unless_cancelled(request, asyncio.wrap_future(files.examine(part)))
             recording = await asyncio.to_thread(files.add, part, name, info)
             return await asyncio.to_thread(matcher.entry, recording)
-        finally:
-            part.unlink(missing_ok=True)
 
     @app.patch("/api/recordings/{name}.rrd")
     def rename(name: str, body: NewName) -> RecordingEntry:

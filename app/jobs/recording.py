@@ -47,12 +47,9 @@ def write(
             yield run.map(step, FINE, MapOptions(quantity=quantity))
             report(count / len(steps), f"likelihood maps, {count} of {len(steps)}")
 
-    part = files.partial_path()
-    try:
+    with files.partial_file() as part:
         write_recording(trace, part, maps(), diagnostics=quick(trace, run.checkpoint))
         files.publish(part, path, RecordingInfo.from_json(describe(part), part))
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def open_run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:

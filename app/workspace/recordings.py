@@ -12,7 +12,7 @@ import unicodedata
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -97,10 +97,15 @@ class RecordingFolder:
             raise NameTaken(f"A recording {path.name!r} already exists. Choose another name.")
         return path
 
-    def partial_path(self) -> Path:
-        """Path for a partial file. The caller deletes it."""
+    @contextmanager
+    def partial_file(self) -> Iterator[Path]:
+        """Yields the path for a partial file, which is deleted at the end of the block unless it was moved."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        return self.folder / f".{uuid.uuid4().hex}.part"
+        path = self.folder / f".{uuid.uuid4().hex}.part"
+        try:
+            yield path
+        finally:
+            path.unlink(missing_ok=True)
 
     def examine(self, path: Path) -> Future[RecordingInfo]:
         """Read a file in a subprocess, one at a time. The future raises BadInput if Rerun cannot read the file."""
