@@ -26,7 +26,7 @@ BLOCK = 16
 
 @dataclass(frozen=True)
 class ScoredRuns(Diagnostic):
-    """Runs of a filter, of which a result by one score is.
+    """A result by one score over runs of a filter.
 
     Attributes:
         task, filter, checkpoint_hash, faults, seed, particles: of the runs.
