@@ -76,11 +76,16 @@ def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
     the filter, and the sensors, do not change.
     """
     cause = _in_predictions_of_run(cause)
-    if not has_true_starts or (cause.component in OF_DYNAMICS and cause.name != JACOBIAN.name):
+    if not has_true_starts:
         return cause
+    if cause.name == "dynamics.broken":  # a gain of the predicted changes is one of their spread about the slope, too
+        first, _ = cause.symptoms
+        return replace(cause, symptoms=(first, Symptom("dynamics spread/*", 1)))
+    if cause.component in OF_DYNAMICS and cause.name not in (DRIFT.name, JACOBIAN.name):
+        return cause
+    unchanged = ("measurement function/",) if cause.name == DRIFT.name else OF_TRUE_STATES
     patterns = cause.consequences.replace(DYNAMICS, f"{_dynamics('offset', 'scatter')}|{FILTER}").split("|")
-    kept = (p for p in patterns if not p.startswith(OF_TRUE_STATES))
-    return replace(cause, consequences="|".join(kept))
+    return replace(cause, consequences="|".join(p for p in patterns if not p.startswith(unchanged)))
 
 
 def _in_predictions_of_run(cause: Cause) -> Cause:

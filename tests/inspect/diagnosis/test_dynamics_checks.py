@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart, drive
+from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart, drive, loaded as of_cart, profile
 from tests.inspect.diagnosis.test_innovation_checks import Boat, loaded, sail
 
 import beliefscope as bs
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.diagnosis.catalog import causes_in
+from beliefscope.inspect.diagnosis.cause import matches
+from beliefscope.inspect.diagnosis.causes.external_filters import OF_DYNAMICS, OF_TRUE_STATES
+from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.dynamics_checks import (
     dynamics_statistics,
     has_true_starts,
@@ -144,3 +148,22 @@ def test_jacobians_do_not_depend_on_wrong_readings_of_other_sensors() -> None:
         values = jacobian_statistics(bs.trace(checkpoint, [episode]), checkpoint)
         for key in ("radar", "compass"):
             assert values[f"measurement jacobian/{key}/all"] < 0.02
+
+
+def test_only_faults_of_the_dynamics_explain_them() -> None:
+    """In filters whose single steps can start at true states."""
+    names = [f"{kind}x/all" for kind in OF_TRUE_STATES]
+    explaining: dict[type, set[str]] = {}
+    for filter_ in (Cart(), Started()):
+        causes = causes_in(cart(filter_))
+        explaining[type(filter_)] = {c.component for c in causes if any(matches(c.consequences, n) for n in names)}
+    assert explaining[Cart] == set(OF_DYNAMICS)
+    assert explaining[Started] > explaining[Cart] | {"resampling", "measurement_noise.front", "front"}
+
+
+@pytest.mark.slow
+def test_predicted_changes_that_are_all_too_small_are_not_broken() -> None:
+    record = profile()
+    result = diagnose(of_cart(Cart(gain=0.6)), {seed: drive(seed) for seed in range(20, 30)}, profile=record)
+    assert result.causes[0].cause.name == "dynamics.frozen"
+    assert result.causes[0].probability > 0.9
