@@ -77,6 +77,18 @@ def run_sweep(
     return pq.read_table(folder / f"{RESULTS}.parquet")
 
 
+def replaced_results(cells: Iterable[Cell], folder: Path) -> int:
+    """Number of results (checkpoint, data set, faults, seed) in the tables of a folder that a sweep replaces."""
+    columns = ("checkpoint", "data", "faults", "seed")
+    try:
+        table = pq.read_table(folder / f"{RESULTS}.parquet", columns=[*columns])
+    except (OSError, pa.ArrowInvalid):
+        return 0
+    rows = table.group_by([*columns]).aggregate([]).to_pylist()
+    kept = {(cell.checkpoint_hash, cell.data_hash, cell.faults, cell.seed) for cell in cells}
+    return sum(tuple(row[name] for name in columns) not in kept for row in rows)
+
+
 def is_finished(cell: Cell, folder: Path) -> bool:
     """Whether the rows of a cell are stored completely."""
     try:

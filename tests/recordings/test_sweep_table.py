@@ -24,7 +24,15 @@ from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.sweep import Inputs, describe_checkpoint, summary
 from beliefscope.inspect.trace import trace
-from beliefscope.recordings.sweep_table import RESULTS, TABLES, Experiments, is_finished, run_sweep, write_tables
+from beliefscope.recordings.sweep_table import (
+    RESULTS,
+    TABLES,
+    Experiments,
+    is_finished,
+    replaced_results,
+    run_sweep,
+    write_tables,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -240,6 +248,19 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
         assert message in error
         assert error.count("\n") == 1
     assert "has no results of a sweep" in run("experiments", tmp_path)[2]
+
+
+def test_results_that_another_command_replaces_are_announced(
+    inputs: Inputs, sweep: Path, run: Run, tmp_path: Path
+) -> None:
+    assert replaced_results(inputs.cells(BLOCK), sweep) == 0
+    assert replaced_results(inputs.cells(BLOCK), tmp_path) == 0
+    folder = shutil.copytree(sweep, tmp_path / "sweep")
+    options = f"--particles {PARTICLES} --block {BLOCK} --faults '' --data {inputs.data[0]} -o {folder}"
+    _, _, notes = run(f"sweep --checkpoints {inputs.checkpoints[0]} {options}")
+    assert "will have the results of this command only, and lose 3 others; to keep them, stop" in notes
+    _, _, notes = run(f"sweep --checkpoints {inputs.checkpoints[0]} {options}")
+    assert "Warning" not in notes
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -1,8 +1,15 @@
+from __future__ import annotations
+
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.text import plural
+
+if TYPE_CHECKING:
+    from beliefscope.inspect.sweep import Cell, Inputs
 
 
 def sweep(
@@ -63,9 +70,7 @@ def sweep(
     cells = inputs.cells(block, skip=(lambda problem: console.note(f"skipped: {problem}")) if skip_bad else None)
     opt.check_output(output / "results.parquet" if output.is_dir() else output)
     output.mkdir(exist_ok=True)
-    used = {cell.checkpoint for cell in cells}
-    if idle := [path.name for path in inputs.checkpoints if path not in used]:
-        console.note(f"Warning: no data of their tasks, or copies of other checkpoints: {', '.join(idle)}")
+    _warn(inputs, cells, output)
     console.note(f"{plural(len(cells), 'cell')}; if interrupted, the same command resumes")
     with console.bars() as update:
         table = run_sweep(
@@ -85,3 +90,18 @@ def sweep(
         + (f"\n{plural(more, 'more row')}: {command} --top {len(overview)}" if more > 0 else ""),
         output / "results.parquet",
     )
+
+
+def _warn(inputs: Inputs, cells: Sequence[Cell], output: Path) -> None:
+    """Name checkpoints without cells, and the number of results in the tables that this sweep replaces."""
+    from beliefscope.recordings.sweep_table import replaced_results
+
+    used = {cell.checkpoint for cell in cells}
+    if idle := [path.name for path in inputs.checkpoints if path not in used]:
+        console.note(f"Warning: no data of their tasks, or copies of other checkpoints: {', '.join(idle)}")
+    if lost := replaced_results(cells, output):
+        console.note(
+            f"Warning: the tables in {output} will have the results of this command only, and lose "
+            f"{plural(lost, 'other')}; to keep them, stop with Ctrl-C and add their checkpoints, data and faults, or "
+            "choose another --output"
+        )
