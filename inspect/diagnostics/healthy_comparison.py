@@ -107,6 +107,8 @@ class Deviation:
     def text(self) -> str:
         """Label, value and healthy range, in the unit for display, without digits far below the range's width.
 
+        A value that differs from both ends of the range has enough digits, up to six, to show it.
+
         The healthy mean is within the range, from which a few values may move it.
         """
         unit, factor = self.conversion
@@ -114,7 +116,7 @@ class Deviation:
         digits = 1 - math.floor(math.log10(width)) if 0.0 < width < math.inf else 12
         mean = min(max(self.healthy, self.low), self.high)
         numbers = (round(factor * x, digits) + 0.0 for x in (self.value, mean, self.low, self.high))
-        value, healthy, low, high = map(_number, numbers)
+        value, healthy, low, high = _numbers(*numbers)
         return f"{self.label} is {_amount(value, unit)}, healthy {_amount(healthy, unit)} ({low} to {high})"
 
 
@@ -316,8 +318,17 @@ def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _number(value: float) -> str:
-    return f"{value:.0f}" if 10 <= abs(value) < LARGE else f"{value:.2g}"
+def _numbers(value: float, *healthy: float) -> list[str]:
+    """Texts with the fewest digits, two to six, in which the value differs from all healthy numbers; else with two."""
+    for digits in range(2, 7):
+        texts = [_number(x, digits) for x in (value, *healthy)]
+        if texts[0] not in texts[1:]:
+            return texts
+    return [_number(x) for x in (value, *healthy)]
+
+
+def _number(value: float, digits: int = 2) -> str:
+    return f"{value:.0f}" if 10 ** (digits - 1) <= abs(value) < LARGE else f"{value:.{digits}g}"
 
 
 def _amount(number: str, unit: str) -> str:

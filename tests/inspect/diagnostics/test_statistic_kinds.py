@@ -113,6 +113,13 @@ def test_a_deviation_is_written_in_its_unit() -> None:
     assert deviation.text == "RMS position error is 5 cm, healthy 1.7 cm (1.5 to 2.1)"
 
 
+def test_a_deviation_has_enough_digits_to_differ_from_the_healthy_range() -> None:
+    deviation = Deviation("nees//all", 1.0043, 1.001, 0.9996, 1.0021, 0.01, True, 3.0)
+    assert deviation.text == "NEES/n is 1.004, healthy 1.001 (0.9996 to 1.002)"
+    constant = Deviation("nees//all", 0.07, 0.07, 0.07, 0.07, 1.0, False, 0.0)
+    assert constant.text == "NEES/n is 0.07, healthy 0.07 (0.07 to 0.07)"
+
+
 def test_the_numbers_of_a_filter_that_diverges_have_an_exponent() -> None:
     deviation = Deviation("error//all", 1.8e17, 0.017, 0.015, 0.021, 0.01, True, 3.0, TASKS["door"])
     assert deviation.text == "RMS position error is 1.8e+19 cm, healthy 1.7 cm (1.5 to 2.1)"
