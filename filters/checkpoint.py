@@ -183,7 +183,9 @@ def _read(path: Path, prefix: str | None = "") -> tuple[dict[str, Any], dict[str
     """Header of a file, and the tensors whose names start with the prefix; None: no tensors."""
     check_not_source(str(path))
     if not path.is_file():
-        raise BadInput(f"checkpoint {str(path)!r} does not exist")
+        is_name = (PRETRAINED / f"{'-'.join(path.parts)}.safetensors").is_file()  # TASK/NAME
+        hint = f"; the pretrained filter of task {path.parts[0]!r} is named {path.name!r}" if is_name else ""
+        raise BadInput(f"checkpoint {str(path)!r} does not exist{hint}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -119,3 +119,12 @@ def test_a_task_of_the_user_has_no_pretrained_filter() -> None:
     own = replace(DOOR, name="own-door")
     with pytest.raises(BadInput, match=r"your own task 'own-door': train one \(beliefscope train FILE.py:TASK --data "):
         pretrained_path(own, "crossmodal-ekf")
+
+
+def test_the_error_for_task_and_name_of_a_pretrained_filter_has_its_name() -> None:
+    with pytest.raises(
+        BadInput, match=r"'door/image-pf' does not exist; the pretrained filter of task 'door' is named"
+    ):
+        load_checkpoint(Path("door/image-pf"))
+    with pytest.raises(BadInput, match=r"'door/nosuch' does not exist$"):
+        load_checkpoint(Path("door/nosuch"))
