@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -106,13 +107,14 @@ def test_another_filter_runs_over_the_healthy_episodes(open_page: Any, start_ser
     tank = runpy.run_path(str(TANK))
     write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(60)])
     options = ["--task", f"{TANK}:TASK", "--data", str(tmp_path / "tank.h5")]
-    filters = ["--filter", f"{tmp_path}/scaled.py:build", "--filter", f"{TANK}:build"]
+    shutil.copyfile(TANK, tmp_path / "tank_old.py")
+    filters = ["--filter", f"{tmp_path}/scaled.py:build", "--filter", f"{tmp_path}/tank_old.py:build"]
     page = open_page("?tab=diagnosis", url=start_server(*options, *filters).url)
     choice = page.page.locator("#diagnosis > .healthy-filter select")
-    assert choice.locator("option").all_text_contents() == ["this filter", "tank-build"]
-    choice.select_option("tank-build")
+    assert choice.locator("option").all_text_contents() == ["this filter", "tank_old-build"]
+    choice.select_option("tank_old-build")
     page.page.get_by_role("button", name="Measure a healthy record").click()
     page.until("() => document.querySelector('#diagnosis').dataset.finding === 'fault'")
     about = page.page.locator("#diagnosis .about").text_content()
-    assert "Healthy record: 60 held-out episodes of tank, run by tank-build" in about
+    assert "Healthy record: 60 held-out episodes of tank, run by tank_old-build" in about
     page.screenshot("record-of-another-filter")
