@@ -68,6 +68,15 @@ def test_values_and_exports_match_the_engine_and_the_quantity_is_a_switch(
     np.testing.assert_allclose(
         cells[:, 2:4] - cells[:, :2], 100.0 * expected.centre[None].repeat(len(cells), 0), atol=2e-3
     )
+    page.page.keyboard.press("Escape")
+    for query, command in {"step 12": "Go toStep 12", "export csv": "ActionExport the maps as CSV"}.items():
+        page.page.keyboard.press("Escape")
+        page.page.keyboard.press("Control+k")
+        page.page.keyboard.type(query)
+        assert page.page.locator("#command-list > *").first.text_content() == command
+    with page.page.expect_download() as download:
+        page.page.keyboard.press("Enter")
+    assert download.value.suggested_filename == files["csv"].name
     drawing = ElementTree.parse(files["svg"]).getroot()
     assert len(drawing.findall(".//{*}clipPath")) == 3
     texts = [text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")]

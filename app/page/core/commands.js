@@ -59,14 +59,15 @@ export function commands(page) {
 }
 
 /**
- * Returns the command that a number as query stands for.
+ * Returns the command that a query such as `31` or `step 31` stands for.
  * @param {Page} page
  * @param {string} query
  * @returns {Command[]}
  */
 export function stepCommand(page, query) {
-  if (!/^\d+$/.test(query.trim())) return [];
-  const step = Number(query);
+  const match = query.trim().match(/^(?:step\s+)?(\d+)$/i);
+  if (!match) return [];
+  const step = Number(match[1]);
   return [{ group: 'Go to', title: `Step ${step}`, run: () => page.goTo(step) }];
 }
 
@@ -120,7 +121,7 @@ function actionCommands(page) {
     ['Undo the selection', 'ctrl z', () => page.undo.undo()],
     ['Redo the selection', 'ctrl shift z', () => page.undo.redo()],
     ['Jobs', 'j', () => page.jobs.toggle()],
-    ['Light or dark', 'd', () => page.theme.toggle()],
+    ['Light or dark theme', 'd', () => page.theme.toggle()],
     ['Introduction and examples', '', () => page.intro.show()],
     ['Tour', '', () => page.tour.start()],
   ];
@@ -129,8 +130,20 @@ function actionCommands(page) {
   return [
     ...listed,
     ...clickable('#report', 'Action'),
+    ...exportCommands(),
     ...clickable('#help', 'Action', 'Keyboard shortcuts', '?'),
   ];
+}
+
+/** @returns {Command[]} */
+function exportCommands() {
+  const buttons = [...document.querySelectorAll('#maps-options .export button')];
+  return buttons.flatMap((button) => {
+    const format = button.textContent ?? '';
+    const title = format === 'Copy' ? 'Copy the maps as an image' : `Export the maps as ${format}`;
+    const run = () => button instanceof HTMLButtonElement && button.click();
+    return [{ group: 'Action', title, run }];
+  });
 }
 
 /** @param {string} selector */
