@@ -34,10 +34,10 @@ from beliefscope.filters.external.adapter import (
     Values,
     check_values,
     copied,
-    derived,
     model_names,
     named_values,
 )
+from beliefscope.filters.external.derived_values import derived
 from beliefscope.filters.external.step_values import stacked
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing

@@ -40,7 +40,6 @@ from beliefscope.filters.external.adapter import (
     Values,
     check_values,
     copied,
-    derived,
     joined,
     model_names,
     named_values,
@@ -59,6 +58,7 @@ from beliefscope.filters.external.calls import (
     snapshot,
     steps_of,
 )
+from beliefscope.filters.external.derived_values import derived
 from beliefscope.filters.external.fingerprint import fingerprint
 from beliefscope.filters.external.module_weights import load_weights, pretrained_std
 from beliefscope.filters.external.step_values import StepValues, with_ancestors

@@ -16,7 +16,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.task_json import check_definition
 from beliefscope.datasets.text import plural
-from beliefscope.filters.external.adapter import check_values, derived
+from beliefscope.filters.external.adapter import check_values
+from beliefscope.filters.external.derived_values import derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.recordings.log_readers.arrays import Columns
@@ -36,8 +37,7 @@ from beliefscope.recordings.log_readers.table_folder import FILE
 
 Array = NDArray[np.float64]
 
-IRREGULAR = 0.01
-"""Deviation of a time from a constant step, relative to the step, above which the times are kept."""
+IRREGULAR = 0.01  # deviation of a time from a constant step, relative to the step, above which the times are kept
 
 LARGE, SMALL = 5.0, 0.05  # m, span of the positions above which they are displayed in m, and below which in mm
 

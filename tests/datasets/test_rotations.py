@@ -13,7 +13,7 @@ from beliefscope.datasets.task import Component, Task, rotation
 from beliefscope.datasets.task_json import task_from_json, task_to_json
 from beliefscope.filters.catalog import build
 from beliefscope.filters.evaluate import metrics
-from beliefscope.filters.external.adapter import derived
+from beliefscope.filters.external.derived_values import derived
 from beliefscope.filters.filter import Architecture
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.diagnostics.consistency import consistency

@@ -215,6 +215,10 @@ def test_hash_of_an_object_covers_its_arrays() -> None:
         ({"extra": {"a b": 1.0}}, r"extra value 'a b': a name has up to 80 letters, digits, - and _$"),
         ({"extra": {"a" * 81: 1.0}}, r"extra value 'a{81}': a name has up to 80 letters"),
         ({"extra": {"a": np.inf}}, "extra/a with a number that is not finite"),
+        (
+            {"effective_weights": np.array([[0.9], [0.9]])},
+            "effective_weights with the sum 1.8 over the K models, expected",
+        ),
         ({"extra": {"a": [1.0]}}, "returns extra/a as a list, expected an array or a Tensor"),
     ],
 )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.filters.external import adapter
+from beliefscope.filters.external import derived_values
 from beliefscope.filters.external.ancestors import ancestors as search, new_table, words_of
 from beliefscope.filters.external.step_values import BLOCK, StepValues, with_ancestors
 from beliefscope.filters.external.torchfilter_hooks import RESAMPLED
@@ -132,8 +132,8 @@ def test_moments_of_blocks_are_those_of_all_steps(monkeypatch: pytest.MonkeyPatc
     }
     results = []
     for block in (1, 400, 10**6):  # 1, 2 and all steps
-        monkeypatch.setattr(adapter, "BLOCK", block)
-        results.append(adapter.derived({k: v.clone() for k, v in values.items()}, find_task("door")))
+        monkeypatch.setattr(derived_values, "BLOCK", block)
+        results.append(derived_values.derived({k: v.clone() for k, v in values.items()}, find_task("door")))
     for name, value in results[0].items():
         # The order of sums over particles does not depend on the number of steps.
         assert torch.equal(value, results[1][name]), name
@@ -158,7 +158,7 @@ def test_moments_of_angles_do_not_depend_on_where_they_wrap() -> None:
     angle = turned["particles"][..., 2] + torch.pi
     turned["particles"][..., 2] = (angle + torch.pi) % (2.0 * torch.pi) - torch.pi
     assert (turned["particles"][..., 2].amax(2) - turned["particles"][..., 2].amin(2) > 6.0).all()
-    expected, result = adapter.derived(values, task), adapter.derived(turned, task)
+    expected, result = derived_values.derived(values, task), derived_values.derived(turned, task)
     for name in ("estimate_covariance", "modality_covariance"):
         torch.testing.assert_close(result[name], expected[name], atol=1e-6, rtol=1e-4)
     difference = task.difference(result["modality_mean"].numpy(), expected["modality_mean"].numpy())
