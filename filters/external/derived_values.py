@@ -1,4 +1,4 @@
-"""Values derived from those that an external filter returns: moments of particles, and posteriors of single models."""
+"""Moments of particles and posteriors of single models, from the values that an external filter returns."""
 
 from __future__ import annotations
 

@@ -38,6 +38,7 @@ from beliefscope.inspect.diagnosis.cause import (
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
+from beliefscope.inspect.diagnosis.wrong_noise import too_small
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
@@ -83,7 +84,9 @@ def healthy(case: Case) -> Diagnosis:
         overconfident = f"{'over' if nees > 1 else 'under'}confident (median NEES {nees:.2g})"
         headline = f"Healthy, though {overconfident}: {text}"
         if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
-            headline = f"Always {overconfident}, even in its healthy record; {text[:-1]}; try: {CONVENTIONS}."
+            noise = too_small(case.profile, case.inputs.checkpoint) if nees > 1 else None
+            reason, action = (f": {noise.finding}", noise.action) if noise else ("", CONVENTIONS)
+            headline = f"Always {overconfident}, even in its healthy record{reason}; {text[:-1]}; try: {action}."
     if defect := _turned(case) or _wrong_equations(case):
         headline = f"{defect}; otherwise {text}"
     return Diagnosis("healthy", False, headline, (), largest, _provenance(case, defect))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from beliefscope.inspect.diagnosis.dynamics_checks import (
     predictions_from_truth,
 )
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
+from beliefscope.inspect.healthy import profile_of
 
 STD = 0.005
 """Standard deviation of the cart's process noise, m."""
@@ -167,3 +170,26 @@ def test_predicted_changes_that_are_all_too_small_are_not_broken() -> None:
     result = diagnose(of_cart(Cart(gain=0.6)), {seed: drive(seed) for seed in range(20, 30)}, profile=record)
     assert result.causes[0].cause.name == "dynamics.frozen"
     assert result.causes[0].probability > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("filter_", "episode", "finding"),
+    [
+        (Boat(compass=0.01), sail, r"measurement noise is too small for its innovations \(compass: NIS/m \d+\)"),
+        (
+            Cart(noise=0.0003),
+            drive,
+            r"process noise is too small for the squared errors of its dynamics \(.: \d+ times Q",
+        ),
+    ],
+)
+def test_the_noise_of_a_filter_that_has_always_been_overconfident_is_named(
+    filter_: Boat | Cart, episode: Callable[[int], bs.Episode], finding: str
+) -> None:
+    """The comparison with its own record shows nothing."""
+    checkpoint = loaded(filter_) if isinstance(filter_, Boat) else of_cart(filter_)
+    record = profile_of(checkpoint, [episode(seed) for seed in range(12)], "clean")
+    result = diagnose(checkpoint, {seed: episode(seed) for seed in range(40, 43)}, profile=record)
+    start = rf"Always overconfident \(median NEES .*\), even in its healthy record: its {finding}"
+    assert re.match(start, result.headline), result.headline
