@@ -22,7 +22,7 @@ from beliefscope.inspect.diagnosis.causes import (
     particles,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
-from beliefscope.inspect.diagnosis.dynamics_checks import has_true_starts
+from beliefscope.inspect.diagnosis.true_starts import has_true_starts
 from beliefscope.inspect.statistics.reference_images import HAND
 
 CAUSES: tuple[Cause, ...] = (

@@ -10,15 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, axis_name
-from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
+from beliefscope.inspect.diagnosis.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import prediction, prediction_of
@@ -35,15 +32,8 @@ MIN_STEPS = 10
 ROUNDING = 1e-12
 """Largest variance that a prediction adds by rounding, relative to that of the states."""
 
-START_STD, PRECISION = 1e-3, 1e-5
-"""Standard deviation of the belief at a true state, relative to that of the states and to their largest value, since
-beliefs may have single precision. What a prediction adds to it is the process noise."""
-
 MOVED = 5.0
 """Smallest predicted change in standard deviations of the belief at a true state, which are also those of particles."""
-
-MOST_CALLS, MOST_PARTICLES = 60, 100_000
-"""Largest number of calls of a filter of single trajectories, and of particles of all steps together."""
 
 
 def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
@@ -113,7 +103,7 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     values = _lag(change, predicted, states.std(0))
     values |= _by_component(task, {"dynamics offset": measures.wrapped(task, predicted - change).mean(0)})
     if has_true_starts(checkpoint):
-        steps = steps[:: -(-len(steps) // most_steps(trace, checkpoint))]
+        steps = some_steps(trace, checkpoint)
         started = predictions_from_truth(trace, checkpoint, steps)
         if started is None:
             return values
@@ -131,19 +121,6 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     return values | _of_changes(task, residual, change, more, states.std(0))
 
 
-def has_true_starts(checkpoint: ExternalFilter) -> bool:
-    """Whether the filter is here, and can start a single step at a given belief."""
-    module = checkpoint.adapter.module
-    return not isinstance(checkpoint, UnavailableFilter) and is_stepwise(module) and not has_own_start(module)
-
-
-def most_steps(trace: Trace, checkpoint: ExternalFilter) -> int:
-    """Largest number of steps to start at true states."""
-    calls = len(trace) if checkpoint.adapter.batched else MOST_CALLS
-    particles = 1 if trace.particles is None else trace.particles.shape[1]
-    return max(MIN_STEPS, min(calls, MOST_PARTICLES // particles))
-
-
 def predictions_from_truth(
     trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]
 ) -> tuple[Array, Array | None] | None:
@@ -152,23 +129,15 @@ def predictions_from_truth(
     Each step is a call of the filter, or the second one if the first only updates the belief, as the belief is too
     certain to be changed by an update. None if the filter fails or reports no predictions.
     """
-    states, n = trace.episode.states.astype(np.float64), len(trace.task.components)
-    start_std = np.maximum(START_STD * states.std(0), PRECISION * np.maximum(np.abs(states).max(0), 1e-3))
-    before = states[steps - 1]
-    covariance = np.diag(np.square(start_std))
-    start = Gaussian(torch.from_numpy(before), torch.from_numpy(covariance).expand(len(steps), n, n))
+    before, start_std = trace.episode.states[steps - 1].astype(np.float64), smallest_std(trace)
     for calls in (1, 2):
-        episodes = [trace.episode.part(int(step) + 1 - calls, int(step) + 1) for step in steps]
-        try:
-            values, _ = checkpoint.run(episodes, trace.seed, start=start)
-        except BadInput:
-            return None
+        values = run_from_truth(trace, checkpoint, steps, start_std, calls)
         names = ("predicted_mean", "predicted_covariance", "particles", "prior_log_weights")
-        belief = prediction_of(trace.task, *(values[n][-1].numpy() if n in values else None for n in names))
+        belief = None if values is None else prediction_of(trace.task, *map(values.get, names))
         if belief is None:
             return None
         change = trace.task.difference(belief.mean, before)
-        added = None if belief.covariance is None else belief.covariance - covariance
+        added = None if belief.covariance is None else belief.covariance - np.diag(np.square(start_std))
         is_noisy = added is not None and (np.diagonal(added, axis1=-2, axis2=-1) > np.square(start_std)).any()
         if is_noisy or (np.abs(change) > MOVED * start_std).any():
             break

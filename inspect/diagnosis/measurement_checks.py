@@ -38,10 +38,15 @@ JUMP = 0.1
 """Smallest fall of the log-likelihood between them, relative to that of an innovation of a full turn."""
 
 
-def measurement_model_statistics(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
-    """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of noise and turns."""
+def measurement_model_statistics(
+    trace: Trace, models: Sequence[ReadingModel], near_truth: Trace | None = None
+) -> dict[str, float]:
+    """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of noise and turns.
+
+    near_truth: with other particles and their likelihoods, which show noise and functions; default: those of the run.
+    """
     models = [model.with_weak_channels() for model in models]
-    values, turns = _likelihoods(trace, models), _turns(trace, models)
+    values, turns = _likelihoods(near_truth or trace, models), _turns(trace, models)
     turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
     return _functions(trace, models) | values | turns
 

@@ -24,6 +24,7 @@ from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
+from beliefscope.inspect.diagnosis.true_starts import with_particles_near_truth
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
@@ -57,12 +58,14 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
 
     Statistics that do not apply are absent, such as those of measurement functions without models of the readings.
     """
+    has_truth = bool(np.isfinite(trace.episode.states).all())
     if isinstance(checkpoint, ExternalFilter):
         values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
-        values |= measurement_model_statistics(trace, readings) | jacobian_statistics(trace, checkpoint)
+        near_truth = with_particles_near_truth(trace, checkpoint) if has_truth else trace
+        values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
-    if np.isfinite(trace.episode.states).all():
+    if has_truth:
         values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
         values |= dynamics_statistics(trace, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}

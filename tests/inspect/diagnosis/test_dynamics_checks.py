@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,12 @@ from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import matches
 from beliefscope.inspect.diagnosis.causes.external_filters import OF_DYNAMICS, OF_TRUE_STATES
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.dynamics_checks import (
-    dynamics_statistics,
-    has_true_starts,
-    most_steps,
-    predictions_from_truth,
-)
+from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics, predictions_from_truth
+from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
+from beliefscope.inspect.diagnosis.model_checks import model_statistics
+from beliefscope.inspect.diagnosis.true_starts import has_true_starts, some_steps
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
-from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.healthy import profile_of, sensor_record
 
 STD = 0.005
 """Standard deviation of the cart's process noise, m."""
@@ -100,6 +99,21 @@ class ParticleCart(torch.nn.Module):
         }
 
 
+class SeeingCart(ParticleCart):
+    """Its weights ignore the likelihoods, and its particles stay where they are, so that it loses the state."""
+
+    def __init__(self, offset: float = 0.0, noise: float = 1.0) -> None:
+        super().__init__()
+        self.offset, self.noise = offset, noise
+
+    def forward(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        result = super().forward(observations=observations, controls=0.0 * controls)
+        errors = [
+            (observations[k][:, None] - self.particles - self.offset) / (self.noise * s) for k, s in SENSORS.items()
+        ]
+        return result | {"log_likelihood": torch.stack([-0.5 * e.square().sum(-1) for e in errors], 1)}
+
+
 def cart(filter_: Any) -> ExternalFilter:
     is_batched = isinstance(filter_, torch.nn.Module)
     adapter = bs.Adapter(filter_, batched=is_batched, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
@@ -122,9 +136,13 @@ def test_predicted_changes_are_the_controls_with_the_process_noise(filter_: Any,
 
 def test_their_number_is_limited() -> None:
     """By the calls of a filter of single trajectories, and by the particles of one of many."""
-    for filter_, most in ((Cart(), 60), (ParticleCart(), 50)):
-        checkpoint = cart(filter_)
-        assert most_steps(bs.trace(checkpoint, [drive(0)]), checkpoint) == most
+    one, many = loaded(Boat()), cart(ParticleCart())
+    steps = some_steps(bs.trace(one, [sail(3)]), one)
+    assert len(steps) == 60
+    assert set(np.diff(steps)) == {1, 2}
+    trace = bs.trace(many, [drive(0)])
+    assert len(some_steps(trace, many)) == 30
+    assert len(some_steps(replace(trace, particles=np.zeros((60, 30_000, 2), np.float32)), many)) == 10
 
 
 class Started(Cart):
@@ -193,3 +211,15 @@ def test_the_noise_of_a_filter_that_has_always_been_overconfident_is_named(
     result = diagnose(checkpoint, {seed: episode(seed) for seed in range(40, 43)}, profile=record)
     start = rf"Always overconfident \(median NEES .*\), even in its healthy record: its {finding}"
     assert re.match(start, result.headline), result.headline
+
+
+def test_likelihoods_show_the_measurement_model_of_a_filter_that_has_lost_the_state() -> None:
+    readings = sensor_record([drive(seed) for seed in range(20)]).readings
+    checkpoint = cart(SeeingCart(offset=0.03, noise=2.0))
+    trace = bs.trace(checkpoint, [drive(30)])
+    assert not any("front" in name for name in measurement_model_statistics(trace, readings))
+    values = model_statistics(trace, checkpoint, readings)
+    for key, std in SENSORS.items():
+        assert values[f"measurement noise/{key}/all"] == pytest.approx(2.0 * std, rel=0.1)
+        for axis in "xy":
+            assert values[f"measurement function/{key} {axis}/all"] == pytest.approx(0.03 / std, rel=0.3)

@@ -1,0 +1,90 @@
+"""Single steps of an external filter that start at true states: what they show does not depend on its other parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.external.calls import has_own_start, is_stepwise
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.innovations import AnyArray
+from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.trace import Trace
+
+START_STD, PRECISION = 1e-3, 1e-5
+"""Smallest standard deviation of a belief at a true state, relative to that of the states and to their largest value,
+since beliefs may have single precision. What a prediction adds to it is the process noise."""
+
+LARGEST_STD = 0.1
+"""Largest one, relative to that of the states, of particles whose likelihoods are compared."""
+
+MOST_CALLS, MOST_PARTICLES = 60, 300_000
+"""Largest number of calls of a filter of single trajectories, and of particles of all steps together."""
+
+
+def has_true_starts(checkpoint: ExternalFilter) -> bool:
+    """Whether the filter is here, and can start a single step at a given belief."""
+    module = checkpoint.adapter.module
+    return not isinstance(checkpoint, UnavailableFilter) and is_stepwise(module) and not has_own_start(module)
+
+
+def some_steps(trace: Trace, checkpoint: ExternalFilter) -> NDArray[np.intp]:
+    """Steps that are started at true states: counted ones, almost evenly spaced if they are not all."""
+    steps = 1 + np.flatnonzero(measures.counted(trace)[1:])
+    calls = len(steps) if checkpoint.adapter.batched else MOST_CALLS
+    particles = 1 if trace.particles is None else trace.particles.shape[1]
+    most = max(1, min(calls, MOST_PARTICLES // particles))
+    return steps if len(steps) <= most else steps[np.linspace(0, len(steps) - 1, most).round().astype(np.intp)]
+
+
+def smallest_std(trace: Trace) -> Array:
+    """(n,) smallest standard deviations of a belief at the states of an episode."""
+    states = trace.episode.states.astype(np.float64)
+    return np.maximum(START_STD * states.std(0), PRECISION * np.maximum(np.abs(states).max(0), 1e-3))
+
+
+def run_from_truth(
+    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], std: Array, calls: int = 1
+) -> dict[str, AnyArray] | None:
+    """Values of the steps (S, ...), SI units, by the last of some calls from the true states before them.
+
+    The beliefs at the states have standard deviations (n,). None if the filter fails.
+    """
+    before, covariance = trace.episode.states[steps - 1].astype(np.float64), np.diag(np.square(std))
+    start = Gaussian(torch.from_numpy(before), torch.from_numpy(covariance).expand(len(steps), *covariance.shape))
+    episodes = [trace.episode.part(int(step) + 1 - calls, int(step) + 1) for step in steps]
+    try:
+        values, _ = checkpoint.run(episodes, trace.seed, start=start)
+    except BadInput:
+        return None
+    return {name: value[-1].numpy() for name, value in values.items()}
+
+
+def with_particles_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace:
+    """The trace with particles and likelihoods of steps from true states, NaN at others.
+
+    Particles of a filter that has lost the state are too far from the readings to show its likelihood. Their spread at
+    the start is that of the estimates, within limits. The same trace if the steps cannot be run.
+    """
+    if trace.particles is None or trace.log_likelihood is None or not has_true_starts(checkpoint):
+        return trace
+    steps, states = some_steps(trace, checkpoint), trace.episode.states.astype(np.float64)
+    variance = np.nanmedian(np.diagonal(trace.estimate_covariance, axis1=-2, axis2=-1), axis=0).astype(np.float64)
+    largest, smallest = LARGEST_STD * states.std(0), smallest_std(trace)
+    std = np.maximum(np.minimum(np.sqrt(np.maximum(np.nan_to_num(variance), 0.0)), largest), smallest)
+    values = run_from_truth(trace, checkpoint, steps, std) if len(steps) else None
+    names = ("particles", "log_likelihood")
+    if values is None or any(name not in values for name in names):
+        return trace
+    filled: dict[str, Any] = {n: np.full((len(trace), *values[n].shape[1:]), np.nan, np.float32) for n in names}
+    for name, array in filled.items():
+        array[steps] = values[name]
+    return replace(trace, **filled)
