@@ -22,6 +22,9 @@ from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 
+INDEPENDENT = 0.15
+"""Largest deviation from 1 of the relative spread of independent draws."""
+
 NO_EVIDENCE = 1e-6
 """Variation of a log-likelihood over the particles of an episode, nats, below which its use cannot be seen."""
 
@@ -122,7 +125,7 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     """Of the particles that an external filter reports: those of ``equation_statistics`` that need no equations of it.
 
     ``prior ess`` is of the steps after a resampling, of all steps if there is none: not every filter resamples always.
-    ``ancestors`` and ``offspring`` are of the steps with a resampling.
+    ``ancestors`` and ``offspring`` (``relative_spread``) are of the steps with a resampling.
     ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
     to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it.
     """
@@ -137,7 +140,7 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
         offspring = _offspring(ancestors[resampled], len(resampled), count)
         expected = count * log_weights[torch.from_numpy(resampled)].exp().numpy()
         values["ancestors//all"] = float((offspring > 0).mean())
-        values["offspring//all"] = float(np.square(offspring - expected).mean())
+        values["offspring//all"] = relative_spread(offspring, expected)
     if trace.log_likelihood is None:
         return values
     values |= _absent_updates(trace)
@@ -184,6 +187,18 @@ def _likelihood_power(trace: Trace, filter_: MixtureParticleFilter, prior: Tenso
     weight = log_weights.exp() / len(log_weights)
     x, y = ((v - (weight * v).sum(-1, keepdim=True) * len(log_weights)) for v in (fused, log_weights - prior))
     return float((weight * x * y).sum() / (weight * x * x).sum().clamp_min(1e-12))
+
+
+def relative_spread(offspring: NDArray[np.int64], expected: NDArray[np.float64]) -> float:
+    """Mean square of the difference of numbers of offspring (T, M) from their expectations, relative to its own.
+
+    That of independent (multinomial) draws if it is close to it, else that of systematic resampling, so that it is
+    about 1 for either, whatever the weights.
+    """
+    squared, part = float(np.square(offspring - expected).mean()), expected % 1.0
+    independent = squared / max(float((expected * (1.0 - expected / expected.shape[1])).mean()), 1e-12)
+    systematic = squared / max(float((part * (1.0 - part)).mean()), 1e-12)
+    return independent if abs(independent - 1.0) < INDEPENDENT else systematic
 
 
 def _offspring(ancestors: NDArray[Any] | None, steps: int, count: int) -> NDArray[np.int64]:

@@ -28,8 +28,15 @@ Array = NDArray[np.float64]
 FORMAT = 3
 """Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 has other ``AT_ESTIMATES``."""
 
-AT_ESTIMATES = ("dynamics ", "process noise/", "measurement jacobian/", "prediction jacobian/", "correction slope/")
-"""Statistics of external filters that were those of its run; now those of its single steps from true states."""
+AT_ESTIMATES = (
+    "dynamics ",
+    "process noise/",
+    "measurement jacobian/",
+    "prediction jacobian/",
+    "correction slope/",
+    "offspring/",
+)
+"""Statistics of external filters: most were of its run, and are of single steps from true states."""
 SUFFIX = ".profile.json"
 """Of the file beside a pretrained checkpoint."""
 SENSORS_SUFFIX = ".sensors.json"

@@ -91,7 +91,7 @@ def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
 def _in_predictions_of_run(cause: Cause) -> Cause:
     changed = {
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
-        "process_noise": _dynamics("bias", "error", "offset", "spread"),
+        "process_noise": _dynamics("bias", "error", "offset", "scatter", "spread"),
         "measurement_noise": f"{DYNAMICS}|process noise/*",
         "measurement": f"{_dynamics('bias', 'error', 'nis', 'offset', 'scatter', 'slope', 'spread')}|process noise/*",
     }

@@ -17,7 +17,7 @@ from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.equation_checks import reported_particle_statistics
+from beliefscope.inspect.diagnosis.equation_checks import relative_spread, reported_particle_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 
@@ -86,6 +86,26 @@ def diagnosis(module: Particles) -> Diagnosis:
     return diagnose(filter_of(module), {seed: ride(seed) for seed in range(100, 106)}, profile=record())
 
 
+@pytest.mark.parametrize("spread", [0.1, 1.0, 3.0])
+def test_spread_of_offspring_does_not_depend_on_the_weights(spread: float) -> None:
+    """Of systematic and of independent resampling, but of one by the squares of the weights."""
+    rng, steps, count = np.random.default_rng(0), 200, 300
+    weights = np.exp(spread * rng.standard_normal((steps, count)))
+    weights /= weights.sum(1, keepdims=True)
+
+    def drawn(w: Any, pointers: Any) -> Any:
+        edges = np.cumsum(w, 1)
+        edges[:, -1] = 1.0
+        chosen = [np.searchsorted(edge, pointer) for edge, pointer in zip(edges, pointers, strict=True)]
+        return np.array([np.bincount(row, minlength=count) for row in chosen])
+
+    even, independent = (np.arange(count) + rng.random((steps, 1))) / count, rng.random((steps, count))
+    for pointers in (even, independent):
+        assert relative_spread(drawn(weights, pointers), count * weights) == pytest.approx(1.0, abs=0.1)
+    squares = weights**2 / (weights**2).sum(1, keepdims=True)
+    assert relative_spread(drawn(squares, even), count * weights) > (1.02 if spread < 1.0 else 2.0)
+
+
 def test_statistics_of_particles_that_a_filter_reports() -> None:
     healthy, half, off = (
         reported_particle_statistics(bs.trace(filter_of(module), [ride(0)], 0))
@@ -94,8 +114,7 @@ def test_statistics_of_particles_that_a_filter_reports() -> None:
     assert healthy["particles//all"] == 100.0
     assert healthy["prior ess//all"] == pytest.approx(1.0)
     assert off["prior ess//all"] < 0.3
-    # Multinomial: the variance M w (1 - w) of each number of offspring, which sums to less than M.
-    assert 0.3 < healthy["offspring//all"] < 1.0
+    assert healthy["offspring//all"] == pytest.approx(1.0, abs=0.15)
     assert 0.2 < healthy["ancestors//all"] < 0.64
     assert "offspring//all" not in off
     shares = [{k: values[f"likelihood share/{k}/all"] for k in STD} for values in (healthy, half, off)]
