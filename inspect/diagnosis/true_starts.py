@@ -26,8 +26,11 @@ since beliefs may have single precision. What a prediction adds to it is the pro
 LARGEST_STD = 0.1
 """Largest one, relative to that of the states, of particles whose likelihoods are compared."""
 
-MOST_CALLS, MOST_PARTICLES = 60, 300_000
+MOST_CALLS, MOST_PARTICLES = 60, 100_000
 """Largest number of calls of a filter of single trajectories, and of particles of all steps together."""
+
+LEAST_STEPS = 12
+"""Smallest number of steps, and of those with a reading of each modality."""
 
 
 def has_true_starts(checkpoint: ExternalFilter) -> bool:
@@ -41,7 +44,10 @@ def some_steps(trace: Trace, checkpoint: ExternalFilter) -> NDArray[np.intp]:
     steps = 1 + np.flatnonzero(measures.counted(trace)[1:])
     calls = len(steps) if checkpoint.adapter.batched else MOST_CALLS
     particles = 1 if trace.particles is None else trace.particles.shape[1]
-    most = max(1, min(calls, MOST_PARTICLES // particles))
+    return _evenly(steps, max(LEAST_STEPS, min(calls, MOST_PARTICLES // particles)))
+
+
+def _evenly(steps: NDArray[np.intp], most: int) -> NDArray[np.intp]:
     return steps if len(steps) <= most else steps[np.linspace(0, len(steps) - 1, most).round().astype(np.intp)]
 
 
@@ -76,7 +82,9 @@ def with_particles_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace
     """
     if trace.particles is None or trace.log_likelihood is None or not has_true_starts(checkpoint):
         return trace
-    steps, states = some_steps(trace, checkpoint), trace.episode.states.astype(np.float64)
+    states, counted = trace.episode.states.astype(np.float64), measures.counted(trace)
+    read = (1 + np.flatnonzero((counted & ~measures.absent(trace, m))[1:]) for m in trace.modalities)
+    steps = np.unique(np.concatenate([some_steps(trace, checkpoint), *(_evenly(at, LEAST_STEPS) for at in read)]))
     variance = np.nanmedian(np.diagonal(trace.estimate_covariance, axis1=-2, axis2=-1), axis=0).astype(np.float64)
     largest, smallest = LARGEST_STD * states.std(0), smallest_std(trace)
     std = np.maximum(np.minimum(np.sqrt(np.maximum(np.nan_to_num(variance), 0.0)), largest), smallest)

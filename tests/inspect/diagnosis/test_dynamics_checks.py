@@ -142,7 +142,7 @@ def test_their_number_is_limited() -> None:
     assert set(np.diff(steps)) == {1, 2}
     trace = bs.trace(many, [drive(0)])
     assert len(some_steps(trace, many)) == 30
-    assert len(some_steps(replace(trace, particles=np.zeros((60, 30_000, 2), np.float32)), many)) == 10
+    assert len(some_steps(replace(trace, particles=np.zeros((60, 30_000, 2), np.float32)), many)) == 12
 
 
 class Started(Cart):
