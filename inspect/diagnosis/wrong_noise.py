@@ -39,8 +39,7 @@ def too_small(profile: HealthyProfile, checkpoint: Checkpoint) -> WrongNoise | N
     if not isinstance(checkpoint, ExternalFilter) or not has_true_starts(checkpoint):
         return None
     if components := _too_large(profile, "dynamics nis"):
-        names = {component.name: display_name(component.name) for component in checkpoint.task.components}
-        listed = ", ".join(f"{names[name]}: {ratio:.{_digits(ratio)}f} times Q" for name, ratio in components)
+        listed = ", ".join(f"{display_name(name)}: {ratio:.{_digits(ratio)}f} times Q" for name, ratio in components)
         finding = f"its process noise is too small for the squared errors of its dynamics ({listed})"
         return WrongNoise(finding, "compare Q with the errors of the predictions, and check the dynamics")
     if modalities := _too_large(profile, "nis"):

@@ -26,9 +26,9 @@ from beliefscope.inspect.statistics.reference_images import Reference
 Array = NDArray[np.float64]
 
 FORMAT = 3
-"""Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 has other ``AT_ESTIMATES``."""
+"""Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 has other ``MEASURED_ANEW``."""
 
-AT_ESTIMATES = (
+MEASURED_ANEW = (
     "dynamics ",
     "process noise/",
     "measurement jacobian/",
@@ -36,7 +36,8 @@ AT_ESTIMATES = (
     "correction slope/",
     "offspring/",
 )
-"""Statistics of external filters: most were of its run, and are of single steps from true states."""
+"""Statistics of external filters that have changed: most were of the run, and are of single steps from true states."""
+
 SUFFIX = ".profile.json"
 """Of the file beside a pretrained checkpoint."""
 SENSORS_SUFFIX = ".sensors.json"
@@ -115,7 +116,7 @@ def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Chec
     profile = HealthyProfile.from_json(document)
     if document["format"] == FORMAT or not isinstance(checkpoint, ExternalFilter):
         return profile
-    kept = {name: v for name, v in profile.statistics.items() if not name.startswith(AT_ESTIMATES)}
+    kept = {name: v for name, v in profile.statistics.items() if not name.startswith(MEASURED_ANEW)}
     return replace(profile, statistics=kept)
 
 

@@ -76,8 +76,8 @@ def repeat_steps(trace: Trace, checkpoint: ExternalFilter, at_truth: bool = Fals
             repeated = RepeatedSteps(trace, checkpoint, steps, calls, beliefs=1 if at_truth else None)
             same = repeated.are_same(trace)
             if same.any():
-                known = same.all() and not at_truth
-                return repeated if known else RepeatedSteps(trace, checkpoint, steps[same], calls, at_truth)
+                is_complete = same.all() and not at_truth
+                return repeated if is_complete else RepeatedSteps(trace, checkpoint, steps[same], calls, at_truth)
         except (BadInput, KeyError):  # the filter refuses a changed belief, or does not report all values
             return None
     return None
