@@ -59,6 +59,9 @@ EVIDENCE = 5
 LARGEST = 3
 """Maximum number of listed deviations without an alarm."""
 
+EFFECT = "dynamics effect/"
+"""Statistics of the effects of controls."""
+
 MAX_NEES = 2.0
 """Largest ratio of a healthy record's NEES to 1, and of 1 to it, that the headline does not mention."""
 
@@ -346,11 +349,13 @@ def _lower(title: str) -> str:
 def channels_text(case: Case, cause: Cause) -> str:
     """The channels of a sensor or of the controls that a cause concerns: `` (elbow)``. Empty for all, or without names.
 
-    Channels with more than half of the largest deviation.
+    Channels with more than half of the largest deviation. Of dynamics, the controls with a wrong effect.
     """
-    task, key = case.inputs.checkpoint.task, cause.component.rpartition(".")[2]
+    task, key, alarms = case.inputs.checkpoint.task, cause.component.rpartition(".")[2], symptoms_of(cause, case.alarms)
+    if key == "dynamics" and matches(cause.consequences, f"{EFFECT}control"):
+        key, alarms = "control", [alarm for alarm in case.alarms if alarm.statistic.startswith(EFFECT)]
     largest: dict[str, float] = {}
-    for alarm in symptoms_of(cause, case.alarms):
+    for alarm in alarms:
         if channel := channel_of(alarm.statistic.split("/")[1], task):
             largest.setdefault(channel[1].name.removeprefix(f"{key} "), abs(alarm.t))
     limit = 0.5 * max(largest.values(), default=0.0)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task, axis_name
@@ -15,10 +14,11 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
+from beliefscope.inspect.diagnosis.control_effects import control_effects
+from beliefscope.inspect.diagnosis.true_starts import has_true_starts, predictions_from_truth, some_steps
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import prediction, prediction_of
+from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.statistics.signals import lag
 from beliefscope.inspect.trace import Trace
@@ -32,9 +32,6 @@ MIN_STEPS = 10
 ROUNDING = 1e-12
 """Largest variance that a prediction adds by rounding, relative to that of the states."""
 
-MOVED = 5.0
-"""Smallest predicted change in standard deviations of the belief at a true state, which are also those of particles."""
-
 
 def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
     """``KIND/COMPONENT/all`` -> value, SI units, with residual r of the predicted change, and process noise q.
@@ -47,7 +44,7 @@ def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     Of this project's filters also ``opposed/control``, of controls that do not command a measured hand: log-ratio of
     the size of r to that with the opposite sign of the channel; 0 if the present sign fits better. Of external filters
     also ``dynamics offset``: mean residual of the run's predictions, which start at the filter's estimates; it differs
-    between episodes if the filter does not estimate a bias.
+    between episodes if the filter does not estimate a bias; and ``dynamics effect`` of ``control_effects``.
     """
     if isinstance(checkpoint, ExternalFilter):
         return external_dynamics_statistics(trace, checkpoint)
@@ -107,7 +104,8 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
         started = predictions_from_truth(trace, checkpoint, steps)
         if started is None:
             return values
-        change, predicted, added = task.difference(states[steps], states[steps - 1]), *started
+        change, predicted, added = task.difference(states[steps], states[steps - 1]), started.change, started.added
+        values |= control_effects(trace, checkpoint, steps, started, change)
     else:
         added = None
         if belief.covariance is not None and trace.has_covariance:
@@ -119,29 +117,6 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
         variance = np.where(variance > ROUNDING * np.square(states.std(0)), variance, np.nan)
         more = {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
     return values | _of_changes(task, residual, change, more, states.std(0))
-
-
-def predictions_from_truth(
-    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]
-) -> tuple[Array, Array | None] | None:
-    """Predicted changes (S, n) from the true states before the steps (S,), and the added covariance (S, n, n).
-
-    Each step is a call of the filter, or the second one if the first only updates the belief, as the belief is too
-    certain to be changed by an update. None if the filter fails or reports no predictions.
-    """
-    before, start_std = trace.episode.states[steps - 1].astype(np.float64), smallest_std(trace)
-    for calls in (1, 2):
-        values = run_from_truth(trace, checkpoint, steps, start_std, calls)
-        names = ("predicted_mean", "predicted_covariance", "particles", "prior_log_weights")
-        belief = None if values is None else prediction_of(trace.task, *map(values.get, names))
-        if belief is None:
-            return None
-        change = trace.task.difference(belief.mean, before)
-        added = None if belief.covariance is None else belief.covariance - np.diag(np.square(start_std))
-        is_noisy = added is not None and (np.diagonal(added, axis1=-2, axis2=-1) > np.square(start_std)).any()
-        if is_noisy or (np.abs(change) > MOVED * start_std).any():
-            break
-    return change, added
 
 
 def _lag(change: Array, predicted: Array, std: Array) -> dict[str, float]:

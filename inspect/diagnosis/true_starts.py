@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import AnyArray
+from beliefscope.inspect.statistics.innovations import AnyArray, prediction_of
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.trace import Trace
 
@@ -28,6 +28,9 @@ LARGEST_STD = 0.1
 
 MOST_CALLS, MOST_PARTICLES = 60, 100_000
 """Largest number of calls of a filter of single trajectories, and of particles of all steps together."""
+
+MOVED = 5.0
+"""Smallest predicted change in standard deviations of the belief at a true state, which are also those of particles."""
 
 LEAST_STEPS = 12
 """Smallest number of steps, and of those with a reading of each modality."""
@@ -57,16 +60,73 @@ def smallest_std(trace: Trace) -> Array:
     return np.maximum(START_STD * states.std(0), PRECISION * np.maximum(np.abs(states).max(0), 1e-3))
 
 
+@dataclass(frozen=True)
+class Predictions:
+    """Predictions of S single steps from the true states before them, SI units.
+
+    Attributes:
+        change: (S, n) predicted changes.
+        added: (S, n, n) covariance that is added to that of the start; None without covariances.
+        calls: of the filter in each step.
+    """
+
+    change: Array
+    added: Array | None
+    calls: int
+
+
+def predictions_from_truth(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> Predictions | None:
+    """Predictions of some steps (S,).
+
+    Each step is a call of the filter, or the second one if the first only updates the belief, as the belief is too
+    certain to be changed by an update. None if the filter fails or reports no predictions.
+    """
+    square = np.square(smallest_std(trace))
+    for calls in (1, 2):
+        predictions = predictions_by_calls(trace, checkpoint, steps, calls)
+        if predictions is None:
+            return None
+        added = predictions.added
+        is_noisy = added is not None and (np.diagonal(added, axis1=-2, axis2=-1) > square).any()
+        if is_noisy or (np.abs(predictions.change) > MOVED * np.sqrt(square)).any():
+            break
+    return predictions
+
+
+def predictions_by_calls(
+    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], calls: int, controls: Array | None = None
+) -> Predictions | None:
+    """Those of ``predictions_from_truth`` by a number of calls, with the episode's controls or other ones (S, m)."""
+    std = smallest_std(trace)
+    values = run_from_truth(trace, checkpoint, steps, std, calls, controls)
+    names = ("predicted_mean", "predicted_covariance", "particles", "prior_log_weights")
+    belief = None if values is None else prediction_of(trace.task, *map(values.get, names))
+    if belief is None:
+        return None
+    change = trace.task.difference(belief.mean, trace.episode.states[steps - 1].astype(np.float64))
+    added = None if belief.covariance is None else belief.covariance - np.diag(np.square(std))
+    return Predictions(change, added, calls)
+
+
 def run_from_truth(
-    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], std: Array, calls: int = 1
+    trace: Trace,
+    checkpoint: ExternalFilter,
+    steps: NDArray[np.intp],
+    std: Array,
+    calls: int = 1,
+    controls: Array | None = None,
 ) -> dict[str, AnyArray] | None:
     """Values of the steps (S, ...), SI units, by the last of some calls from the true states before them.
 
-    The beliefs at the states have standard deviations (n,). None if the filter fails.
+    The beliefs at the states have standard deviations (n,). controls: (S, m) those of all calls of a step; default: the
+    episode's. None if the filter fails.
     """
     before, covariance = trace.episode.states[steps - 1].astype(np.float64), np.diag(np.square(std))
     start = Gaussian(torch.from_numpy(before), torch.from_numpy(covariance).expand(len(steps), *covariance.shape))
     episodes = [trace.episode.part(int(step) + 1 - calls, int(step) + 1) for step in steps]
+    if controls is not None:
+        repeated = controls.astype(np.float32)[:, None].repeat(calls, axis=1)
+        episodes = [replace(episode, controls=own) for episode, own in zip(episodes, repeated, strict=True)]
     try:
         values, _ = checkpoint.run(episodes, trace.seed, start=start)
     except BadInput:

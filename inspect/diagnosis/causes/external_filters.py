@@ -19,7 +19,13 @@ def _dynamics(*kinds: str) -> str:
 JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*"
 """The derivative of the prediction may include the update of the step before."""
 
-OF_TRUE_STATES = (*(f"dynamics {kind}/" for kind in ("bias", "error", "nis", "slope", "spread")), "process noise/")
+EFFECTS = "dynamics effect/*"
+"""Effects of the controls on the state, relative to the predicted ones."""
+
+OF_TRUE_STATES = (
+    *(f"dynamics {kind}/" for kind in ("bias", "effect", "error", "nis", "slope", "spread")),
+    "process noise/",
+)
 """Statistics of predictions that start at true states."""
 
 OF_DYNAMICS = ("dynamics", "process_noise", "control", "labels", "data")
@@ -52,7 +58,7 @@ LARGE = Cause(
     "dynamics.large",
     "Predicted changes too large",
     (Symptom("dynamics slope/*"),),
-    f"{_dynamics('error', 'nis', 'spread')}|prediction jacobian/*|process noise/*|{FILTER}",
+    f"{_dynamics('effect', 'error', 'nis', 'spread')}|prediction jacobian/*|process noise/*|{FILTER}",
     "Check the time step, units and gains of the dynamics.",
 )
 """The opposite of ``dynamics.frozen``, such as with a time step that is too long."""
@@ -81,9 +87,15 @@ def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
     if cause.name == "dynamics.broken":  # a gain of the predicted changes is one of their spread about the slope, too
         first, _ = cause.symptoms
         return replace(cause, symptoms=(first, Symptom("dynamics spread/*", 1)))
+    if cause.name == "dynamics.inverted":  # of one control, such as one of two
+        return replace(cause, symptoms=(Symptom(EFFECTS, target="mirrored", otherwise=cause.symptoms),))
     if cause.component in OF_DYNAMICS and cause.name not in (DRIFT.name, JACOBIAN.name):
         return cause
-    unchanged = ("measurement function/",) if cause.name == DRIFT.name else OF_TRUE_STATES
+    unchanged = (
+        ("dynamics spread/", "measurement noise/", "measurement function/")
+        if cause.name == DRIFT.name
+        else OF_TRUE_STATES
+    )
     patterns = cause.consequences.replace(DYNAMICS, f"{_dynamics('offset', 'scatter')}|{FILTER}").split("|")
     return replace(cause, consequences="|".join(p for p in patterns if not p.startswith(unchanged)))
 
@@ -101,7 +113,7 @@ def _in_predictions_of_run(cause: Cause) -> Cause:
     # Predicted changes that are too small, such as those of a shorter time step, add too little noise as well.
     if cause.name == "dynamics.frozen":  # the spread of predictions depends on the process noise of particles
         cause = replace(cause, symptoms=(Symptom("dynamics slope/*", -1, target="shrunk"),))
-        consequences += "|dynamics spread/*"
+        consequences += f"|dynamics spread/*|{EFFECTS}"
     if cause.name not in ("dynamics.frozen", "dynamics.inverted"):
         return replace(cause, consequences=consequences)
     consequences += "|prediction jacobian/*"

@@ -20,10 +20,10 @@ from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import matches
 from beliefscope.inspect.diagnosis.causes.external_filters import OF_DYNAMICS, OF_TRUE_STATES
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics, predictions_from_truth
+from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts, some_steps
+from beliefscope.inspect.diagnosis.true_starts import has_true_starts, predictions_from_truth, some_steps
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.healthy import profile_of, sensor_record
 
@@ -128,10 +128,9 @@ def test_predicted_changes_are_the_controls_with_the_process_noise(filter_: Any,
     checkpoint, episode, steps = cart(filter_), drive(0), np.arange(1, 60, 7)
     result = predictions_from_truth(bs.trace(checkpoint, [episode]), checkpoint, steps)
     assert result is not None
-    change, added = result
-    np.testing.assert_allclose(change, episode.controls[steps], atol=error)
-    assert added is not None
-    np.testing.assert_allclose(np.sqrt(np.diagonal(added, axis1=1, axis2=2)), STD, rtol=0.1)
+    np.testing.assert_allclose(result.change, episode.controls[steps], atol=error)
+    assert result.added is not None
+    np.testing.assert_allclose(np.sqrt(np.diagonal(result.added, axis1=1, axis2=2)), STD, rtol=0.1)
 
 
 def test_their_number_is_limited() -> None:

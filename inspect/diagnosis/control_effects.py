@@ -1,0 +1,76 @@
+"""The effect of each control on the true changes of the state, relative to the one that an external filter predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.task import axis_name
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.diagnosis.true_starts import Predictions, predictions_by_calls
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.statistics.reading_features import monomials
+from beliefscope.inspect.trace import Trace
+
+STEPS = 30
+"""Smallest number of steps of each control, where there are so many; controls share a run by taking turns."""
+
+LEAST = 10
+"""Smallest number of steps beyond that of unknowns."""
+
+LARGEST_STD = 0.4
+"""Largest standard deviation of a slope."""
+
+OWN = 0.05
+"""Smallest part of an effect that does not follow from the state and the other controls, which explain the rest."""
+
+
+def control_effects(
+    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], predictions: Predictions, change: Array
+) -> dict[str, float]:
+    """``dynamics effect/CHANNEL/all``: slope of the true on the predicted effect of a control on the next state.
+
+    It is -1 for a wrong sign in the dynamics, and 1/2 if the dynamics take twice the control. The predicted effect is
+    the difference d of two predictions, with the control and with its median. The true changes (S, n) minus the second
+    prediction are ``slope * d`` plus errors of other parts of the dynamics, linear in the state and the other controls,
+    plus noise. The components of the state are weighted by the inverse variance of the noise. Absent where the control
+    changes nothing, only as the state does, or too little.
+    """
+    task, size = trace.task, trace.task.control_size
+    spacing = max(1, min(size, len(steps) // STEPS))
+    state = np.column_stack([np.ones(len(trace)), monomials(trace.episode, False, 1)])[steps - 1]
+    controls = trace.episode.controls[steps].astype(np.float64)
+    values = {}
+    for first in range(0, size, spacing):  # the same steps have the same random numbers in each run
+        channel = first + np.arange(len(steps)) % spacing
+        chosen = channel[:, None] == np.arange(size)
+        others = np.where(chosen, np.median(trace.episode.controls, axis=0), controls)
+        without = predictions_by_calls(trace, checkpoint, steps, predictions.calls, others)
+        if without is None:
+            return {}
+        effect = measures.wrapped(task, predictions.change - without.change)
+        rest = measures.wrapped(task, change - without.change)
+        for i in range(first, min(first + spacing, size)):
+            own = chosen[:, i]
+            slope = _slope(rest[own], effect[own], np.column_stack([state, np.delete(controls, i, axis=1)])[own])
+            if np.isfinite(slope):
+                values[f"dynamics effect/{axis_name('control', i, size)}/all"] = slope
+    return values
+
+
+def _slope(true: Array, predicted: Array, state: Array) -> float:
+    """Slope of true on predicted effects (S, n) besides linear functions of features (S, F); NaN if it is unknown."""
+    free = len(true) - state.shape[1] - 1
+    if free < LEAST:
+        return np.nan
+    basis, sizes, _ = np.linalg.svd(state / np.maximum(np.abs(state).max(0), 1e-12), full_matrices=False)
+    basis = basis[:, sizes > 1e-6 * sizes[0]]
+    y, d = (values - basis @ (basis.T @ values) for values in (true, predicted))
+    power, total = np.square(d).sum(0), np.square(predicted - predicted.mean(0)).sum(0)
+    has_own = (power > OWN**2 * total) & (power > 0.0)
+    y, d, power = y[:, has_own], d[:, has_own], power[has_own]
+    slopes = (d * y).sum(0) / power
+    variance = np.square(y - slopes * d).sum(0) / free
+    weights = power / np.maximum(variance, 1e-6 * power)
+    return float((weights * slopes).sum() / weights.sum()) if weights.sum() > 1.0 / LARGEST_STD**2 else np.nan
