@@ -31,6 +31,10 @@ NEAR = 3.0
 """Largest error of the reading expected at the nearest particle, relative to its noise: far from the readings, the
 likelihoods of all particles are a line, which does not show where their maximum is."""
 
+SEPARATE = 0.3
+"""Smallest singular value of the errors of all channels over the particles, each of length 1, that separates them. Two
+distances along one line have the same error for all particles but for a factor."""
+
 MIN_PARTICLES = 3
 """Smallest number of particles on either side of the angle at which readings jump by a turn."""
 
@@ -104,7 +108,8 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
     Its log-likelihoods over the particles of a step are ``c + sum_i s_i (b_i e_i - e_i^2 / 2)``, with the errors e of
     the readings expected at the particles, relative to their noise: s are the inverse ratios of the variances, and b
     the errors of its measurement function. Medians over the steps, of b without its sign; the noise is the geometric
-    mean of the standard deviations of all channels. Turns: share of steps with a b close to a full turn, of angles. Of
+    mean of the standard deviations of all channels. Channels that particles do not separate have their root mean square
+    error. Turns: share of steps with a b close to a full turn, of angles. Of
     modalities whose readings follow from the state and the controls of the step.
     """
     likelihood, particles = trace.log_likelihood, trace.particles
@@ -145,13 +150,21 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         noise = noise_of_readings / np.sqrt(power)
         values[f"measurement noise/{modality}/all"] = float(np.exp(np.log(noise).mean()))
         size = np.abs(fit[:, :count] / power)
-        bias = np.median(size, axis=0).tolist()
+        bias = np.median(size, axis=0)
+        if not _are_separate(columns[..., :count]):
+            bias = np.full(count, np.sqrt(np.square(bias).mean()))
         if (angles := np.concatenate([model.is_angle for model in sensors])).any():
             turned = np.abs(size * noise_of_readings - TURN)[:, angles] < NEAR_TURN
             values[f"innovation turns/{modality}/all"] = float(turned.any(1).mean())
         names = [axis_name(m.key, i, len(m.channels)) for m in sensors for i in m.channels]
-        values |= {f"measurement function/{name}/all": b for name, b in zip(names, bias, strict=True)}
+        values |= {f"measurement function/{name}/all": b for name, b in zip(names, bias.tolist(), strict=True)}
     return values
+
+
+def _are_separate(errors: Array) -> bool:
+    """Whether the errors (S, P, A) of some channels, without their means, differ over the particles of most steps."""
+    lengths = np.maximum(np.linalg.norm(errors, axis=1, keepdims=True), 1e-12)
+    return float(np.median(np.linalg.svd(errors / lengths, compute_uv=False)[:, -1])) > SEPARATE
 
 
 def _turns(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:

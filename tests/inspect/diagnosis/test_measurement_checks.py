@@ -68,11 +68,14 @@ def test_a_belief_before_each_update_is_that_of_its_measurement_function() -> No
     assert measurement_model_statistics(shared, models())[compass] > 5.0
 
 
-def with_likelihoods(trace: Trace, scale: float, offset: float) -> Trace:
-    """Particles around the estimates with Gaussian likelihoods of a scaled noise and of ranges with an offset, m."""
+def with_likelihoods(trace: Trace, scale: float, offset: float, spread: float | tuple[float, ...] = 0.3) -> Trace:
+    """Particles around the estimates with Gaussian likelihoods of a scaled noise and of ranges with an offset, m.
+
+    spread: standard deviation of the particles, of all components or of each.
+    """
     rng = np.random.default_rng(0)
     steps, count, n = len(trace), 80, trace.estimate_mean.shape[1]
-    particles = trace.estimate_mean[:, None] + rng.normal(0.0, 0.3, (steps, count, n))
+    particles = trace.estimate_mean[:, None] + rng.normal(0.0, spread, (steps, count, n))
     distance = np.hypot(particles[..., 0], particles[..., 1]) + offset
     expected = np.stack([distance, np.arctan2(particles[..., 1], particles[..., 0])], axis=-1)
     error = trace.episode.observations["radar"][:, None] - expected
@@ -89,6 +92,16 @@ def test_log_likelihoods_over_particles_show_noise_and_function(scale: float, of
     assert values["measurement noise/radar/all"] == pytest.approx(scale * math.sqrt(noise[0] * noise[1]), rel=0.03)
     assert rms(values)[0] == pytest.approx(offset / noise[0], abs=0.2)
     assert "measurement noise/compass/all" not in values, "likelihoods without evidence"
+
+
+def test_channels_that_the_particles_do_not_separate_have_the_same_error() -> None:
+    """Particles on a line show how much the measurement function of the radar is wrong, not in which channel."""
+    n = run(Boat()).estimate_mean.shape[1]
+    on_line = (0.3, *[0.0] * (n - 1))
+    right, wrong = (
+        measurement_model_statistics(with_likelihoods(run(Boat()), 1.0, d, on_line), models()) for d in (0.0, 0.6)
+    )
+    assert rms(wrong)[0] == rms(wrong)[1] > 3.0 * rms(right)[0]
 
 
 @pytest.mark.parametrize("wraps", [True, False])
