@@ -70,9 +70,15 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
 
     warm: prepare the first page's trace and Rerun's viewer in the background at startup. subprocess: run filters in a
     subprocess instead of a thread. access: required token and permissions.
+
+    Raises BadInput if the workspace cannot be created.
     """
-    with contextlib.suppress(FileExistsError):  # reported by the code that needs the folder
+    try:
         settings.workspace.mkdir(mode=0o700, parents=True)
+    except FileExistsError:  # reported by the code that needs the folder
+        pass
+    except OSError as error:
+        raise BadInput(f"workspace {str(settings.workspace)!r} cannot be created: {error.strerror}") from None
     delete_abandoned_parts(settings.workspace)
     store = TraceStore(settings, TraceWorker() if subprocess else None)
     views = Views(store, settings.views)

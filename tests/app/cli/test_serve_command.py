@@ -141,6 +141,11 @@ def test_data_define_the_task_of_filters(tmp_path: Path) -> None:
         filters("build", ["other"])
 
 
+def test_workspace_that_cannot_be_created(settings: Settings) -> None:
+    with pytest.raises(BadInput, match="workspace '/proc/none' cannot be created: No such file or directory"):
+        create_app(replace(settings, workspace=Path("/proc/none")), warm=False)
+
+
 def test_workspace_is_private(settings: Settings) -> None:
     create_app(settings, warm=False)
     assert stat.S_IMODE(settings.workspace.stat().st_mode) == 0o700
