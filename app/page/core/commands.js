@@ -16,6 +16,7 @@ const MAX_EPISODES = 30; // found by a query
  * @property {string} group
  * @property {string} title
  * @property {string} [keys] shortcut
+ * @property {string} [words] other words that find it
  * @property {() => void} run
  */
 
@@ -107,7 +108,7 @@ function tabCommands(page) {
  * @returns {Command[]}
  */
 function actionCommands(page) {
-  /** @type {[title: string, keys: string, run: () => void, control?: string][]} */
+  /** @type {[title: string, keys: string, run: () => void, control?: string, words?: string][]} */
   const actions = [
     ['Play or pause', 'space', () => page.clock.toggle()],
     ['Go to the finding', '', () => page.finding.goToMoment(performance.now())],
@@ -117,7 +118,7 @@ function actionCommands(page) {
     ['Whole episode in the timeline', '0', () => page.timeline.showAll()],
     ['Timeline axis: steps or seconds', '', () => page.switchTimeAxis()],
     ['Change of the maps from this step', 'm', () => page.maps.togglePin(), '#maps-options .pin'],
-    ['Save .rrd', 's', () => page.save(), '#save'],
+    ['Save .rrd', 's', () => page.save(), '#save', 'download export recording'],
     ['Undo the selection', 'ctrl z', () => page.undo.undo()],
     ['Redo the selection', 'ctrl shift z', () => page.undo.redo()],
     ['Jobs', 'j', () => page.jobs.toggle()],
@@ -126,10 +127,19 @@ function actionCommands(page) {
     ['Tour', '', () => page.tour.start()],
   ];
   const enabled = actions.filter(([, , , control]) => !control || isEnabled(control));
-  const listed = enabled.map(([title, keys, run]) => ({ group: 'Action', title, keys, run }));
+  const listed = enabled.map(([title, keys, run, , words]) => ({
+    group: 'Action',
+    title,
+    keys,
+    words,
+    run,
+  }));
   return [
     ...listed,
-    ...clickable('#report', 'Action'),
+    ...clickable('#report', 'Action').map((command) => ({
+      ...command,
+      words: 'figures tables pdf download export',
+    })),
     ...exportCommands(),
     ...clickable('#help', 'Action', 'Keyboard shortcuts', '?'),
   ];
@@ -142,7 +152,7 @@ function exportCommands() {
     const format = button.textContent ?? '';
     const title = format === 'Copy' ? 'Copy the maps as an image' : `Export the maps as ${format}`;
     const run = () => button instanceof HTMLButtonElement && button.click();
-    return [{ group: 'Action', title, run }];
+    return [{ group: 'Action', title, words: 'figure download save', run }];
   });
 }
 

@@ -61,7 +61,11 @@ export class CommandPalette {
 
   #draw() {
     const query = this.#input.value;
-    const matches = search(query, this.#all, ({ group, title }) => `${title} ${group}`);
+    const matches = search(
+      query,
+      this.#all,
+      ({ group, title, words = '' }) => `${title} ${group} ${words}`,
+    );
     this.#show([...this.#byQuery(query), ...matches]);
     this.#activate(0);
     clearTimeout(this.#timer);
