@@ -40,11 +40,13 @@ _process_lock = threading.Lock()
 
 
 CLIENT_HEAD = """<style>
+:root { color-scheme: light dark !important }
 [data-floating-window] { display: none !important; }
 body, div:has(> div > div > div > canvas) { background: none !important; }
 </style><script src="/static/scene/viser_frame_throttle.js"></script>"""
 """Hides viser's control panel, as the page has the controls of the scene, and its background, which is almost black in
-the dark theme: the page's is behind it. The script precedes viser's own."""
+the dark theme: the page's is behind it. A frame whose colour scheme differs from the page's would be opaque: white
+until viser has its theme. The script precedes viser's own."""
 
 
 def client_page() -> bytes:

@@ -24,7 +24,7 @@ from websockets.typing import Origin, Subprotocol
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.views.embedded_viser import MAX_CLIENTS, EmbeddedViser
+from beliefscope.app.views.embedded_viser import MAX_CLIENTS, EmbeddedViser, client_page
 from beliefscope.app.views.registry import Views
 from beliefscope.datasets.errors import BadInput
 
@@ -276,3 +276,9 @@ def test_concurrent_requests_do_not_exceed_the_limit(settings: Settings) -> None
         await views.close()
 
     asyncio.run(scenario())
+
+
+def test_frame_has_the_colour_scheme_of_the_page() -> None:
+    """Otherwise, browsers draw it on white until viser has its theme."""
+    head = client_page().partition(b"<script")[0]
+    assert b":root { color-scheme: light dark !important }" in head
