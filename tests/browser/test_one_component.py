@@ -19,8 +19,9 @@ def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: A
     tank = runpy.run_path(str(TANK))
     write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(5)])
     options = ["--task", f"{TANK}:TASK", "--data", str(tmp_path / "tank.h5"), "--filter", f"{TANK}:build"]
-    page = open_page(url=start_server(*options).url)
+    page = open_page(url=start_server(*options).url, scene=True)
     text = page.page.locator
+    page.until("() => document.querySelector('#diagnosis').checkVisibility()")  # instead of an empty scene
     page.page.keyboard.press("ArrowRight")
     page.settle(1)
     assert text("#heatmaps h3").all_text_contents() == ["thermometer", "pyrometer", "fused"]

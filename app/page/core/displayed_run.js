@@ -39,6 +39,8 @@ export class DisplayedRun {
   /** @type {Trace | null} */
   trace = null;
   failure = ''; // why the last trace could not be loaded
+  /** Task of the last trace. */
+  #task = '';
 
   /**
    * @param {Page} page
@@ -124,9 +126,22 @@ export class DisplayedRun {
     page.adaptMapMenu(trace);
     page.sceneMenu.show(trace);
     page.tabs?.show(trace);
+    this.#leaveEmptyScene(trace);
     this.#showComponent(trace);
     this.#move(trace);
     document.documentElement.classList.add('started');
+  }
+
+  /**
+   * Opens another tab than the scene if a new task has none.
+   * @param {Trace} trace
+   */
+  #leaveEmptyScene(trace) {
+    const { task, tab } = this.#store.state;
+    const isNew = task !== this.#task;
+    this.#task = task;
+    if (isNew && tab === 'scene' && trace.header.scene?.length === 0)
+      this.#store.set({ tab: 'diagnosis' });
   }
 
   /**
