@@ -118,11 +118,8 @@ def explain(cause: Cause, deviations: Iterable[Deviation]) -> Explanation:
         hits = [i for i, symptom in enumerate(cause.symptoms) if symptom.matches(name)]
         for i in hits:
             members[i].append(deviation)
-        if (
-            not hits
-            and not matches(cause.consequences, name)
-            and not (deviation.t < 0.0 and matches(cause.lowers, name))
-        ):
+        one_way = cause.lowers if deviation.t < 0.0 else cause.raises
+        if not hits and not matches(cause.consequences, name) and not matches(one_way, name):
             group = name.rpartition("/")[0]
             size = (OF_FILTER if matches(FILTER, name) else 1.0) * strength(abs(deviation.t))
             unexplained[group] = max(unexplained.get(group, 0.0), size)

@@ -35,13 +35,14 @@ DRIFT = Cause(
     "dynamics.drift",
     "Dynamics biased, differently in each episode",
     (Symptom("dynamics scatter/*"),),
-    f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|measurement noise/*|{FILTER}",
+    f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|{FILTER}",
     "Check the bias of its inputs that the filter should estimate, and its sign in the dynamics.",
+    raises="measurement noise/*",
     prior=0.1,
 )
 """A bias that the filter does not estimate, such as that of a gyroscope.
 
-If it has a state for it and no gain, its updates are not those from which the measurement noise is determined.
+If it has a state for it and no gain, its updates are smaller than those from which the measurement noise is determined.
 """
 
 JACOBIAN = Cause(
@@ -91,11 +92,7 @@ def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
         return replace(cause, symptoms=(Symptom(EFFECTS, target="mirrored", otherwise=cause.symptoms),))
     if cause.component in OF_DYNAMICS and cause.name not in (DRIFT.name, JACOBIAN.name):
         return cause
-    unchanged = (
-        ("dynamics spread/", "measurement noise/", "measurement function/")
-        if cause.name == DRIFT.name
-        else OF_TRUE_STATES
-    )
+    unchanged = ("dynamics spread/", "measurement function/") if cause.name == DRIFT.name else OF_TRUE_STATES
     patterns = cause.consequences.replace(DYNAMICS, f"{_dynamics('offset', 'scatter')}|{FILTER}").split("|")
     return replace(cause, consequences="|".join(p for p in patterns if not p.startswith(unchanged)))
 
