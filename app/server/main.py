@@ -77,8 +77,8 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         settings.workspace.mkdir(mode=0o700, parents=True)
     except FileExistsError:  # reported by the code that needs the folder
         pass
-    except OSError as error:
-        raise BadInput(f"workspace {str(settings.workspace)!r} cannot be created: {error.strerror}") from None
+    except OSError as failure:
+        raise BadInput(f"workspace {str(settings.workspace)!r} cannot be created: {failure.strerror}") from None
     delete_abandoned_parts(settings.workspace)
     store = TraceStore(settings, TraceWorker() if subprocess else None)
     views = Views(store, settings.views)
