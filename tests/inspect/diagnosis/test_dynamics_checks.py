@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tests.inspect.diagnosis.test_catalog import deviation
 from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart, drive, loaded as of_cart, profile
 from tests.inspect.diagnosis.test_innovation_checks import Boat, loaded, sail
 
@@ -23,6 +24,7 @@ from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
+from beliefscope.inspect.diagnosis.scoring import explain
 from beliefscope.inspect.diagnosis.true_starts import has_true_starts, predictions_from_truth, some_steps
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.healthy import profile_of, sensor_record
@@ -179,6 +181,14 @@ def test_only_faults_of_the_dynamics_explain_them() -> None:
         explaining[type(filter_)] = {c.component for c in causes if any(matches(c.consequences, n) for n in names)}
     assert explaining[Cart] == set(OF_DYNAMICS)
     assert explaining[Started] > explaining[Cart] | {"resampling", "measurement_noise.front", "front"}
+
+
+@pytest.mark.parametrize(("t", "explained"), [(5.0, True), (-5.0, False)])
+def test_a_bias_that_is_not_estimated_explains_only_larger_measurement_noise(t: float, explained: bool) -> None:
+    """Its updates are smaller, as with a larger R; a smaller R makes the estimates, and so the errors, worse."""
+    deviations = [deviation("dynamics scatter/x/all", 5.0), deviation("measurement noise/front/all", t)]
+    (drift,) = (cause for cause in causes_in(cart(Cart())) if cause.name == "dynamics.drift")
+    assert (explain(drift, deviations).unexplained == {}) == explained
 
 
 @pytest.mark.slow
