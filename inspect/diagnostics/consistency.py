@@ -31,7 +31,7 @@ from beliefscope.inspect.statistics.calibration import (
     particle_level,
 )
 from beliefscope.inspect.statistics.innovations import Whiteness, autocorrelations, nis_of, whiteness_of
-from beliefscope.inspect.statistics.intervals import mean_interval, too_few
+from beliefscope.inspect.statistics.intervals import LEVEL, mean_interval, nees_limit, too_few
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float64]
@@ -91,16 +91,17 @@ class Consistency(Diagnostic):
             return " ".join((*parts, f"{self.healthy.sentence} {fused.evidence}; 1 in theory."))
         parts += [f"{NO_RECORD} {_sentence(f'{fused.assessment} ({fused.evidence})')}"]
         candidates = [entry for entry in self.by_layer if entry.refusal is None]
+        few = too_few(self.trajectories)
         phases = [entry for entry in candidates if entry.layer == FUSED and entry.phase != ALL]
         worst = max(phases, key=inconsistency, default=fused)
         if worst.inconsistent and inconsistency(worst) > inconsistency(fused) + 2.0 * math.log(1.1):
             parts.append(f"Least consistent phase: {worst.phase}, {worst.assessment} ({worst.evidence}).")
-        elif phases and not any(entry.inconsistent for entry in (fused, *phases)):
+        elif phases and not few and not any(entry.inconsistent for entry in (fused, *phases)):
             parts.append(f"Also consistent in each phase: {', '.join(entry.phase for entry in phases)}.")
         unimodal = [entry for entry in candidates if entry.layer != FUSED]
-        if len(self.layers) > 2 and unimodal:
+        if len(self.layers) > 2 and unimodal and not few:
             parts.append(self._unimodal_sentence(unimodal))
-        if self.whiteness and too_few(self.trajectories) is None:
+        if self.whiteness and not few:
             parts.append(self._innovation_sentence())
         return " ".join(parts)
 
@@ -156,7 +157,8 @@ class Consistency(Diagnostic):
         error_rows: list[tuple[Value, ...]] = []
         for entry in self.by_layer:
             low, high = entry.interval
-            interval = "" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
+            limits = f"at least {low:.2f}" if math.isinf(high) else f"{low:.2f} to {high:.2f}"
+            interval = "" if math.isnan(low) else limits
             nis = None if math.isnan(entry.nis) else entry.nis
             head = (measures.layer_label(entry.layer), entry.phase)
             values = (entry.trajectories, entry.steps, entry.nees, interval, nis, entry.coverage95)
@@ -338,15 +340,19 @@ def _summarise(
     curve = calibration_curve(level)
     _, index, counts = np.unique(owner, return_inverse=True, return_counts=True)
     sums = np.bincount(index, steps["nees"])
-    (_, low, high), (_, lowest, highest) = (mean_interval(sums, counts, 1.0 - 0.05 / m) for m in (1, cells))
+    nees, levels = float(steps["nees"].mean()), (LEVEL, 1.0 - (1.0 - LEVEL) / cells)
+    intervals = [(float(low), float(high)) for _, low, high in (mean_interval(sums, counts, each) for each in levels)]
+    if too_few(len(counts)):
+        lowest = [nees / nees_limit(error.shape[1], each) for each in levels]
+        intervals = [(low, math.inf) if low > 1.0 else (math.nan, math.nan) for low in lowest]
     return LayerConsistency(
         layer=layer,
         phase=phase,
         trajectories=len(counts),
         steps=len(error),
-        nees=float(steps["nees"].mean()),
-        interval=(float(low), float(high)),
-        adjusted=(float(lowest), float(highest)),
+        nees=nees,
+        interval=intervals[0],
+        adjusted=intervals[1],
         nis=_known_mean(steps["nis"]),
         coverage95=float((level <= 0.95).mean()),
         calibration=curve,

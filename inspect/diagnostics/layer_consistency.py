@@ -25,7 +25,8 @@ class LayerConsistency:
         phase: phase name.
         trajectories, steps: number of episodes and steps in the phase.
         nees: mean of ``e^T S^-1 e / n``.
-        interval: 95 % interval of ``nees`` over episodes; NaN for too few of them.
+        interval: 95 % interval of ``nees`` over episodes; NaN for too few of them, unless ``nees`` is too large for any
+            number of steps of a consistent filter (``nees_limit``): then only its lower limit is known.
         adjusted: the same, simultaneous over all layers and phases (Bonferroni).
         nis: mean of the normalised innovation squared over n; NaN without innovations.
         coverage95: share of steps with the true state in the 95 % region.
@@ -61,7 +62,7 @@ class LayerConsistency:
         """Why there is no assessment, or None."""
         if self.steps < MIN_STEPS:
             return f"too few steps ({self.steps}; at least {MIN_STEPS} needed)"
-        return too_few(self.trajectories)
+        return too_few(self.trajectories) if math.isnan(self.interval[0]) else None
 
     @property
     def assessment(self) -> str:
@@ -84,6 +85,8 @@ class LayerConsistency:
         """NEES / n and its interval."""
         low, high = self.interval
         text = f"NEES/n {number(self.nees)}"
+        if math.isinf(high):
+            return f"{text}, with 95 % confidence at least {number(low)}"
         return text if math.isnan(low) else f"{text}, 95 % interval {number(low)} to {number(high)}"
 
 

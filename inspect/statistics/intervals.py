@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtr, stdtrit
+from scipy.special import bdtr, chdtrc, chdtri, stdtrit
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.number[Any]]
@@ -31,6 +31,17 @@ def too_few(trajectories: int) -> str | None:
     if trajectories >= MIN_TRAJECTORIES:
         return None
     return f"too few episodes ({trajectories}; at least {MIN_TRAJECTORIES} needed)"
+
+
+def nees_limit(n: int, level: float = LEVEL) -> float:
+    """Largest mean NEES / n of a consistent filter with n components, at any number and dependence of steps.
+
+    It is the mean of ``chi2_n / n`` beyond its quantile q of this level, ``P(chi2_(n + 2) > q) / P(chi2_n > q)``. Means
+    of dependent variables exceed this expected shortfall with at most the probability of the tail, as it is
+    subadditive (Acerbi and Tasche, Journal of Banking & Finance 26(7), 2002).
+    """
+    tail = 0.5 * (1.0 - level)
+    return float(chdtrc(n + 2, chdtri(n, tail)) / tail)
 
 
 def jackknife(sums: Array, statistic: Callable[[Array], Array], level: float = LEVEL) -> tuple[Array, Array, Array]:

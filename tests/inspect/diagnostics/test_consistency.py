@@ -138,6 +138,16 @@ def test_few_trajectories_qualify_the_verdict() -> None:
     assert len(consistency(plant.simulated(2)).curves()) == 0
 
 
+def test_one_trajectory_far_beyond_any_consistent_one_is_overconfident() -> None:
+    result = consistency(plant.simulated(1, scale=0.01))
+    fused = result.entry("fused")
+    assert fused.nees > 50.0
+    assert "Overconfident by a factor of" in result.verdict
+    assert "with 95 % confidence at least" in result.verdict
+    assert "consistent in each phase" not in result.verdict
+    assert any("fused" in alarm for alarm in result.alarms)
+
+
 def test_exact_particle_set_is_calibrated() -> None:
     """True states and particles of one distribution: levels are uniform, and the mean CRPS is s / sqrt(pi)."""
     rng = np.random.default_rng(3)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, mean_interval, too_few
+from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, mean_interval, nees_limit, too_few
 
 COVERAGE = runpy.run_path(str(Path(__file__).parents[3] / "bench" / "coverage.py"))
 REPEATS = 2000
@@ -57,6 +57,17 @@ def test_the_mean_of_a_diverging_quantity_is_above_its_median() -> None:
     value, low, high = mean_interval(np.array([3.0, 8.0, 1e3, 1e5, 1e8, 1e11]), np.ones(6))
     assert low == pytest.approx(3.0)
     assert low < value < high
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_dependent_steps_of_a_consistent_filter_exceed_the_limit_rarely(n: int) -> None:
+    """Equal steps are the worst case up to a factor of about e; independent ones hardly exceed 1."""
+    rng, limit = np.random.default_rng(n), nees_limit(n)
+    equal = rng.chisquare(n, 100_000) / n
+    assert 0.025 / 3.0 < (equal > limit).mean() < 0.025
+    tail = np.quantile(equal, 0.975)
+    assert limit == pytest.approx(equal[equal > tail].mean(), rel=0.02)
+    assert not (rng.chisquare(n, (1000, 50)).mean(1) / n > limit).any()
 
 
 def test_too_few_trajectories() -> None:
