@@ -76,7 +76,7 @@ class Cause:
         symptoms: deviations that the cause always produces.
         consequences: patterns of statistics that it may change as well.
         lowers: patterns of statistics that it may decrease, but not increase.
-        raises: those that it may increase, but not decrease.
+        raises: patterns of statistics that it may increase, but not decrease.
         undo: names of interventions that undo it (``inspect/diagnosis/undo.py``), joined by ``|``: the first one
             that is possible does; empty if there is none.
         next: next action; without its full stop if a command follows.
