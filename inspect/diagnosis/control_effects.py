@@ -8,16 +8,14 @@ from numpy.typing import NDArray
 from beliefscope.datasets.task import axis_name
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.true_starts import Predictions, predictions_by_calls
+from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.reading_features import monomials
 from beliefscope.inspect.trace import Trace
 
-STEPS = 30
-"""Smallest number of steps of each control, where there are so many; controls share a run by taking turns."""
-
 LEAST = 10
-"""Smallest number of steps beyond that of unknowns."""
+"""Smallest number of steps beyond that of unknowns; twice as many where there are enough."""
 
 LARGEST_STD = 0.4
 """Largest standard deviation of a slope."""
@@ -35,13 +33,15 @@ def control_effects(
     the difference d of two predictions, with the control and with its median. The true changes (S, n) minus the second
     prediction are ``slope * d`` plus errors of other parts of the dynamics, linear in the state and the other controls,
     plus noise. The components of the state are weighted by the inverse variance of the noise. Absent where the control
-    changes nothing, only as the state does, or too little.
+    changes nothing, only as the state does, or too little, and for controls that command a measured hand.
     """
     task, size = trace.task, trace.task.control_size
-    spacing = max(1, min(size, len(steps) // STEPS))
+    if commands_hand(task):
+        return {}
     state = np.column_stack([np.ones(len(trace)), monomials(trace.episode, False, 1)])[steps - 1]
     controls = trace.episode.controls[steps].astype(np.float64)
     values = {}
+    spacing = max(1, min(size, len(steps) // (state.shape[1] + size + 2 * LEAST)))  # controls take turns in a run
     for first in range(0, size, spacing):  # the same steps have the same random numbers in each run
         channel = first + np.arange(len(steps)) % spacing
         chosen = channel[:, None] == np.arange(size)
