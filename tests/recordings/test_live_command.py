@@ -32,6 +32,8 @@ def test_run_equals_trace(run: Run, assert_same: Compare, tmp_path: Path) -> Non
     document = json.loads(out)
     assert code == 0, err
     assert f"beliefscope serve --workspace {tmp_path}" in err
+    (name,) = (path.stem for path in (tmp_path / "live").glob("*.live"))
+    assert f"/?task=door&data=live%3A{name}" in err, "the page's link of the run"
     assert (document["steps"], document["stopped"], document["waited"]) == (100, False, 0)
     assert run(f"trace {line} -o {tmp_path}/run.trace")[0] == 0
     expected = load_trace(tmp_path / "run.trace")

@@ -27,6 +27,7 @@ def live(
       beliefscope live door --filter crossmodal-ekf --faults blackout=0.8 --rate 50 --workspace runs
       beliefscope live door --filter examples/04_own_filter.py:build --name mine
     """
+    from beliefscope.app.cli.commands.report import URL
     from beliefscope.app.protocol.permalinks import page_link
     from beliefscope.app.runs.live_runs import LIVE_PREFIX
     from beliefscope.recordings.live_episode import record_steps, run_steps
@@ -42,7 +43,7 @@ def live(
     recorder, steps = record_steps(*arguments, name, workspace / "live")
     watch = shlex.join(["beliefscope", "serve", "--workspace", str(workspace)])
     link = page_link(task=checkpoint.task.name, data=f"{LIVE_PREFIX}{recorder.path.stem}")  # of the run's only episode
-    console.note(f"{recorder.path}: view it with {watch} at http://127.0.0.1:8000/{link}")
+    console.note(f"{recorder.path}: view it with {watch} at {URL}/{link}")
     count = len(recorded)
     with console.bars() as update:
         timing = run_steps(
