@@ -29,6 +29,8 @@ def main(folder: Path) -> None:
 
     diagnosis: bs.Diagnosis = bs.diagnose(checkpoint, data, [9, 19], faults="image_frozen:from=40")
     print(diagnosis.headline)
+    healthy: bs.HealthyProfile = bs.healthy_record(checkpoint, data)  # the checkpoint has one; other filters need it
+    print(bs.diagnose(checkpoint, data, [9, 19], faults="blackout=0.8", profile_from=healthy).headline)
     metrics: bs.Metrics = bs.evaluate(checkpoint, data, [9, 19], faults="blackout=0.4", start_offset="3cm")
     print(metrics.rmse, metrics.nees, metrics.baselines["stay"])
     failures: bs.Failures = bs.find_failures(checkpoint, data, [9, 19], by="disagreement")

@@ -119,7 +119,8 @@ def profile_of(
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     lengths = [len(episode) for episode in episodes]
     steps = (min(lengths), max(lengths))
-    return HealthyProfile(data, len(rows), particles, columns, sensors.reference, sensors.readings, steps)
+    task = checkpoint.task.name
+    return HealthyProfile(data, len(rows), particles, columns, sensors.reference, sensors.readings, steps, task)
 
 
 def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> str | None:

@@ -168,9 +168,12 @@ def test_diagnosis_against_the_record_of_another_filter() -> None:
         return inputs["observations"]["gauge"] + 1.0
 
     assert bs.diagnose(wrong, data, profile_from=clean).state == "healthy"  # an error of its record
-    assert bs.diagnose(wrong, data, profile_from=clean, profile_filter=correct).state != "healthy"
-    with pytest.raises(bs.BadInput, match="profile_filter needs profile_from"):
-        bs.diagnose(wrong, data, profile_filter=correct)
+    record = bs.healthy_record(correct, clean)
+    assert record.episodes == len(clean)
+    assert bs.diagnose(wrong, data, profile_from=record).state != "healthy"
+    assert bs.diagnose(correct, data, profile_from=record) == bs.diagnose(correct, data, profile_from=clean)
+    with pytest.raises(bs.BadInput, match="healthy record of task tank, but crossmodal-ekf is of task door"):
+        bs.diagnose("door/crossmodal-ekf", "door", profile_from=record)
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,7 @@ class HealthyProfile:
         reference: healthy images; None in profiles of format 1 and for tasks without images.
         readings: models of the vector sensors of unknown physics; none in profiles of earlier versions.
         steps: smallest and largest number of steps of the trajectories; None in profiles of earlier versions.
+        task: name of the task of a profile that has just been measured; files belong to a filter.
     """
 
     data: str
@@ -69,6 +70,7 @@ class HealthyProfile:
     reference: Reference | None = None
     readings: tuple[ReadingModel, ...] = ()
     steps: tuple[int, int] | None = None
+    task: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, rounded to ``DIGITS``; NaN as null."""

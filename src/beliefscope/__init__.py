@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         export_page,
         find_failures,
         finetune,
+        healthy_record,
         inspect_run,
         load_filter,
         maps,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from beliefscope.inspect.compare.checkpoints import CheckpointComparison
     from beliefscope.inspect.diagnosis.cause import Diagnosis
     from beliefscope.inspect.diagnostics.base import Diagnostic
+    from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
     from beliefscope.inspect.failures.events import Failures
     from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
     from beliefscope.inspect.trace import Trace, load_trace, save_trace
@@ -49,8 +51,19 @@ __version__ = "0.2.0"
 
 _SOURCES = {
     "_interface": (
-        *("load_filter", "open_dataset", "save_dataset", "trace", "maps", "inspect_run", "diagnose", "evaluate"),
-        *("find_failures", "finetune", "compare", "sweep", "experiments", "record", "export_page", "serve"),
+        *("load_filter", "open_dataset", "save_dataset", "trace", "maps", "inspect_run", "evaluate"),
+        *(
+            "diagnose",
+            "healthy_record",
+            "find_failures",
+            "finetune",
+            "compare",
+            "sweep",
+            "experiments",
+            "record",
+            "export_page",
+            "serve",
+        ),
     ),
     "_notebook": ("show",),
     "datasets.covariate": ("Covariate",),
@@ -65,6 +78,7 @@ _SOURCES = {
     "inspect.compare.checkpoints": ("CheckpointComparison",),
     "inspect.diagnosis.cause": ("Diagnosis",),
     "inspect.diagnostics.base": ("Diagnostic",),
+    "inspect.diagnostics.healthy_profile": ("HealthyProfile",),
     "inspect.failures.events": ("Failures",),
     "inspect.maps.likelihood_map": ("LikelihoodMap",),
     "inspect.trace": ("Trace", "load_trace", "save_trace"),
@@ -89,6 +103,7 @@ __all__ = [
     "Experiments",
     "Failures",
     "Faults",
+    "HealthyProfile",
     "LikelihoodMap",
     "LiveRecorder",
     "Metrics",
@@ -102,6 +117,7 @@ __all__ = [
     "export_page",
     "find_failures",
     "finetune",
+    "healthy_record",
     "inspect_run",
     "load_filter",
     "load_trace",

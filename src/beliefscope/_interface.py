@@ -31,6 +31,7 @@ from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compar
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose as diagnose_episodes
 from beliefscope.inspect.diagnostics.base import Diagnostic
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.failures.events import Failures, find_failures as rank_failures
 from beliefscope.inspect.healthy import measure_profile, profile_of
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap, Quantity
@@ -153,6 +154,18 @@ def inspect_run(run: Trace, filter_: Filter | None = None) -> Mapping[str, Diagn
     return quick(run, None if filter_ is None else load_filter(filter_))
 
 
+def healthy_record(filter_: Filter, data: Data, episodes: Sequence[int] | None = None) -> HealthyProfile:
+    """Statistics of a filter over clean episodes, with which ``diagnose`` compares others.
+
+    Args:
+        episodes: indices; default: the held-out ones.
+    """
+    checkpoint = _filter(filter_, data)
+    source = _episodes(data, checkpoint)
+    indices = source.held_out() if episodes is None else episodes
+    return profile_of(checkpoint, [source[i] for i in indices], str(source.path), indices=indices)
+
+
 def diagnose(
     filter_: Filter,
     data: Data,
@@ -162,8 +175,7 @@ def diagnose(
     seed: int = 0,
     particles: int = 300,
     alarm_rate: float | None = None,
-    profile_from: Data | None = None,
-    profile_filter: Filter | None = None,
+    profile_from: Data | HealthyProfile | None = None,
 ) -> Diagnosis:
     """Name the probable cause of a fault, with evidence and the effect of undoing it (docs/diagnose.md).
 
@@ -171,21 +183,22 @@ def diagnose(
         episodes: indices; default: the held-out ones. faults: to inject first, to try the diagnosis.
         alarm_rate: probability that a healthy filter is not called healthy. Default: 0.02, or 1 / (n + 1) for one
             episode and a healthy record of n < 49 episodes.
-        profile_from: clean data whose held-out episodes become the healthy record; default: that of the filter.
-        profile_filter: filter that runs over ``profile_from``, such as an earlier version; default: the same one.
+        profile_from: ``healthy_record``, such as that of an earlier version of the filter, or clean data for one of
+            this filter; default: that of the checkpoint.
 
-    Raises BadInput for a filter without a healthy record.
+    Raises BadInput for a filter without a healthy record, and for a record of another task.
     """
-    if profile_filter is not None and profile_from is None:
-        raise BadInput("profile_filter needs profile_from, the clean episodes that it runs over")
     checkpoint = _filter(filter_, data)
     source, injected = _episodes(data, checkpoint), _faults(faults, checkpoint)
     indices = source.held_out() if episodes is None else episodes
-    profile = None
-    if profile_from is not None:
-        clean = _episodes(profile_from, checkpoint)
-        correct = checkpoint if profile_filter is None else _filter(profile_filter, clean)
-        profile = profile_of(correct, [clean[i] for i in clean.held_out()], str(clean.path))
+    if isinstance(profile_from, HealthyProfile):
+        profile: HealthyProfile | None = profile_from
+    else:
+        profile = None if profile_from is None else healthy_record(checkpoint, profile_from)
+    if profile is not None and profile.task != checkpoint.task.name:
+        raise BadInput(
+            f"healthy record of task {profile.task}, but {checkpoint.name} is of task {checkpoint.task.name}"
+        )
     faulty = injected.apply_all(source, indices, seed)
     return diagnose_episodes(checkpoint, faulty, seed=seed, particles=particles, alarm_rate=alarm_rate, profile=profile)
 
