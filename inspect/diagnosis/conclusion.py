@@ -35,6 +35,7 @@ from beliefscope.inspect.diagnosis.cause import (
     matches,
     probability_text,
 )
+from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
@@ -58,9 +59,6 @@ EVIDENCE = 5
 
 LARGEST = 3
 """Maximum number of listed deviations without an alarm."""
-
-EFFECT = "dynamics effect/"
-"""Statistics of the effects of controls."""
 
 MAX_NEES = 2.0
 """Largest ratio of a healthy record's NEES to 1, and of 1 to it, that the headline does not mention."""
@@ -352,8 +350,9 @@ def channels_text(case: Case, cause: Cause) -> str:
     Channels with more than half of the largest deviation. Of dynamics, the controls with a wrong effect.
     """
     task, key, alarms = case.inputs.checkpoint.task, cause.component.rpartition(".")[2], symptoms_of(cause, case.alarms)
-    if key == "dynamics" and matches(cause.consequences, f"{EFFECT}control"):
-        key, alarms = "control", [alarm for alarm in case.alarms if alarm.statistic.startswith(EFFECT)]
+    if key == "dynamics":
+        patterns = cause.consequences, EFFECTS
+        key, alarms = "control", [a for a in case.alarms if all(matches(each, a.statistic) for each in patterns)]
     largest: dict[str, float] = {}
     for alarm in alarms:
         if channel := channel_of(alarm.statistic.split("/")[1], task):

@@ -52,18 +52,8 @@ __version__ = "0.2.0"
 _SOURCES = {
     "_interface": (
         *("load_filter", "open_dataset", "save_dataset", "trace", "maps", "inspect_run", "evaluate"),
-        *(
-            "diagnose",
-            "healthy_record",
-            "find_failures",
-            "finetune",
-            "compare",
-            "sweep",
-            "experiments",
-            "record",
-            "export_page",
-            "serve",
-        ),
+        *("diagnose", "healthy_record", "find_failures", "finetune", "compare"),
+        *("sweep", "experiments", "record", "export_page", "serve"),
     ),
     "_notebook": ("show",),
     "datasets.covariate": ("Covariate",),
