@@ -1,0 +1,144 @@
+"""Diagnose planted faults of four external filters and of their data, and count the correct first causes.
+
+    python bench/external_faults
+    python bench/external_faults kiln lid --cases healthy0 dt_short
+
+Each task has a simulator, a correct filter, 5 faults of the data and 7 of the filter: shunter and lid are particle
+filters, kiln and turbine extended Kalman filters. The healthy record is 60 clean episodes; a case has 10 other ones.
+A diagnosis is correct if its first cause is one of those accepted for the fault. A healthy sample with any other
+state than healthy is a false alarm. A task takes about 3 min.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import math
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import beliefscope as bs
+from beliefscope.datasets.errors import BadInput
+from external_faults.fault import Fault
+
+TASKS = ("shunter", "kiln", "turbine", "lid")
+HEALTHY = [f"healthy{k}" for k in range(5)]
+
+
+class Answer(NamedTuple):
+    """rank: of the first accepted cause, from 1; 0 without one, None of a healthy sample."""
+
+    task: str
+    case: str
+    fault: Fault | None
+    diagnosis: bs.Diagnosis
+    rank: int | None
+
+
+def episodes_of(module: ModuleType, case: str) -> list[bs.Episode]:
+    """The 10 episodes of a case; each case has its own seeds."""
+    if case in HEALTHY:
+        return [module.simulate(20000 + 100 * HEALTHY.index(case) + i) for i in range(10)]
+    fault = case if module.FAULTS[case].where == "data" else ""
+    return [module.simulate(10000 + 100 * list(module.FAULTS).index(case) + i, fault) for i in range(10)]
+
+
+def filter_of(module: ModuleType, case: str = "") -> bs.Checkpoint:
+    """A new filter of a case; without its fault, if that is one of the data."""
+    name = module.TASK.name
+    fault = module.FAULTS.get(case)
+    return bs.load_filter(
+        module.make(case if fault and fault.where == "filter" else ""), name=f"{name}-{case or 'right'}"
+    )
+
+
+def answers(task: str, cases: list[str], folder: Path) -> list[Answer]:
+    """Diagnose the cases of a task one after the other, with progress in stderr."""
+    module = importlib.import_module(f"external_faults.{task}")
+    torch.manual_seed(0)
+    record, results = None, []
+    chosen = [case for case in [*HEALTHY, *module.FAULTS] if not cases or case in cases]
+    for number, case in enumerate(chosen, 1):
+        began = time.perf_counter()
+        if record is None:
+            clean = bs.save_dataset([module.simulate(seed) for seed in range(60)], folder / f"{task}-clean.h5")
+            record = bs.healthy_record(filter_of(module), clean)
+        data = bs.save_dataset(episodes_of(module, case), folder / f"{task}-{case}.h5")
+        diagnosis = bs.diagnose(filter_of(module, case), data, profile_from=record)
+        fault = module.FAULTS.get(case)
+        causes = [candidate.cause for candidate in diagnosis.causes]
+        ranks = [k for k, cause in enumerate(causes, 1) if fault and re.fullmatch(fault.accepted, cause)]
+        results.append(Answer(task, case, fault, diagnosis, next(iter(ranks), 0) if fault else None))
+        print(f"{task} {number}/{len(chosen)} {case}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+    return results
+
+
+def row(answer: Answer) -> str:
+    """A line of the table in Markdown."""
+    fault, headline = answer.fault, answer.diagnosis.headline
+    cells = [answer.task, answer.case]
+    cells += [fault.where, fault.description, f"`{fault.accepted}`".replace("|", "\\|")] if fault else ["", "none", ""]
+    rank = "" if answer.rank is None else str(answer.rank or "-")
+    return f"| {' | '.join([*cells, headline, rank])} |"
+
+
+def interval(count: int, total: int) -> str:
+    """A share with its Wilson interval of 95 %."""
+    if not total:
+        return "none"
+    z, share = 1.96, count / total
+    scale = 1 + z * z / total
+    centre = (share + z * z / 2 / total) / scale
+    half = z * math.sqrt(share * (1 - share) / total + z * z / 4 / total**2) / scale
+    low, high = max(centre - half, 0.0), min(centre + half, 1.0)
+    return f"{count} of {total} ({100 * share:.0f} %, {100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def totals(results: list[Answer]) -> str:
+    """Correct first causes by the place of the fault, and false alarms."""
+    ranks = {where: [a.rank for a in results if a.fault and a.fault.where == where] for where in ("data", "filter")}
+    ranks["all"] = ranks["data"] + ranks["filter"]
+    lines = [f"First cause accepted, {where}: {interval(r.count(1), len(r))}" for where, r in ranks.items()]
+    alarms = [answer.diagnosis.state != "healthy" for answer in results if answer.fault is None]
+    return "\n".join([*lines, f"Healthy samples with an alarm: {interval(sum(alarms), len(alarms))}"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.prog = "python bench/external_faults"
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"any of {', '.join(TASKS)}; default: all")
+    parser.add_argument("--cases", nargs="+", default=[], metavar="CASE", help="names of faults, or healthy0 to 4")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="keep the episodes here; default: temporary")
+    options = parser.parse_args()
+    tasks = options.tasks or list(TASKS)
+    if unknown := set(tasks) - set(TASKS):
+        parser.error(f"unknown task {', '.join(sorted(unknown))}; valid: {', '.join(TASKS)}")
+    names = {t: importlib.import_module(f"external_faults.{t}").FAULTS for t in tasks}
+    valid = [*HEALTHY, *dict.fromkeys(case for faults in names.values() for case in faults)]
+    if unknown := set(options.cases) - set(valid):
+        parser.error(f"unknown case {', '.join(sorted(unknown))}; valid: {', '.join(valid)}")
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.data or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            results = [answer for task in tasks for answer in answers(task, options.cases, folder)]
+        except BadInput as error:
+            sys.exit(str(error))
+    print("| task | case | where | fault | accepted causes | headline | rank |")
+    print("| --- | --- | --- | --- | --- | --- | ---: |")
+    print("\n".join(map(row, results)))
+    print(f"\n{totals(results)}")
+
+
+if __name__ == "__main__":
+    main()

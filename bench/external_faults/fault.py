@@ -1,0 +1,37 @@
+"""What the four tasks share: the description of a fault, and two faults of readings."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+Values = np.ndarray
+
+
+class Fault(NamedTuple):
+    """A planted fault.
+
+    Attributes:
+        where: ``data`` or ``filter``.
+        description: with its magnitude.
+        accepted: regular expression of the causes that are a correct diagnosis; chosen before the first one.
+    """
+
+    where: str
+    description: str
+    accepted: str
+
+
+def hold(values: Values, present: Values) -> Values:
+    """Readings (T, C) that keep their last value at the steps without a new one; present: (T,) boolean."""
+    held, last = np.zeros_like(values), values[0]
+    for t in range(len(values)):
+        last = values[t] if present[t] else last
+        held[t] = last
+    return held
+
+
+def delay(values: Values, steps: int) -> Values:
+    """Readings (T, C) that arrive ``steps`` later; the first one fills the start."""
+    return np.concatenate([np.repeat(values[:1], steps, 0), values[:-steps]])

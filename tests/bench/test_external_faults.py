@@ -1,0 +1,62 @@
+"""The filters of the external faults are consistent, and every fault has an effect."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from external_faults.fault import delay, hold
+
+import beliefscope as bs
+from beliefscope.inspect.statistics.measures import nees
+
+STEPS = 80
+TASKS = ("shunter", "kiln", "turbine", "lid")
+
+
+@pytest.fixture(params=TASKS)
+def task(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = importlib.import_module(f"external_faults.{request.param}")
+    if hasattr(module, "PARTICLES"):
+        monkeypatch.setattr(module, "PARTICLES", 300)
+    return module
+
+
+def inputs(episode: bs.Episode) -> Mapping[str, np.ndarray]:
+    return {**episode.observations, "control": episode.controls}
+
+
+@pytest.mark.slow
+def test_filter_is_consistent_and_each_fault_of_it_changes_its_estimates(task: ModuleType) -> None:
+    episode = task.simulate(1, steps=50)
+
+    def run(fault: str) -> bs.Trace:
+        torch.manual_seed(0)
+        return bs.trace(bs.load_filter(task.make(fault)), [episode])
+
+    right = run("")
+    assert 0.4 < nees(right)[10:, -1].mean() < 2
+    faults = [name for name, fault in task.FAULTS.items() if fault.where == "filter"]
+    assert len(faults) == 7
+    assert not [name for name in faults if np.array_equal(run(name).estimate_mean, right.estimate_mean)]
+
+
+def test_each_fault_of_the_data_changes_the_episode(task: ModuleType) -> None:
+    clean = task.simulate(1, steps=STEPS)
+    faults = [name for name, fault in task.FAULTS.items() if fault.where == "data"]
+    assert len(faults) == 5
+    for name in faults:
+        faulty = task.simulate(1, name, steps=STEPS)
+        changed = [key for key, values in inputs(clean).items() if not np.array_equal(inputs(faulty)[key], values)]
+        assert len(changed) == 1, name
+        assert np.array_equal(faulty.states, clean.states)
+
+
+def test_late_and_held_readings() -> None:
+    values = np.arange(5.0)[:, None]
+    assert delay(values, 2)[:, 0].tolist() == [0, 0, 0, 1, 2]
+    assert hold(values, np.array([True, False, False, True, False]))[:, 0].tolist() == [0, 0, 0, 3, 3]
