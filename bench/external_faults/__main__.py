@@ -35,7 +35,7 @@ HEALTHY = [f"healthy{k}" for k in range(5)]
 
 
 class Answer(NamedTuple):
-    """rank: of the first accepted cause, from 1; 0 without one, None of a healthy sample."""
+    """rank: as of ``rank_of``; None of a healthy sample."""
 
     task: str
     case: str
@@ -61,6 +61,12 @@ def filter_of(module: ModuleType, case: str = "") -> bs.Checkpoint:
     )
 
 
+def rank_of(fault: Fault, diagnosis: bs.Diagnosis) -> int:
+    """Rank of the first accepted cause, from 1; 0 without one."""
+    names = [candidate.cause.name for candidate in diagnosis.causes]
+    return next((rank for rank, name in enumerate(names, 1) if re.fullmatch(fault.accepted, name)), 0)
+
+
 def answers(task: str, cases: list[str], folder: Path) -> list[Answer]:
     """Diagnose the cases of a task one after the other, with progress in stderr."""
     module = importlib.import_module(f"external_faults.{task}")
@@ -75,10 +81,9 @@ def answers(task: str, cases: list[str], folder: Path) -> list[Answer]:
         data = bs.save_dataset(episodes_of(module, case), folder / f"{task}-{case}.h5")
         diagnosis = bs.diagnose(filter_of(module, case), data, profile_from=record)
         fault = module.FAULTS.get(case)
-        causes = [candidate.cause for candidate in diagnosis.causes]
-        ranks = [k for k, cause in enumerate(causes, 1) if fault and re.fullmatch(fault.accepted, cause)]
-        results.append(Answer(task, case, fault, diagnosis, next(iter(ranks), 0) if fault else None))
-        print(f"{task} {number}/{len(chosen)} {case}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+        results.append(Answer(task, case, fault, diagnosis, rank_of(fault, diagnosis) if fault else None))
+        progress = f"{task} {number}/{len(chosen)} {case}: {time.perf_counter() - began:.0f} s: {diagnosis.headline}"
+        print(progress, file=sys.stderr, flush=True)
     return results
 
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
+from external_faults.__main__ import Answer, rank_of, row, totals
 from external_faults.fault import delay, hold
 
 import beliefscope as bs
+from beliefscope.inspect.diagnosis.catalog import causes_in
+from beliefscope.inspect.diagnosis.cause import Candidate
 from beliefscope.inspect.statistics.measures import nees
 
 STEPS = 80
@@ -54,6 +59,19 @@ def test_each_fault_of_the_data_changes_the_episode(task: ModuleType) -> None:
         changed = [key for key, values in inputs(clean).items() if not np.array_equal(inputs(faulty)[key], values)]
         assert len(changed) == 1, name
         assert np.array_equal(faulty.states, clean.states)
+
+
+def test_accepted_causes_are_in_the_catalog_and_counted(task: ModuleType) -> None:
+    for name, fault in task.FAULTS.items():
+        accepted = [c for c in causes_in(bs.load_filter(task.make(name))) if re.fullmatch(fault.accepted, c.name)]
+        assert accepted, name
+        other = replace(accepted[0], name="other.cause")
+        candidates = [Candidate(cause, 0.5, (), None, (), None, "") for cause in (other, *accepted)]
+        diagnosis = bs.Diagnosis("fault", False, "Headline", tuple(candidates))
+        assert rank_of(fault, diagnosis) == 2
+        answer = Answer(task.TASK.name, name, fault, diagnosis, 1)
+        assert f"{fault.where}: 1 of 1 (100 %, 21 to 100 %)" in totals([answer])
+        assert row(answer).endswith("| Headline | 1 |")
 
 
 def test_late_and_held_readings() -> None:
