@@ -168,6 +168,7 @@ def test_diagnosis_against_the_record_of_another_filter() -> None:
         return inputs["observations"]["gauge"] + 1.0
 
     assert bs.diagnose(wrong, data, profile_from=clean).state == "healthy"  # an error of its record
+    assert len(bs.trace(correct, clean[0])) == 40, "a single episode"
     record = bs.healthy_record(correct, clean)
     assert record.episodes == len(clean)
     assert bs.diagnose(wrong, data, profile_from=record).state != "healthy"

@@ -43,7 +43,7 @@ from beliefscope.recordings.sweep_table import Experiments, run_sweep
 from beliefscope.recordings.write import write_recording
 
 Filter = Checkpoint | str | Path
-Data = Dataset | Sequence[Episode] | str | Path
+Data = Dataset | Episode | Sequence[Episode] | str | Path
 
 
 def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkpoint:
@@ -75,13 +75,13 @@ def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkp
     return load_checkpoint(_pretrained_path(source))
 
 
-def open_dataset(source: str | Path | Sequence[Episode], task: Task | None = None) -> Dataset:
-    """Episodes of a file or folder (docs/data.md), of the sample data set of a task, such as ``door``, or of a list.
+def open_dataset(source: str | Path | Episode | Sequence[Episode], task: Task | None = None) -> Dataset:
+    """Episodes of a file or folder (docs/data.md), of the sample data set of a task, such as ``door``, or given ones.
 
     Raises BadInput if there is none, or if it is damaged.
     """
     if not isinstance(source, str | Path):
-        return checked_list(source)
+        return checked_list([source] if isinstance(source, Episode) else source)
     if isinstance(source, str) and source in TASKS and not Path(source).exists():
         return store.open_dataset(store.sample_path(load_task(source)))
     return store.open_dataset(source, task)
@@ -401,6 +401,7 @@ def _pretrained_path(text: str) -> Path:
 def _filter(filter_: object, data: Data) -> Checkpoint:
     """The filter. The data define the task of a filter object of your own."""
     own = not isinstance(filter_, Checkpoint | str | Path)
+    data = [data] if isinstance(data, Episode) else data
     source = data if isinstance(data, Dataset | str | Path) else EpisodeList(data)
     return load_filter(filter_, source.task if own and isinstance(source, Dataset) else "")
 

@@ -77,10 +77,6 @@ def test_keys_change_the_step_and_the_theme_and_open_the_help(open_page: Any) ->
     assert find("15") == "Go toStep 15"
     page.page.keyboard.press("Enter")
     page.until("() => beliefscope.state().step === 15")
-    assert find("download") == "ActionSave .rrds"
-    page.page.keyboard.press("Escape")
-    assert "Export the maps as" in find("figure maps")
-    page.page.keyboard.press("Escape")
     assert find("ekf filter cross") == "Filtercrossmodal-ekf"
     options.first.click()
     page.until("() => beliefscope.state().filter === 'crossmodal-ekf'")
