@@ -242,7 +242,7 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
 @pytest.mark.parametrize(
     ("filter_", "cause"),
     [
-        (Boat(radar=0.1), "measurement_noise.radar.small"),
+        pytest.param(Boat(radar=0.1), "measurement_noise.radar.small", marks=pytest.mark.long),
         pytest.param(Boat(compass=10.0), "measurement_noise.compass.large", marks=pytest.mark.long),
         pytest.param(Boat(wraps=False), "innovation.compass.turns", marks=pytest.mark.long),
         pytest.param(Boat(has_bias=False), "dynamics.drift", marks=pytest.mark.long),
