@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import math
 import re
 import sys
 import tempfile
@@ -25,6 +24,8 @@ from typing import NamedTuple
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from beliefbench.scorecard import proportion
 
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
@@ -96,25 +97,22 @@ def row(answer: Answer) -> str:
     return f"| {' | '.join([*cells, headline, rank])} |"
 
 
-def interval(count: int, total: int) -> str:
+def share(correct: list[bool]) -> str:
     """A share with its Wilson interval of 95 %."""
-    if not total:
+    if not correct:
         return "none"
-    z, share = 1.96, count / total
-    scale = 1 + z * z / total
-    centre = (share + z * z / 2 / total) / scale
-    half = z * math.sqrt(share * (1 - share) / total + z * z / 4 / total**2) / scale
-    low, high = max(centre - half, 0.0), min(centre + half, 1.0)
-    return f"{count} of {total} ({100 * share:.0f} %, {100 * low:.0f} to {100 * high:.0f} %)"
+    score = proportion("", correct, "")
+    low, high = 100 * score.low, 100 * score.high
+    return f"{sum(correct)} of {len(correct)} ({100 * score.value:.0f} %, {low:.0f} to {high:.0f} %)"
 
 
 def totals(results: list[Answer]) -> str:
     """Correct first causes by the place of the fault, and false alarms."""
     ranks = {where: [a.rank for a in results if a.fault and a.fault.where == where] for where in ("data", "filter")}
     ranks["all"] = ranks["data"] + ranks["filter"]
-    lines = [f"First cause accepted, {where}: {interval(r.count(1), len(r))}" for where, r in ranks.items()]
+    lines = [f"First cause accepted, {where}: {share([rank == 1 for rank in r])}" for where, r in ranks.items()]
     alarms = [answer.diagnosis.state != "healthy" for answer in results if answer.fault is None]
-    return "\n".join([*lines, f"Healthy samples with an alarm: {interval(sum(alarms), len(alarms))}"])
+    return "\n".join([*lines, f"Healthy samples with an alarm: {share(alarms)}"])
 
 
 def main() -> None:

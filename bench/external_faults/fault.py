@@ -1,10 +1,12 @@
-"""What the four tasks share: the description of a fault, and two faults of readings."""
+"""What the four tasks share: the description of a fault, a delay, and episodes with a masked sensor."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+
+import beliefscope as bs
 
 Values = np.ndarray
 
@@ -30,6 +32,18 @@ def hold(values: Values, present: Values) -> Values:
         last = values[t] if present[t] else last
         held[t] = last
     return held
+
+
+def masked_episode(
+    task: bs.Task, states: Values, controls: Values, readings: dict[str, Values], seen: Values, seed: int
+) -> bs.Episode:
+    """An episode whose masked sensor, the only one of the task, has new readings at some steps; seen: (T,) boolean."""
+    ((key, covariate),) = task.masks.items()
+    readings = {**readings, key: hold(readings[key], seen)}
+    covariates = {covariate: seen.astype(np.float32)}
+    return bs.Episode(
+        task, states, controls=controls, observations=readings, covariates=covariates, seed=seed, split="test"
+    )
 
 
 def delay(values: Values, steps: int) -> Values:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import beliefscope as bs
-from external_faults.fault import Fault, Values, hold
+from external_faults.fault import Fault, Values, masked_episode
 
 DT = 0.5  # min
 HEAT, WIRE, AIR_LOAD, AIR_WIRE = 160.0, 0.25, 0.1, 0.12  # K/min at full power; 1/min
@@ -127,11 +127,7 @@ def simulate(seed: int, fault: str = "", steps: int = 140) -> bs.Episode:
         readings["ammeter"] *= 0.9
     elif fault == "controls_swapped":
         controls = controls[:, ::-1].copy()
-    readings["pyrometer"] = hold(readings["pyrometer"], seen)
-    covariates = {"open": seen.astype(np.float32)}
-    return bs.Episode(
-        TASK, states, controls=controls, observations=readings, covariates=covariates, seed=seed, split="test"
-    )
+    return masked_episode(TASK, states, controls, readings, seen, seed)
 
 
 class Filter:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import beliefscope as bs
-from external_faults.fault import Fault, Values, delay, hold
+from external_faults.fault import Fault, Values, delay, masked_episode
 
 DT = 0.05  # s
 PARTICLES = 800
@@ -107,11 +107,7 @@ def simulate(seed: int, fault: str = "", steps: int = 120) -> bs.Episode:
         controls[:, 1] *= 2.4
     elif fault == "controls_delay":
         controls = delay(controls, 4)
-    readings["edge"] = hold(readings["edge"], visible)
-    covariates = {"visible": visible.astype(np.float32)}
-    return bs.Episode(
-        TASK, states, controls=controls, observations=readings, covariates=covariates, seed=seed, split="test"
-    )
+    return masked_episode(TASK, states, controls, readings, visible, seed)
 
 
 class Filter:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 import beliefscope as bs
-from external_faults.fault import Fault, Values, delay, hold
+from external_faults.fault import Fault, Values, delay, masked_episode
 
 DT = 0.5  # s
 PARTICLES = 1000
@@ -99,11 +99,7 @@ def simulate(seed: int, fault: str = "", steps: int = 120) -> bs.Episode:
     }
     plant(fault, readings, controls, rng)
     polled = np.arange(steps) % POLL == 0
-    readings["radio"] = hold(readings["radio"], polled)
-    covariates = {"polled": polled.astype(np.float32)}
-    return bs.Episode(
-        TASK, states, controls=controls, observations=readings, covariates=covariates, seed=seed, split="test"
-    )
+    return masked_episode(TASK, states, controls, readings, polled, seed)
 
 
 def plant(fault: str, readings: dict[str, Values], controls: Values, rng: np.random.Generator) -> None:

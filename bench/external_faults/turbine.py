@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 import beliefscope as bs
-from external_faults.fault import Fault, delay, hold
+from external_faults.fault import Fault, delay, masked_episode
 
 DT = 0.05  # s
 POLL = 5  # steps
@@ -115,11 +115,7 @@ def simulate(seed: int, fault: str = "", steps: int = 120) -> bs.Episode:
     elif fault == "shaft_noise":
         readings["strain"][:, 1] += rng.normal(0, 0.17, steps)
     polled = np.arange(steps) % POLL == 0
-    readings["power"] = hold(readings["power"], polled)
-    covariates = {"polled": polled.astype(np.float32)}
-    return bs.Episode(
-        TASK, states, controls=controls, observations=readings, covariates=covariates, seed=seed, split="test"
-    )
+    return masked_episode(TASK, states, controls, readings, polled, seed)
 
 
 class Filter(nn.Module):

@@ -191,10 +191,10 @@ def diagnose(
     checkpoint = _filter(filter_, data)
     source, injected = _episodes(data, checkpoint), _faults(faults, checkpoint)
     indices = source.held_out() if episodes is None else episodes
-    if isinstance(profile_from, HealthyProfile):
-        profile: HealthyProfile | None = profile_from
+    if profile_from is None or isinstance(profile_from, HealthyProfile):
+        profile = profile_from
     else:
-        profile = None if profile_from is None else healthy_record(checkpoint, profile_from)
+        profile = healthy_record(checkpoint, profile_from)
     if profile is not None and profile.task != checkpoint.task.name:
         raise BadInput(
             f"healthy record of task {profile.task}, but {checkpoint.name} is of task {checkpoint.task.name}"
@@ -401,9 +401,8 @@ def _pretrained_path(text: str) -> Path:
 def _filter(filter_: object, data: Data) -> Checkpoint:
     """The filter. The data define the task of a filter object of your own."""
     own = not isinstance(filter_, Checkpoint | str | Path)
-    data = [data] if isinstance(data, Episode) else data
-    source = data if isinstance(data, Dataset | str | Path) else EpisodeList(data)
-    return load_filter(filter_, source.task if own and isinstance(source, Dataset) else "")
+    source = data if isinstance(data, Dataset | Episode | str | Path) else EpisodeList(data)
+    return load_filter(filter_, source.task if own and isinstance(source, Dataset | Episode) else "")
 
 
 def _episodes(data: Data, checkpoint: Checkpoint) -> Dataset:
