@@ -71,3 +71,11 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
         page.until("() => /this live run alone/.test(document.querySelector('#diagnosis .status').textContent)")
         assert page.page.locator("#diagnosis .doing button:visible").count() == 0
         page.page.reload()  # the run is then no longer followed
+
+
+def test_link_to_a_live_run_opens_it_when_it_starts(open_page: Any, request: pytest.FixtureRequest) -> None:
+    page = open_page("?task=door&data=live:go")
+    page.until("() => /“go” has not started/.test(document.querySelector('#messages').textContent)")
+    request.getfixturevalue("running")
+    page.until(f"() => beliefscope.state().data === 'live:go' && beliefscope.state().follow && {NEWEST} > 0")
+    page.until("() => !document.querySelector('#messages').textContent")

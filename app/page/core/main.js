@@ -1,7 +1,7 @@
 /** Starts the page: loads the catalog and reads the state from the address. */
 
 import * as api from '../data/api.js';
-import { addLiveRuns } from '../tabs/live_runs.js';
+import { addLiveRuns, awaitedRun } from '../tabs/live_runs.js';
 import { Messages } from '../widgets/panel_state.js';
 import { showError, showLoading } from './common_panels.js';
 import { html, messageOf } from './dom.js';
@@ -28,7 +28,8 @@ async function start() {
     throw new api.ServerError(
       'Nothing to display: no task has both episodes and a trained filter.',
     );
-  const { state, problems } = parsePermalink(completeLink(location.search, catalog), catalog);
+  const link = awaitedRun(location.search, live) ? '' : location.search;
+  const { state, problems } = parsePermalink(completeLink(link, catalog), catalog);
   if (state.faults)
     await api.checkSelection({ ...state, against: '' }).catch((error) => {
       problems.push(

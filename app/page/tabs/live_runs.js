@@ -54,6 +54,16 @@ export function addLiveRuns(catalog, { runs, tasks }) {
 }
 
 /**
+ * Returns the name of the live run of a link if it is not listed yet, otherwise ''. The page opens it when it starts.
+ * @param {string} search query string
+ * @param {LiveList} list
+ */
+export function awaitedRun(search, { runs }) {
+  const [, name] = /^live:(.+)/.exec(new URLSearchParams(search).get('data') ?? '') ?? [];
+  return name && !runs.some((run) => run.name === name) ? name : '';
+}
+
+/**
  * Returns the changes of the state that select a live run at its newest step.
  * @param {Catalog} catalog
  * @param {ListedLiveRun} run
@@ -88,6 +98,8 @@ export class Live {
   #handlers;
   /** @type {ListedRun[]} */
   #runs = [];
+  /** Name of the run that the page opens when it starts. */
+  #awaited;
   /** @type {Trace | null} */
   #trace = null;
   /** @type {Latency[]} */
@@ -103,6 +115,7 @@ export class Live {
     this.#catalog = catalog;
     this.#store = store;
     this.#handlers = handlers;
+    this.#awaited = awaitedRun(location.search, list);
     this.#follow.addEventListener('click', () => this.newest());
     this.#list.addEventListener('beforetoggle', (event) => {
       if (event.newState === 'open') this.#place();
@@ -126,7 +139,9 @@ export class Live {
     this.#trace?.stream?.close();
     this.#trace = trace;
     this.#latencies = [];
-    this.#handlers.message(trace?.live?.message ?? this.#selectedRun?.message ?? '');
+    const awaited =
+      this.#awaited && `The live run “${this.#awaited}” has not started. It opens when it does.`;
+    this.#handlers.message(awaited || (trace?.live?.message ?? this.#selectedRun?.message ?? ''));
     if (this.#isRunning && this.#store.state.follow) this.#goToNewest();
     this.#showFollowButton();
     if (trace && this.#isRunning) this.#receive(trace);
@@ -153,6 +168,7 @@ export class Live {
    * @param {Set<string>} changed
    */
   #update({ data, step, playing, follow }, changed) {
+    if (['task', 'filter', 'data', 'episode'].some((key) => changed.has(key))) this.#awaited = '';
     const trace = this.#trace;
     if (!trace || !this.#isRunning || data !== trace.selection.data || changed.has('data')) return;
     // Moving the cursor away from the newest step stops following, moving it there resumes.
@@ -244,6 +260,8 @@ export class Live {
     this.#button.classList.toggle('on', running > 0);
     this.#button.title = `${summary} (l)`;
     this.#draw();
+    const awaited = this.#runs.filter(isReadable).find(({ name }) => name === this.#awaited);
+    if (awaited) this.#open(awaited);
   }
 
   /** Shows the runs, the newest first. Rows are reused, so that the focus stays. */
