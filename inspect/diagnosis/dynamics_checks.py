@@ -30,7 +30,7 @@ MIN_STEPS = 10
 """Minimum number of steps of a statistic."""
 
 ROUNDING = 1e-12
-"""Largest variance that a prediction adds by rounding, relative to that of the states."""
+"""Largest variance that a prediction adds by rounding, relative to that of the states; smallest process noise."""
 
 
 def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
@@ -113,9 +113,10 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     residual = measures.wrapped(task, predicted - change)
     more: dict[str, Array] = {}
     if added is not None:
-        variance = np.median(np.diagonal(added, axis1=-2, axis2=-1), axis=0)
-        variance = np.where(variance > ROUNDING * np.square(states.std(0)), variance, np.nan)
-        more = {"dynamics nis": np.square(residual).mean(0) / variance, "process noise": np.sqrt(variance)}
+        smallest = ROUNDING * np.square(states.std(0))
+        variance = np.maximum(np.median(np.diagonal(added, axis1=-2, axis2=-1), axis=0), smallest)
+        squared = np.maximum(np.square(residual).mean(0), smallest)
+        more = {"dynamics nis": squared / variance, "process noise": np.sqrt(variance)}
     return values | _of_changes(task, residual, change, more, states.std(0))
 
 

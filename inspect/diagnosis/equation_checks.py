@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from beliefscope.filters.angles import Angles
 from beliefscope.filters.belief import Gaussian, moments
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
@@ -24,6 +25,13 @@ from beliefscope.inspect.trace import Trace
 
 INDEPENDENT = 0.15
 """Largest deviation from 1 of the relative spread of independent draws."""
+
+SMALLEST_STD = 1e-3
+"""Smallest standard deviation of the particles of a step, relative to that of the states: moments of particles that are
+almost equal depend on rounding."""
+
+MOST_NUMBERS = 3_000_000
+"""Numbers of particles from which only some of the steps count."""
 
 NO_EVIDENCE = 1e-6
 """Variation of a log-likelihood over the particles of an episode, nats, below which its use cannot be seen."""
@@ -127,13 +135,15 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     ``prior ess`` is of the steps after a resampling, of all steps if there is none: not every filter resamples always.
     ``ancestors`` and ``offspring`` (``relative_spread``) are of the steps with a resampling.
     ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
-    to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it.
+    to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it. ``estimate mean`` and
+    ``reported variance``: as ``_estimate_statistics``.
     """
     if trace.all_particles_ess is not None or trace.log_weights is None or trace.prior_log_weights is None:
         return {}
     log_weights, prior = _tensor(trace.log_weights), _tensor(trace.prior_log_weights)
     count = log_weights.shape[1]
     values = {"particles//all": float(count), "prior ess//all": _ess_after_resampling(log_weights, prior)}
+    values |= _estimate_statistics(trace)
     ancestors = np.arange(count)[None] if trace.ancestors is None else trace.ancestors
     resampled = np.flatnonzero((ancestors != np.arange(count)).any(-1) & (ancestors >= 0).all(-1))
     if len(resampled):
@@ -156,6 +166,31 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     share = torch.linalg.lstsq(flat[:, :-1], flat[:, -1:], driver="gelsd").solution[:, 0]
     names = trace.modalities if len(trace.modalities) == len(share) else ()
     return values | {f"likelihood share/{name}/all": float(x) for name, x in zip(names, share, strict=False)}
+
+
+def _estimate_statistics(trace: Trace) -> dict[str, float]:
+    """The estimate against the moments of the weighted particles.
+
+    ``estimate mean``: root mean square distance from their mean, in standard deviations; ``reported variance``:
+    log-ratio of the variances. Of components whose particles differ.
+    """
+    assert trace.particles is not None
+    assert trace.log_weights is not None
+    if trace.task.rotations:
+        return {}
+    every = np.s_[:: 1 + trace.particles.size // MOST_NUMBERS]
+    angles = Angles(trace.task.angles)
+    rule = moments(_tensor(trace.particles[every]), _tensor(trace.log_weights[every]), angles)
+    variance = rule.covariance.diagonal(dim1=-2, dim2=-1).numpy()
+    differ = variance > np.square(SMALLEST_STD * trace.episode.states.std(0))
+    if not differ.any():
+        return {}
+    distance = np.square(trace.task.difference(trace.estimate_mean[every].astype(np.float64), rule.mean.numpy()))
+    values = {"estimate mean//all": math.sqrt((distance[differ] / variance[differ]).mean())}
+    if trace.has_covariance:
+        reported = np.diagonal(trace.estimate_covariance[every], axis1=-2, axis2=-1)[differ]
+        values["reported variance//all"] = float(np.median(np.log(np.maximum(reported / variance[differ], 1e-12))))
+    return values
 
 
 def _absent_updates(trace: Trace) -> dict[str, float]:

@@ -38,6 +38,9 @@ distances along one line have the same error for all particles but for a factor.
 MIN_PARTICLES = 3
 """Smallest number of particles on either side of the angle at which readings jump by a turn."""
 
+INVERTED = -0.1
+"""Largest inverse ratio of variances of an inverted likelihood."""
+
 JUMP = 0.1
 """Smallest fall of the log-likelihood between them, relative to that of an innovation of a full turn."""
 
@@ -101,16 +104,17 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
 
 
 def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
-    """``measurement noise/MODALITY/all``, ``measurement function/CHANNEL/all`` and ``innovation turns/MODALITY/all``.
+    """Of a particle filter, ``KIND/SUBJECT/all`` -> value.
 
-    Of a particle filter.
+    ``measurement noise`` and ``inverted likelihood``, by modality, ``measurement function``, by channel, and
+    ``innovation turns``, by modality.
 
     Its log-likelihoods over the particles of a step are ``c + sum_i s_i (b_i e_i - e_i^2 / 2)``, with the errors e of
     the readings expected at the particles, relative to their noise: s are the inverse ratios of the variances, and b
     the errors of its measurement function. Medians over the steps, of b without its sign; the noise is the geometric
     mean of the standard deviations of all channels. Channels that particles do not separate have their root mean square
-    error. Turns: share of steps with a b close to a full turn, of angles. Of
-    modalities whose readings follow from the state and the controls of the step.
+    error. Inverted: 1 if the likelihood grows with the error in a channel, else 0. Turns: share of steps with a b close
+    to a full turn, of angles. Of modalities whose readings follow from the state and the controls of the step.
     """
     likelihood, particles = trace.log_likelihood, trace.particles
     if likelihood is None or particles is None or trace.task.rotations:
@@ -144,6 +148,7 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
         fit = (np.linalg.pinv(columns / scale, rcond=1e-6) @ y / scale.mT)[..., 0]  # (S, 2 A): s b and s
         count = e.shape[-1]
         power = np.median(fit[:, count:], axis=0)
+        values[f"inverted likelihood/{modality}/all"] = float((power < INVERTED).any())
         if not (power > 0.0).all():
             continue
         noise_of_readings = np.concatenate([model.noise for model in sensors])

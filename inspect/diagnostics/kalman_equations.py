@@ -196,7 +196,8 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 
     ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality: of ``correction_slopes``.
+    ``correction slope``, by modality: of ``correction_slopes``. ``covariance update``: ``Updates.covariance_slope``, of
+    filters without fusion weights.
     """
     has_truth = bool(np.isfinite(trace.episode.states).all())
     repeated = None if why_not(trace, checkpoint) else repeat_steps(trace, checkpoint, at_truth=has_truth)
@@ -206,7 +207,10 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
     columns = {"prediction jacobian": (components, known_median(repeated.dynamics_errors()))}
     if trace.innovation is not None:
         columns["measurement jacobian"] = (list(trace.modalities), known_median(repeated.measurement_errors()))
-        columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated, expected_updates(repeated)))
+        updates = expected_updates(repeated)
+        columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated, updates))
+        if trace.weights is None:
+            columns["covariance update"] = ([""], np.array([updates.covariance_slope]))
     return {
         f"{kind}/{name}/all": float(value)
         for kind, (names, values) in columns.items()

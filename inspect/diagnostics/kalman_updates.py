@@ -27,12 +27,15 @@ class Updates:
         corrections: (J, K, n) of the mean, by each modality.
         covariance_error: (J, K) relative error of the reduction of the covariance, NaN without the measurement.
         correction_error: (J, K) relative error of the correction of the mean, as before.
+        covariance_slope: of the reductions of the covariance on the expected ones: 1 if they are right, 0 if the
+            covariance is not updated; NaN without a measurement.
     """
 
     noise: Array
     corrections: Array
     covariance_error: Array
     correction_error: Array
+    covariance_slope: float
 
 
 def expected_updates(steps: RepeatedSteps) -> Updates:
@@ -113,10 +116,12 @@ def _compared(steps: RepeatedSteps, noise: Array, covariance: Array, corrections
     weights = weights_of(prior)
     used = np.isfinite(steps.innovation[:, 0]).any(-1)  # (J, K)
     difference, reduction = weights * (steps.posterior - covariance), weights * (prior - covariance)
+    actual, size = weights * (prior - steps.posterior), np.square(reduction).sum()
     moved, expected = scale * (steps.correction - correction), scale * correction
     return Updates(
         noise,
         corrections,
         np.where(used, relative(difference, reduction, (-2, -1), SMALLEST_UPDATE)[:, None], np.nan),
         np.where(used, relative(moved, expected, (-1,), SMALLEST_UPDATE)[:, None], np.nan),
+        float((actual * reduction).sum() / size) if size > 0.0 else np.nan,
     )

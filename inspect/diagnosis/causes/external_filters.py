@@ -16,7 +16,7 @@ def _dynamics(*kinds: str) -> str:
     return "|".join(f"dynamics {kind}/*" for kind in kinds)
 
 
-JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*"
+JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*|covariance update/*"
 """The derivative of the prediction may include the update of the step before."""
 
 EFFECTS = "dynamics effect/*"
@@ -28,6 +28,9 @@ OF_TRUE_STATES = (
 )
 """Statistics of predictions that start at true states."""
 
+UNCHANGED_BY_DRIFT = ("dynamics spread/", "measurement function/", "process noise/")
+"""Statistics that a bias of the dynamics does not change."""
+
 OF_DYNAMICS = ("dynamics", "process_noise", "control", "labels", "data")
 """Components of causes that change them as well."""
 
@@ -38,7 +41,7 @@ DRIFT = Cause(
     f"{_dynamics('bias', 'error', 'nis', 'offset', 'spread')}|process noise/*|{FILTER}",
     "Check the bias of its inputs that the filter should estimate, and its sign in the dynamics.",
     raises="measurement noise/*",
-    prior=0.1,
+    prior=-0.1,
 )
 """A bias that the filter does not estimate, such as that of a gyroscope.
 
@@ -54,6 +57,24 @@ JACOBIAN = Cause(
     prior=-0.1,  # another gain or sign of the predicted mean also changes its derivative
 )
 """A derivative in the prediction of the covariance, other than that of the predicted mean."""
+
+COVARIANCE = Cause(
+    "updates.covariance",
+    "Covariance of the updates wrong",
+    (Symptom("covariance update/*", 0),),
+    f"measurement noise/*|{FILTER}",
+    "Compare the covariance after an update with P - K H P: its signs, and the P, H and K in it.",
+)
+"""An update of the mean that is right, but not that of its covariance."""
+
+ESTIMATE = Cause(
+    "estimate.mean",
+    "Estimate is not the mean of the particles",
+    (Symptom("estimate mean/*"),),
+    f"reported variance/*|{FILTER}",
+    "Compare the estimate with the sum of the particles times their weights; average angles by their differences.",
+)
+"""Such as their mean without weights, after the resampling, or with angles that are not wrapped."""
 
 LARGE = Cause(
     "dynamics.large",
@@ -71,6 +92,8 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         DRIFT,
         JACOBIAN,
         LARGE,
+        COVARIANCE,
+        ESTIMATE,
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
         *(cause for modality in task.modalities for cause in _of_updates(modality)),
     )
@@ -79,10 +102,13 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
 def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates.
 
+    Whether the offspring agrees with the weights depends on the resampling alone.
+
     has_true_starts: most statistics of the dynamics are of predictions that start at true states, which other parts of
     the filter, and the sensors, do not change.
     """
     cause = _in_predictions_of_run(cause)
+    cause = replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
     if not has_true_starts:
         return cause
     if cause.name == "dynamics.broken":  # a gain of the predicted changes is one of their spread about the slope, too
@@ -92,7 +118,7 @@ def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
         return replace(cause, symptoms=(Symptom(EFFECTS, target="mirrored", otherwise=cause.symptoms),))
     if cause.component in OF_DYNAMICS and cause.name not in (DRIFT.name, JACOBIAN.name):
         return cause
-    unchanged = ("dynamics spread/", "measurement function/") if cause.name == DRIFT.name else OF_TRUE_STATES
+    unchanged = UNCHANGED_BY_DRIFT if cause.name == DRIFT.name else OF_TRUE_STATES
     patterns = cause.consequences.replace(DYNAMICS, f"{_dynamics('offset', 'scatter')}|{FILTER}").split("|")
     return replace(cause, consequences="|".join(p for p in patterns if not p.startswith(unchanged)))
 
@@ -186,6 +212,13 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"Compare the gain of {name} with P Hᵀ S⁻¹.",
         ),
         Cause(
+            f"likelihood.{modality}.inverted",
+            f"Likelihood of {name} inverted: it grows with the error",
+            (Symptom(f"inverted likelihood/{modality}/*"),),
+            f"measurement noise/{modality}/*|measurement function/*|{FILTER}",
+            f"Check the sign of the log-likelihood of {name}.",
+        ),
+        Cause(
             f"innovation.{modality}.turns",
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
@@ -196,7 +229,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"updates.{modality}.missing",
             f"Updates with {name} missing",
             (Symptom(f"updates/{modality}/*", -1),),
-            f"measurement noise//*|{FILTER}",
+            f"covariance update/*|measurement noise//*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
         ),
         Cause(

@@ -81,6 +81,7 @@ def profile() -> HealthyProfile:
         (Cart(gain=-1.0), "dynamics.inverted"),
         pytest.param(Cart(gain=0.1), "dynamics.frozen", marks=pytest.mark.long),
         (Cart(noise=0.0005), "process_noise.small"),
+        pytest.param(Cart(noise=0.0), "process_noise.small", marks=pytest.mark.long),
         pytest.param(Cart(noise=0.05), "process_noise.large", marks=pytest.mark.long),
         (Cart(weight=0.98), "weights.constant"),
     ],

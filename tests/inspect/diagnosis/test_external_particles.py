@@ -47,8 +47,11 @@ class Particles:
         powers: Mapping[str, float] | None = None,
         resample: bool = True,
         best_only: bool = False,
+        weighted: bool = True,
+        variance: float = 1.0,
     ) -> None:
         self.count, self.powers, self.resample, self.best_only = count, powers or {}, resample, best_only
+        self.weighted, self.variance = weighted, variance
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.rng = np.random.default_rng(0)
@@ -62,7 +65,10 @@ class Particles:
         posterior = prior + sum(self.powers.get(k, 1.0) * row for k, row in zip(STD, likelihood, strict=True))
         posterior -= np.logaddexp.reduce(posterior)
         values = {"particles": self.x, "log_weights": posterior, "prior_log_weights": prior}
-        values |= {"log_likelihood": likelihood, "estimate_mean": np.exp(posterior) @ self.x}
+        mean = np.exp(posterior) @ self.x
+        covariance = self.variance * np.exp(posterior)[None] @ np.square(self.x - mean)
+        values |= {"log_likelihood": likelihood, "estimate_mean": mean if self.weighted else self.x.mean(0)}
+        values |= {"estimate_covariance": covariance}
         self.log_weights = posterior
         ancestors = np.arange(self.count)
         if self.resample and 1 / np.exp(2 * posterior).sum() < 0.5 * self.count:
@@ -123,6 +129,31 @@ def test_statistics_of_particles_that_a_filter_reports() -> None:
     assert shares[2] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
 
 
+def test_estimates_are_compared_with_the_moments_of_the_particles() -> None:
+    healthy, mean, quarter = (
+        reported_particle_statistics(bs.trace(filter_of(module), [ride(0)], 0))
+        for module in (Particles(), Particles(weighted=False), Particles(variance=0.25))
+    )
+    assert healthy["estimate mean//all"] == pytest.approx(0.0, abs=1e-4)  # the trace has single precision
+    assert healthy["reported variance//all"] == pytest.approx(0.0, abs=1e-4)
+    assert mean["estimate mean//all"] > 0.3
+    assert quarter["reported variance//all"] == pytest.approx(np.log(0.25), abs=1e-4)
+
+
+def test_moments_of_angles_are_those_of_their_differences() -> None:
+    """Particles on both sides of half a turn: the estimate at the turn is right, their arithmetic mean, 0, is wrong."""
+    task = replace(TASK, components=(bs.Component("x", "rad", wraps=True),))
+    trace = bs.trace(filter_of(Particles()), [ride(0)], 0)
+    x = np.pi + np.linspace(-0.1, 0.1, 100)[:, None] * np.ones((len(trace), 1, 1))
+    wrapped = ((x + np.pi) % (2.0 * np.pi) - np.pi).astype(np.float32)
+    even = np.full_like(trace.log_weights, -np.log(100))
+    turned = replace(trace, episode=replace(trace.episode, task=task), particles=wrapped, log_weights=even)
+    for estimate, distance in ((np.pi, 0.0), (0.0, np.pi / x.std(1).mean())):
+        mean = np.full_like(trace.estimate_mean, estimate)
+        values = reported_particle_statistics(replace(turned, estimate_mean=mean))
+        assert values["estimate mean//all"] == pytest.approx(distance, rel=0.01, abs=1e-3)
+
+
 def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
     """The filter uses the held reading of a masked sensor; a flat likelihood is none."""
     task = replace(TASK, masks={"far": "seen"}, covariates={"seen": CONTACT})
@@ -144,6 +175,8 @@ def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
         (Particles(powers={"far": 0.0}), "weights.ignores_likelihood"),
         (Particles(resample=False), "resampling.off"),
         (Particles(best_only=True), "particles.deprived"),
+        (Particles(weighted=False), "estimate.mean"),
+        pytest.param(Particles(powers=dict.fromkeys(STD, -1.0)), "weights.ignores_likelihood", marks=pytest.mark.long),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

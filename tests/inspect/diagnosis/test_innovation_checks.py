@@ -94,13 +94,14 @@ class Boat:
         jacobian: float | Array = 1.0,
         heading_jacobian: float = 1.0,
         gain: float = 1.0,
+        reduction: float = 1.0,
         absent: bool = False,
     ) -> None:
         self.factors = {"radar": radar, "compass": compass}
         self.wraps, self.has_bias, self.updates = wraps, has_bias, updates
         self.turn, self.offset, self.separate = turn, offset, separate
         self.jacobian, self.heading_jacobian = np.asarray(jacobian), heading_jacobian
-        self.gain, self.absent = gain, absent
+        self.gain, self.reduction, self.absent = gain, reduction, absent
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
         self.mean, self.covariance, self.random = mean, covariance, np.random.default_rng(0)
@@ -130,7 +131,7 @@ class Boat:
             size = h @ covariance @ h.T + r
             gain = covariance @ h.T @ np.linalg.inv(size)
             used = self.gain if key == "radar" else 1.0
-            mean, covariance = mean + used * gain @ innovation, covariance - gain @ size @ gain.T
+            mean, covariance = mean + used * gain @ innovation, covariance - self.reduction * gain @ size @ gain.T
             innovations.append(innovation)
             covariances.append(size)
         mean[2] = wrapped(mean[2])
@@ -257,6 +258,8 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         pytest.param(Boat(jacobian=0.5), "measurement.radar.jacobian", marks=pytest.mark.long),
         (Boat(heading_jacobian=-1.0), "dynamics.jacobian"),
         (Boat(gain=0.5), "updates.radar.gain"),
+        (Boat(reduction=0.0), "updates.covariance"),
+        pytest.param(Boat(reduction=-0.2), "updates.covariance", marks=pytest.mark.long),
         pytest.param(Boat(absent=True), "updates.radar.absent", marks=pytest.mark.long),
     ],
 )

@@ -94,6 +94,14 @@ def test_log_likelihoods_over_particles_show_noise_and_function(scale: float, of
     assert "measurement noise/compass/all" not in values, "likelihoods without evidence"
 
 
+def test_likelihoods_that_grow_with_the_error_are_inverted() -> None:
+    trace = with_likelihoods(run(Boat()), 1.0, 0.0)
+    assert measurement_model_statistics(trace, models())["inverted likelihood/radar/all"] == 0.0
+    inverted = measurement_model_statistics(replace(trace, log_likelihood=-trace.log_likelihood), models())
+    assert inverted["inverted likelihood/radar/all"] == 1.0
+    assert "measurement noise/radar/all" not in inverted
+
+
 def test_channels_that_the_particles_do_not_separate_have_the_same_error() -> None:
     """Particles on a line show how much the measurement function of the radar is wrong, not in which channel."""
     n = run(Boat()).estimate_mean.shape[1]

@@ -53,6 +53,13 @@ def test_corrections_with_the_wrong_sign_have_a_slope_of_minus_one() -> None:
     assert slope == pytest.approx(-1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("filter_", [Boat(), Boat(radar=5.0), Boat(gain=0.5), Boat(reduction=0.0), Boat(reduction=0.8)])
+def test_the_reduction_of_the_covariance_is_relative_to_that_of_a_right_update(filter_: Boat) -> None:
+    """Whatever R and the gain of the mean."""
+    slope = jacobian_statistics(run(filter_, 4), loaded(filter_, 4))["covariance update//all"]
+    assert slope == pytest.approx(filter_.reduction, abs=0.01)
+
+
 def test_a_wrong_sign_in_one_column_shows_in_its_modality() -> None:
     f, (radar, compass), _ = errors_of(Boat(jacobian=FLIPPED))
     assert radar > 0.5 > 3.0 * compass
