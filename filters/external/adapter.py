@@ -59,6 +59,14 @@ PAIRS = (
 Values = dict[str, Tensor]
 
 
+class FailedStep(BadInput):
+    """A filter fails at a step, or returns a number that is not finite."""
+
+    def __init__(self, message: str, step: int) -> None:
+        super().__init__(message)
+        self.step = step
+
+
 def unchanged(observations: dict[str, Any], controls: Any) -> tuple[Any, Any]:
     """The default ``Adapter.inputs``: the task's observations and controls."""
     return observations, controls
@@ -256,10 +264,13 @@ def joined(name: str, runs: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(runs), dim=1)
 
 
-def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str) -> Values:
-    """Returns the values. Raises BadInput for inconsistent shapes and numbers that are not finite.
+def check_values(
+    values: Values, leading: Sequence[int], sizes: dict[str, int], source: str, step: int | None = None
+) -> Values:
+    """Returns the values. Raises BadInput for inconsistent shapes, and FailedStep for numbers that are not finite.
 
     Args:
+        step: of the values, if they have no axis of time.
         leading: expected sizes of the axes before those in ``SHAPES``. sizes: of the axes' letters; extended by those
             that occur for the first time.
     """
@@ -277,7 +288,8 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
         if _is_finite(value):
             continue
         if (not may_be_nan and value.isnan().any()) or (not may_be_infinite and value.isinf().any()):
-            raise BadInput(f"{source} returns {name} with a number that is not finite")
+            failed = int((~value.isfinite()).flatten(1).any(1).int().argmax()) if step is None else step
+            raise FailedStep(f"{source} returns {name} with a number that is not finite", failed)
     if "effective_weights" in values and values["effective_weights"].shape[-2] > 1:
         _check_sum(values["effective_weights"].sum(-2), source)
     sizes.pop("m", None)  # the number of channels may change between steps

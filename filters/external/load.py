@@ -36,6 +36,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.adapter import (
     SHAPES,
     Adapter,
+    FailedStep,
     Units,
     Values,
     check_values,
@@ -214,7 +215,7 @@ class ExternalFilter(Checkpoint):
         """Raises BadInput that names the first step with an invalid value."""
         sizes = {"n": len(self._task.components)}
         for t, values in enumerate(steps):
-            check_values(values, (count,), sizes, f"{self.source} at step {t}")
+            check_values(values, (count,), sizes, f"{self.source} at step {t}", t)
 
     def live(self, episode: Episode, seed: int = 0) -> Generator[tuple[Values, tuple[str, ...]]]:
         """Like ``run`` for one episode, as an iterator over steps: (N, ...) with N = 1, and the models' names.
@@ -272,7 +273,7 @@ class ExternalFilter(Checkpoint):
                 except BadInput:
                     raise
                 except Exception as error:
-                    raise self._error(f"step {t}", error) from error
+                    raise FailedStep(str(self._error(f"step {t}", error)), t) from error
                 yield values, capture.models
 
     def _initialize(self, start: Gaussian) -> None:

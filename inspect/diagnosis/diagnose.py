@@ -15,6 +15,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
+from beliefscope.filters.external.adapter import FailedStep
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import (
     Case,
@@ -31,6 +32,7 @@ from beliefscope.inspect.diagnosis.case import (
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
+from beliefscope.inspect.diagnosis.divergence import traces_with_restarts, with_restarts
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
@@ -39,7 +41,6 @@ from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.batch import trace_all
 
 BLOCK = 16
 """Number of episodes that run together. It does not depend on the number of workers, so neither do the values."""
@@ -77,6 +78,8 @@ def diagnose(
         engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
         progress: called with the completed fraction.
 
+    An external filter that fails at a step is restarted at the true state; the headline says so.
+
     Raises BadInput without episodes, without a healthy profile or with too small a one, for episodes of another task,
     and for several workers with an external filter that has no build function.
     """
@@ -94,7 +97,8 @@ def diagnose(
     traces, rows, sensors = zip(*(observed[index] for index in episodes), strict=True)
     inputs = _run_inputs(checkpoint, traces, particles, profile)
     case = compared(inputs, traces, rows, sensors, profile, alarm_rate)
-    return _diagnosed(case, seed, base, engine, workers, lambda share: report(0.6 + 0.4 * share))
+    diagnosis = _diagnosed(case, seed, base, engine, workers, lambda share: report(0.6 + 0.4 * share))
+    return with_restarts(diagnosis, traces)
 
 
 Observed = tuple[Trace, dict[str, float], dict[str, float]]
@@ -111,7 +115,7 @@ def _observed(
 ) -> list[Observed]:
     episodes = dict(block)
     observed: list[Observed] = []
-    for trace in trace_all(checkpoint, episodes, episodes, seed, particles):
+    for trace in traces_with_restarts(checkpoint, episodes, seed, particles):
         observed.append((trace, *observe(trace, checkpoint, profile)))
         if progress is not None:
             progress(len(observed) / len(block))
@@ -227,7 +231,10 @@ def _undone(everything: Case, case: Case, seed: int, base: Checkpoint | None, na
     steps = affected_steps(case, alarms[0], hit) if alarms else None
     indices = [trace.episode_index for trace, affected in zip(case.traces, hit, strict=True) if affected]
     inputs = replace(case.inputs, affected=frozenset(indices), steps=steps)
-    replay = replay_without(cause, inputs, case.by_statistic, seed, base)
+    try:
+        replay = replay_without(cause, inputs, case.by_statistic, seed, base)
+    except FailedStep:  # the filter diverges nevertheless
+        return None
     if replay is None:
         return None
     action, traces = replay

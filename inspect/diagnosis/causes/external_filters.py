@@ -94,8 +94,21 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         LARGE,
         COVARIANCE,
         ESTIMATE,
+        *([_wrong_sign(tuple(task.modalities))] if len(task.modalities) > 1 else []),
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
         *(cause for modality in task.modalities for cause in _of_updates(modality)),
+    )
+
+
+def _wrong_sign(modalities: Sequence[str]) -> Cause:
+    """Of a single modality, it is called a wrong Jacobian."""
+    return Cause(
+        "updates.sign",
+        "Corrections by all sensors have the wrong sign",
+        tuple(Symptom(f"correction slope/{modality}/*", -1, target="mirrored") for modality in modalities),
+        f"{JACOBIANS}|measurement function/*|measurement noise/*|{FILTER}",
+        "Check the sign of the innovations, reading minus expected reading, and that the corrections are added.",
+        prior=0.3,  # each wrong Jacobian explains those of the other modalities as well
     )
 
 

@@ -1,0 +1,99 @@
+"""Filters that diverge or fail are restarted at the true state, and the cause is named."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, drive
+
+import beliefscope as bs
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.divergence import RESTARTS, traces_with_restarts
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.healthy import profile_of
+
+
+class Kalman:
+    """One update after another of a position, m."""
+
+    def __init__(self, sign: float = 1.0, fails_beyond: float = np.inf) -> None:
+        self.sign, self.fails_beyond = sign, fails_beyond
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        self.mean, self.covariance = mean, covariance
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        prior, covariance = self.mean + controls, self.covariance + 0.005**2 * np.eye(2)
+        mean, values = (
+            prior,
+            {"predicted_mean": np.stack([prior] * 2), "predicted_covariance": np.stack([covariance] * 2)},
+        )
+        innovations, sizes = [], []
+        for key, std in SENSORS.items():
+            innovation, size = observations[key] - mean, covariance + std**2 * np.eye(2)
+            gain = covariance @ np.linalg.inv(size)
+            innovations.append(innovation)
+            sizes.append(size)
+            mean, covariance = mean + self.sign * gain @ innovation, (np.eye(2) - gain) @ covariance
+        if np.abs(mean).max() > self.fails_beyond:
+            raise np.linalg.LinAlgError("Matrix is not positive definite")
+        self.mean, self.covariance = mean, covariance
+        values |= {"innovation": innovations, "innovation_covariance": sizes}
+        return values | {"estimate_mean": mean, "estimate_covariance": covariance}
+
+
+def loaded(filter_: Kalman) -> ExternalFilter:
+    adapter = bs.Adapter(filter_, batched=False, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
+    checkpoint = bs.load_filter(adapter, TASK, name="kalman")
+    assert isinstance(checkpoint, ExternalFilter)
+    return checkpoint
+
+
+@cache
+def profile() -> HealthyProfile:
+    return profile_of(loaded(Kalman()), [drive(seed) for seed in range(12)], "cart")
+
+
+@pytest.mark.parametrize("filter_", [Kalman(sign=-1.0), Kalman(sign=-1.0, fails_beyond=1e3)])
+def test_a_run_with_restarts_is_that_of_the_parts(filter_: Kalman) -> None:
+    """From the true state at each of them, up to where the state is lost, and with the complete episode."""
+    checkpoint, episode = loaded(filter_), drive(20)
+    (run,) = traces_with_restarts(checkpoint, {7: episode}, 0, 100)
+    assert run.episode is episode
+    assert len(run) == len(episode)
+    starts = [0, *run.settings[RESTARTS], len(episode)]
+    assert len(starts) > 3
+    std = episode.states.std(0)
+    for first, last in pairwise(starts):
+        np.testing.assert_array_equal(
+            run.estimate_mean[first:last], bs.trace(checkpoint, episode.part(first, last)).estimate_mean
+        )
+        assert (np.abs(run.estimate_mean[first : last - 1] - episode.states[first : last - 1]) < 10.0 * std).all()
+
+
+def test_a_run_that_does_not_diverge_has_no_restarts() -> None:
+    (run,) = traces_with_restarts(loaded(Kalman()), {7: drive(20)}, 0, 100)
+    assert RESTARTS not in run.settings
+    np.testing.assert_array_equal(run.estimate_mean, bs.trace(loaded(Kalman()), drive(20)).estimate_mean)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "filter_", [Kalman(sign=-1.0), pytest.param(Kalman(sign=-1.0, fails_beyond=1e3), marks=pytest.mark.long)]
+)
+def test_the_cause_of_a_divergence_is_named(filter_: Kalman) -> None:
+    result = diagnose(loaded(filter_), {seed: drive(seed) for seed in range(20, 25)}, profile=profile())
+    assert result.causes[0].cause.name == "updates.sign", result.headline
+    assert "; the filter diverges in 5 of 5 episodes, first at step " in result.headline
+    assert set(result.provenance[RESTARTS]) == set(range(20, 25))
+
+
+def test_a_filter_that_fails_at_once_has_no_diagnosis() -> None:
+    with pytest.raises(BadInput, match="Kalman fails at step 0: LinAlgError: Matrix is not positive definite"):
+        diagnose(loaded(Kalman(fails_beyond=0.0)), {0: drive(20)}, profile=profile())
