@@ -17,8 +17,8 @@ from beliefscope.inspect.trace import Trace
 LEAST = 10
 """Smallest number of steps beyond that of unknowns; twice as many where there are enough."""
 
-LARGEST_STD = 0.4
-"""Largest standard deviation of a slope."""
+LARGEST_STD = 1.0
+"""Largest standard deviation of the slope of an episode; several episodes have a mean of less."""
 
 OWN = 0.05
 """Smallest part of an effect that does not follow from the state and the other controls, which explain the rest."""

@@ -256,8 +256,8 @@ def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None
         (Boat(jacobian=FLIPPED), "measurement.radar.jacobian"),
         pytest.param(Boat(jacobian=-1.0), "measurement.radar.jacobian", marks=pytest.mark.long),
         pytest.param(Boat(jacobian=0.5), "measurement.radar.jacobian", marks=pytest.mark.long),
-        (Boat(heading_jacobian=-1.0), "dynamics.jacobian"),
-        (Boat(gain=0.5), "updates.radar.gain"),
+        pytest.param(Boat(heading_jacobian=-1.0), "dynamics.jacobian", marks=pytest.mark.long),
+        pytest.param(Boat(gain=0.5), "updates.radar.gain", marks=pytest.mark.long),
         (Boat(reduction=0.0), "updates.covariance"),
         pytest.param(Boat(reduction=-0.2), "updates.covariance", marks=pytest.mark.long),
         pytest.param(Boat(absent=True), "updates.radar.absent", marks=pytest.mark.long),
@@ -269,7 +269,7 @@ def test_defects_of_the_equations_are_named(filter_: Boat, cause: str) -> None:
     assert (result.causes[0].cause.name, result.causes[0].probability > 0.5) == (cause, True), result.headline
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_innovations_that_are_not_wrapped_are_mentioned_although_the_record_has_them_too() -> None:
     unwrapped = loaded(Boat(wraps=False))
     record = profile_of(unwrapped, [sail(seed) for seed in range(12)], "boat")

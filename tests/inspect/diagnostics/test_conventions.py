@@ -76,6 +76,7 @@ def test_sensors_without_influence_change_nothing() -> None:
     assert (result.share[rows] == 0.0).all()
 
 
+@pytest.mark.long
 def test_clean_episodes_have_no_finding() -> None:
     result = conventions(traces(), filter_())
     assert (result.relevant_removals, result.alarms) == ([], ())
