@@ -65,10 +65,11 @@ def _until_lost(
         if error.step < MIN_STEPS:
             raise
         run = trace(checkpoint, episode.part(0, error.step), index, seed)
-    size = np.abs(measures.errors(run)[:, -1]) / std
-    if len(run) == len(episode) and not (size > largest).any():
+    with np.errstate(all="ignore"):  # single precision overflows before the filter fails
+        size = np.abs(measures.errors(run)[:, -1]) / std
+    if len(run) == len(episode) and (size <= largest).all():
         return run
-    steps = max(MIN_STEPS, int(np.argmax(np.append((size > LOST).any(-1), True))))
+    steps = max(MIN_STEPS, int(np.argmin(np.append((size <= LOST).all(-1), False))))
     return _joined([run], episode.part(0, steps), {})
 
 
