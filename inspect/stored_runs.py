@@ -10,10 +10,13 @@ from typing import Any
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.adapter import FailedStep
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.external_replay import ExternalReplay, open_replay
 from beliefscope.inspect.traces.replay import Intervention, Replay
+from beliefscope.inspect.traces.restarts import trace_with_restarts
 
 Progress = Callable[[float], None]
 """Called with the completed fraction, 0..1. An exception that it raises ends the run."""
@@ -54,13 +57,23 @@ class StoredRuns:
         return self._replay[1].with_intervention(intervention)
 
 
+def _traced(checkpoint: Checkpoint, episode: Episode, progress: Progress, settings: dict[str, Any]) -> Trace:
+    """The run; an external filter that fails at a step is restarted at the true state."""
+    try:
+        return trace(checkpoint, episode, progress=progress, **settings)
+    except FailedStep:
+        assert isinstance(checkpoint, ExternalFilter)
+        own = {name: value for name, value in settings.items() if name != "particles"}
+        return trace_with_restarts(checkpoint, episode, **own)
+
+
 def _run_or_load(
     path: Path, checkpoint: Checkpoint, episode: Episode, progress: Progress, settings: dict[str, Any]
 ) -> Trace:
     if path.is_file():
         with suppress(BadInput):
             return load_trace(path)
-    result = trace(checkpoint, episode, progress=progress, **settings)
+    result = _traced(checkpoint, episode, progress, settings)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_trace(result, path)
     return result

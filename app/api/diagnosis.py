@@ -69,6 +69,7 @@ class Diagnosis(Reply):
     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
     outdated: whether an earlier version measured the healthy record, which lacks statistics.
+    restarts: steps of the episodes at which a filter that diverges was restarted, or None.
     """
 
     state: Literal["healthy", "fault", "unsure"]
@@ -87,6 +88,7 @@ class Diagnosis(Reply):
     unmeasured: list[str]
     outdated: bool = False
     alarm_rate: float
+    restarts: dict[int, list[int]] | None = None
 
 
 class DiagnosisJob(JobReply):

@@ -63,6 +63,13 @@ class Column(Reply):
     offset: int
 
 
+class Failure(Reply):
+    """The first reason for which a filter fails, and the steps at which the run restarts it at the true state."""
+
+    failure: str
+    restarts: list[int]
+
+
 class TraceHeader(Reply):
     """Metadata of a trace.
 
@@ -73,6 +80,7 @@ class TraceHeader(Reply):
         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
             reasons. sensors: drawn ones.
         no_diagnosis: why the filter has no diagnosis, or None. defects: errors of such a filter that show without one.
+        failure: present if the filter fails at a step.
         data_warning: how the data differ from the checkpoint's training data, or None.
         scene: layers of its 3D scene. live: present while the trace is of a live run.
     """
@@ -99,6 +107,7 @@ class TraceHeader(Reply):
     data_warning: str | None = None
     no_diagnosis: str | None = None
     defects: tuple[str, ...] = ()
+    failure: Failure | None = None
     scene: list[SceneLayer]
     live: LiveRun | None = None
 

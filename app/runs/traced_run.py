@@ -17,6 +17,7 @@ from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap, MapEngine, missing_quantities, no_maps
 from beliefscope.inspect.trace import Trace, arrays_of
+from beliefscope.inspect.traces.restarts import FAILURE, RESTARTS
 
 MAP_CACHE_BYTES = 12 << 20  # per trace: about 300 coarse maps
 DEFAULT_MAP = MapOptions()
@@ -84,7 +85,8 @@ class TracedRun:
         warning = data_warning(checkpoint, [trace.episode], trace.faults)
         reason = no_diagnosis(checkpoint)
         defects = wrong_equations([trace], checkpoint) if reason else ()  # which a diagnosis contains
-        return description | {"data_warning": warning, "no_diagnosis": reason, "defects": defects}
+        failure = {name: trace.settings[name] for name in (FAILURE, RESTARTS) if FAILURE in trace.settings} or None
+        return description | {"data_warning": warning, "no_diagnosis": reason, "defects": defects, "failure": failure}
 
     @cached_property
     def columns(self) -> tuple[list[dict[str, Any]], bytes]:

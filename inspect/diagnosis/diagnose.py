@@ -7,7 +7,7 @@ with the same random numbers. The right undo restores the healthy statistics.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -32,7 +32,6 @@ from beliefscope.inspect.diagnosis.case import (
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.divergence import traces_with_restarts, with_restarts
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
@@ -41,6 +40,8 @@ from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
+from beliefscope.inspect.traces.restarts import RESTARTS, trace_with_restarts
 
 BLOCK = 16
 """Number of episodes that run together. It does not depend on the number of workers, so neither do the values."""
@@ -50,6 +51,9 @@ UNDONE = 3
 
 WORTH_UNDOING = 0.02
 """Smallest probability of a cause that is undone."""
+
+DIVERGED = 1e4
+"""Error of an external filter that is restarted (``trace_with_restarts``)."""
 
 RESTORED = 0.3
 """Weight of the restored share of all deviations in the score of a cause that was undone."""
@@ -98,7 +102,7 @@ def diagnose(
     inputs = _run_inputs(checkpoint, traces, particles, profile)
     case = compared(inputs, traces, rows, sensors, profile, alarm_rate)
     diagnosis = _diagnosed(case, seed, base, engine, workers, lambda share: report(0.6 + 0.4 * share))
-    return with_restarts(diagnosis, traces)
+    return _with_restarts(diagnosis, traces)
 
 
 Observed = tuple[Trace, dict[str, float], dict[str, float]]
@@ -115,11 +119,32 @@ def _observed(
 ) -> list[Observed]:
     episodes = dict(block)
     observed: list[Observed] = []
-    for trace in traces_with_restarts(checkpoint, episodes, seed, particles):
+    for trace in _runs(checkpoint, episodes, seed, particles):
         observed.append((trace, *observe(trace, checkpoint, profile)))
         if progress is not None:
             progress(len(observed) / len(block))
     return observed
+
+
+def _runs(checkpoint: Checkpoint, episodes: Mapping[int, Episode], seed: int, particles: int) -> Iterator[Trace]:
+    """The runs of all episodes, of external filters with restarts."""
+    if isinstance(checkpoint, ExternalFilter):
+        for index, episode in episodes.items():
+            yield trace_with_restarts(checkpoint, episode, index, seed, largest=DIVERGED)
+    else:
+        yield from trace_all(checkpoint, episodes, episodes, seed, particles)
+
+
+def _with_restarts(diagnosis: Diagnosis, traces: Sequence[Trace]) -> Diagnosis:
+    """The diagnosis, whose headline states in how many episodes the filter was restarted."""
+    lost = {trace.episode_index: trace.settings[RESTARTS] for trace in traces if RESTARTS in trace.settings}
+    if not lost:
+        return diagnosis
+    index = min(lost, key=lambda i: lost[i][0])
+    where = f" in {len(lost)} of {len(traces)} episodes, first at" if len(traces) > 1 else " at"
+    of_episode = f" of episode {index}" if len(traces) > 1 else ""
+    headline = f"{diagnosis.headline}; the filter diverges{where} step {lost[index][0]}{of_episode}"
+    return replace(diagnosis, headline=headline, provenance={**diagnosis.provenance, RESTARTS: lost})
 
 
 def diagnose_traces(
@@ -146,7 +171,8 @@ def preliminary(
     Raises BadInput without a healthy profile, or with too small a one.
     """
     case = _examined(checkpoint, [trace], particles, required_profile(checkpoint), alarm_rate)
-    return conclude(case, case, explain_all(case), None) if case.alarms else healthy(case)
+    diagnosis = conclude(case, case, explain_all(case), None) if case.alarms else healthy(case)
+    return _with_restarts(diagnosis, [trace])
 
 
 def _examined(

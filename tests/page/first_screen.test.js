@@ -198,6 +198,13 @@ test('an error that stays, falls again or jumps at the last step is no divergenc
 });
 
 test('a defect of a filter without a diagnosis comes before its largest error', () => {
+  const failure = { failure: 'ekf.py:make fails at step 9: LinAlgError', restarts: [5, 8] };
+  assert.deepEqual(finding({ ...run(11), header: { failure } }, 0, null), {
+    tone: 'bad',
+    headline: 'The filter fails; this run restarts it at the true state 2 times.',
+    evidence: 'ekf.py:make fails at step 9: LinAlgError.',
+    step: 5,
+  });
   const defects = ['the Jacobian of radar differs by 91 %'];
   const { tone, headline, evidence, step } = finding({ ...run(11), header: { defects } }, 0, null);
   assert.deepEqual([tone, headline], ['bad', 'The Jacobian of radar differs by 91 %.']);

@@ -4,7 +4,7 @@
 /** @import { Diagnosis, DiagnosisCause } from '../types/server.js' */
 
 import { SHOWN } from '../core/constants.js';
-import { displayName, fixed, percent, sentence, typeset, withUnit } from '../core/units.js';
+import { displayName, fixed, percent, plural, sentence, typeset, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { stepSummary, weightScope } from './step_summary.js';
 
@@ -47,11 +47,22 @@ export function finding(trace, component, diagnosis) {
   const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
   const outage = fault ? null : outageFinding(trace, component);
   if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
+  if (trace.header.failure) return failureFinding(trace.header.failure);
   const defect = trace.header.defects?.[0];
   if (defect) return { ...worst, tone: 'bad', headline: sentence(defect), evidence: summary };
   if (!diagnosis) return worst;
   const { tone = healthy, headline = healthyHeadline(trace, component, diagnosis) } = fault ?? {};
   return { tone, headline, evidence: summary, step: worst.step };
+}
+
+/**
+ * Describes the failure of a filter by its first restart.
+ * @param {NonNullable<Trace['header']['failure']>} failure
+ * @returns {Finding}
+ */
+function failureFinding({ failure, restarts }) {
+  const headline = `The filter fails; this run restarts it at the true state ${plural(restarts.length, 'time')}.`;
+  return { tone: 'bad', headline, evidence: sentence(failure), step: restarts[0] };
 }
 
 /**

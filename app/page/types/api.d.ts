@@ -151,6 +151,7 @@ export interface components {
          *     statistics: number of compared statistics by sensor, of the controls, labels, models and the filter.
          *     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
          *     outdated: whether an earlier version measured the healthy record, which lacks statistics.
+         *     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
          */
         Diagnosis: {
             /**
@@ -196,6 +197,10 @@ export interface components {
             outdated: boolean;
             /** Alarm Rate */
             alarm_rate: number;
+            /** Restarts */
+            restarts?: {
+                [key: string]: number[];
+            } | null;
         };
         /**
          * DiagnosisCause
@@ -517,6 +522,16 @@ export interface components {
             rows: components["schemas"]["ExperimentRow"][];
             /** Count */
             count: number;
+        };
+        /**
+         * Failure
+         * @description The first reason for which a filter fails, and the steps at which the run restarts it at the true state.
+         */
+        Failure: {
+            /** Failure */
+            failure: string;
+            /** Restarts */
+            restarts: number[];
         };
         /**
          * FailureEvent
@@ -1962,6 +1977,7 @@ export interface components {
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
          *             reasons. sensors: drawn ones.
          *         no_diagnosis: why the filter has no diagnosis, or None. defects: errors of such a filter that show without one.
+         *         failure: present if the filter fails at a step.
          *         data_warning: how the data differ from the checkpoint's training data, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
          */
@@ -2020,6 +2036,7 @@ export interface components {
              * @default []
              */
             defects: string[];
+            failure?: components["schemas"]["Failure"] | null;
             /** Scene */
             scene: ("replay" | "objects" | "estimates" | "contours" | "particles" | "force" | "map" | "camera")[];
             live?: components["schemas"]["LiveRun"] | null;
@@ -2149,6 +2166,7 @@ export type Error = components['schemas']['Error'];
 export type Example = components['schemas']['Example'];
 export type ExperimentRow = components['schemas']['ExperimentRow'];
 export type Experiments = components['schemas']['Experiments'];
+export type Failure = components['schemas']['Failure'];
 export type FailureEvent = components['schemas']['FailureEvent'];
 export type FailureScore = components['schemas']['FailureScore'];
 export type FailureSlice = components['schemas']['FailureSlice'];

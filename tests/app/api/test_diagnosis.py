@@ -130,8 +130,41 @@ def right():
 
 def wrong():
     return adapter(Boat(jacobian=FLIPPED))
+
+class Failing(Boat):
+    def initialize_beliefs(self, **belief):
+        super().initialize_beliefs(**belief)
+        self.steps = 0
+
+    def __call__(self, **inputs):
+        self.steps += 1
+        if self.steps > 15:
+            raise ArithmeticError("not positive definite")
+        return super().__call__(**inputs)
+
+def failing():
+    return adapter(Failing())
 """
-"""Filters of a task; the Jacobian of one is wrong."""
+"""Filters of a task; the Jacobian of one is wrong, and one fails after 15 steps."""
+
+
+def test_a_run_of_a_filter_that_fails_has_restarts(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
+    (tmp_path / "boats.py").write_text(BOATS)
+    source = f"{tmp_path}/boats.py"
+    write_dataset(tmp_path / "short.h5", task(4), [sail(seed).part(0, 40) for seed in range(4)])
+    settings = Settings(
+        tmp_path / "workspace",
+        data={"short": tmp_path / "short.h5"},
+        checkpoints={"failing": load_external(f"{source}:failing", task(4))},
+        tasks=(f"{source}:TASK",),
+    )
+    with open_client(settings) as client:
+        while (reply := client.get("/api/trace/boat/failing/1")).status_code == 202:
+            time.sleep(0.05)
+        header = reply.json()
+    reason = f"{source}:failing fails at step 15: ArithmeticError: not positive definite"
+    assert header["steps"] == 40
+    assert header["failure"] == {"failure": reason, "restarts": [15, 30]}
 
 
 def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.inspect.diagnosis import test_innovation_checks as boats
 from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, drive
 
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.divergence import RESTARTS, traces_with_restarts
+from beliefscope.inspect.diagnosis.diagnose import DIVERGED, diagnose
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.traces.restarts import FAILURE, RESTARTS, trace_with_restarts
 
 
 class Kalman:
@@ -64,9 +65,11 @@ def profile() -> HealthyProfile:
 def test_a_run_with_restarts_is_that_of_the_parts(filter_: Kalman) -> None:
     """From the true state at each of them, up to where the state is lost, and with the complete episode."""
     checkpoint, episode = loaded(filter_), drive(20)
-    (run,) = traces_with_restarts(checkpoint, {7: episode}, 0, 100)
-    assert run.episode is episode
-    assert len(run) == len(episode)
+    run = trace_with_restarts(checkpoint, episode, 7, largest=100.0)
+    assert (run.episode_index, len(run), run.data_hash) == (7, len(episode), episode.digest())
+    np.testing.assert_array_equal(run.episode.states, episode.states)
+    reason = "fails at step" if np.isfinite(filter_.fails_beyond) else "Kalman diverges"
+    assert reason in run.settings[FAILURE]
     starts = [0, *run.settings[RESTARTS], len(episode)]
     assert len(starts) > 3
     std = episode.states.std(0)
@@ -78,9 +81,15 @@ def test_a_run_with_restarts_is_that_of_the_parts(filter_: Kalman) -> None:
 
 
 def test_a_run_that_does_not_diverge_has_no_restarts() -> None:
-    (run,) = traces_with_restarts(loaded(Kalman()), {7: drive(20)}, 0, 100)
+    run, usual = trace_with_restarts(loaded(Kalman()), drive(20)), bs.trace(loaded(Kalman()), drive(20))
     assert RESTARTS not in run.settings
-    np.testing.assert_array_equal(run.estimate_mean, bs.trace(loaded(Kalman()), drive(20)).estimate_mean)
+    assert (run.data_hash, run.settings) == (usual.data_hash, usual.settings)
+    np.testing.assert_array_equal(run.estimate_mean, usual.estimate_mean)
+
+
+def test_a_component_that_does_not_change_has_the_scale_of_the_first_belief() -> None:
+    """The bias of the boat is constant."""
+    assert RESTARTS not in trace_with_restarts(boats.loaded(boats.Boat()), boats.sail(3, 4), largest=DIVERGED).settings
 
 
 @pytest.mark.slow

@@ -1,0 +1,95 @@
+"""Runs of external filters that diverge: restarted at the true state, they can be displayed and diagnosed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.external.adapter import FailedStep
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.traces.data import Trace
+from beliefscope.inspect.traces.external import trace_external
+
+MIN_STEPS = 5
+"""Smallest number of steps between two restarts."""
+
+LOST = 3.0
+"""Error of an estimate that has lost the true state, in standard deviations of the true states, or of the first belief
+if these are larger."""
+
+RESTARTS, FAILURE = "restarts", "failure"
+"""Settings of a trace: the steps at which its filter was restarted, and the first reason."""
+
+
+def trace_with_restarts(
+    external: ExternalFilter,
+    episode: Episode,
+    episode_index: int = 0,
+    seed: int = 0,
+    faults: Faults = NO_FAULTS,
+    largest: float = math.inf,
+) -> Trace:
+    """The run over an episode; a filter that fails at a step is restarted at the true state where it has lost it.
+
+    It also fails if it returns a number that is not finite, or with an error of more than ``largest`` standard
+    deviations (``LOST``). The trace has the settings ``RESTARTS`` and ``FAILURE`` if it fails.
+
+    Raises BadInput as ``trace``, and if the filter fails within ``MIN_STEPS`` of a start.
+    """
+    seen, start = faults.apply(episode, seed), external.start([episode]).covariance[0].numpy()
+    # Some components, such as a bias, do not change in an episode.
+    std = np.fmax(episode.states.std(0), np.sqrt(np.fmax(np.diagonal(start), 1e-24)))
+    runs: list[Trace] = []
+    starts, reason = [0], ""
+    while starts[-1] < len(episode):
+        part = seen.part(starts[-1], len(episode))
+        run, failure = _until_lost(external, part, seed, std, LOST if runs else largest)
+        runs.append(run)
+        starts.append(starts[-1] + len(run))
+        reason = reason or failure
+    joined = _joined(runs, seen, {RESTARTS: starts[1:-1], FAILURE: reason} if reason else {})
+    return replace(joined, episode_index=episode_index, faults=faults, data_hash=episode.digest())
+
+
+def _until_lost(
+    external: ExternalFilter, episode: Episode, seed: int, std: NDArray[Any], largest: float
+) -> tuple[Trace, str]:
+    """The run up to the step at which the filter has lost the true state, if it fails, and the reason; else all of it.
+
+    Args:
+        std: (n,) of ``LOST``. largest: error of a filter that does not fail, relative to it.
+    """
+    reason = f"{external.source} diverges"
+    try:
+        run = trace_external(external, episode, seed=seed)
+    except FailedStep as error:
+        if error.step < MIN_STEPS:
+            raise
+        run, reason = trace_external(external, episode.part(0, error.step), seed=seed), str(error)
+    with np.errstate(all="ignore"):  # single precision overflows before the filter fails
+        difference = episode.task.difference(run.estimate_mean, run.episode.states)
+        size = np.abs(difference) / std
+    if len(run) == len(episode) and (size <= largest).all():
+        return run, ""
+    steps = max(MIN_STEPS, int(np.argmin(np.append((size <= LOST).all(-1), False))))
+    return _joined([run], episode.part(0, steps), {}), reason
+
+
+def _joined(runs: Sequence[Trace], episode: Episode, settings: Mapping[str, Any]) -> Trace:
+    """Runs over the parts of an episode, as one, without values beyond its end."""
+    first, steps = runs[0], len(episode)
+    arrays = {f.name: [getattr(run, f.name) for run in runs] for f in fields(Trace) if not f.name.startswith("start_")}
+    extra = {name: np.concatenate([run.extra[name] for run in runs])[:steps] for name in first.extra}
+    by_step: dict[str, Any] = {
+        name: np.concatenate(values)[:steps]
+        for name, values in arrays.items()
+        if all(isinstance(value, np.ndarray) for value in values)
+    }
+    return replace(first, episode=episode, extra=extra, settings={**first.settings, **settings}, **by_step)
