@@ -27,13 +27,13 @@ OWN = 0.05
 def control_effects(
     trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], predictions: Predictions, change: Array
 ) -> dict[str, float]:
-    """``dynamics effect/CHANNEL/all``: slope of the true on the predicted effect of a control on the next state.
+    """``dynamics effect/CHANNEL/COMPONENT``: slope of the true on the predicted effect of a control on the next state.
 
     It is -1 for a wrong sign in the dynamics, and 1/2 if the dynamics take twice the control. The predicted effect is
     the difference d of two predictions, with the control and with its median. The true changes (S, n) minus the second
     prediction are ``slope * d`` plus errors of other parts of the dynamics, linear in the state and the other controls,
-    plus noise. The components of the state are weighted by the inverse variance of the noise. Absent where the control
-    changes nothing, only as the state does, or too little, and for controls that command a measured hand.
+    plus noise. Absent where the control changes nothing, only as the state does, or too little, and for controls that
+    command a measured hand.
     """
     task, size = trace.task, trace.task.control_size
     if commands_hand(task):
@@ -53,24 +53,21 @@ def control_effects(
         rest = measures.wrapped(task, change - without.change)
         for i in range(first, min(first + spacing, size)):
             own = chosen[:, i]
-            slope = _slope(rest[own], effect[own], np.column_stack([state, np.delete(controls, i, axis=1)])[own])
-            if np.isfinite(slope):
-                values[f"dynamics effect/{axis_name('control', i, size)}/all"] = slope
-    return values
+            slopes = _slopes(rest[own], effect[own], np.column_stack([state, np.delete(controls, i, axis=1)])[own])
+            for component, slope in zip(task.components, slopes, strict=True):
+                values[f"dynamics effect/{axis_name('control', i, size)}/{component.name}"] = float(slope)
+    return {name: value for name, value in values.items() if np.isfinite(value)}
 
 
-def _slope(true: Array, predicted: Array, state: Array) -> float:
-    """Slope of true on predicted effects (S, n) besides linear functions of features (S, F); NaN if it is unknown."""
+def _slopes(true: Array, predicted: Array, state: Array) -> Array:
+    """(n,) slopes of true on predicted effects (S, n) besides linear functions of features (S, F); NaN if unknown."""
     free = len(true) - state.shape[1] - 1
     if free < LEAST:
-        return np.nan
+        return np.full(true.shape[1], np.nan)
     basis, sizes, _ = np.linalg.svd(state / np.maximum(np.abs(state).max(0), 1e-12), full_matrices=False)
     basis = basis[:, sizes > 1e-6 * sizes[0]]
     y, d = (values - basis @ (basis.T @ values) for values in (true, predicted))
     power, total = np.square(d).sum(0), np.square(predicted - predicted.mean(0)).sum(0)
-    has_own = (power > OWN**2 * total) & (power > 0.0)
-    y, d, power = y[:, has_own], d[:, has_own], power[has_own]
-    slopes = (d * y).sum(0) / power
+    slopes = (d * y).sum(0) / np.where(power > 0.0, power, np.nan)
     variance = np.square(y - slopes * d).sum(0) / free
-    weights = power / np.maximum(variance, 1e-6 * power)
-    return float((weights * slopes).sum() / weights.sum()) if weights.sum() > 1.0 / LARGEST_STD**2 else np.nan
+    return np.where((power > OWN**2 * total) & (variance < LARGEST_STD**2 * power), slopes, np.nan)

@@ -19,7 +19,8 @@ from beliefscope.inspect.diagnosis.true_starts import predictions_from_truth, so
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 
-NAMES = ["dynamics effect/control x/all", "dynamics effect/control y/all"]
+NAMES = [[f"dynamics effect/control {control}/{component}" for component in "xy"] for control in "xy"]
+"""Of both controls on both components."""
 
 MOVES = np.array([[1.0, 0.5], [0.5, 1.0]])
 """Displacements, m, of both components by the two controls."""
@@ -39,12 +40,12 @@ def drive(seed: int, noise: float = 0.002, task: bs.Task = TASK) -> bs.Episode:
 
 
 class Mixed(Cart):
-    """Predicts ``MOVES`` of the controls times gains."""
+    """Predicts ``MOVES`` of the controls times gains of both, or of each on each component."""
 
     def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
-        return super().__call__(observations=observations, controls=MOVES @ (np.array(self.gains) * controls))
+        return super().__call__(observations=observations, controls=(MOVES * np.array(self.gains)) @ controls)
 
-    def __init__(self, *gains: float) -> None:
+    def __init__(self, *gains: float | tuple[float, float]) -> None:
         super().__init__()
         self.gains = gains
 
@@ -70,35 +71,42 @@ def effects(filter_: Any, episode: bs.Episode) -> dict[str, float]:
 def test_slopes_are_the_inverse_gains(gains: tuple[float, float]) -> None:
     """Up to single precision; a wrong gain of one control does not change the slope of the other one."""
     values = effects(Mixed(*gains), drive(0, noise=0.0))
-    assert [values[name] for name in NAMES] == pytest.approx(1.0 / np.array(gains), abs=1e-3)
+    for names, gain in zip(NAMES, gains, strict=True):
+        assert [values[name] for name in names] == pytest.approx([1.0 / gain] * 2, abs=1e-3)
+
+
+def test_an_effect_on_one_component_does_not_change_that_on_the_other() -> None:
+    values = effects(Mixed((1.0, 1.0), (-1.0, 1.0)), drive(0, noise=0.0))
+    expected = {name: 1.0 for names in NAMES for name in names} | {NAMES[0][1]: -1.0}
+    assert values == pytest.approx(expected, abs=1e-3)
 
 
 def test_runs_of_particle_filters_share_their_random_numbers() -> None:
     """Otherwise the mean of the particles would have a standard deviation of 1e-4 m, and the slopes one of 5e-4."""
     values = effects(MixedParticles(), drive(0, noise=0.0))
-    assert [values[name] for name in NAMES] == pytest.approx([1.0, 1.0], abs=1e-2)
+    assert values == pytest.approx({name: 1.0 for names in NAMES for name in names}, abs=1e-2)
 
 
 def test_a_first_call_without_prediction_is_no_obstacle() -> None:
     episode = drive(0, noise=0.0)
     straight = bs.Episode(TASK, np.cumsum(episode.controls, axis=0), episode.controls, episode.observations, seed=0)
     values = effects(LateCart(), straight)
-    assert [values[name] for name in NAMES] == pytest.approx([1.0, 1.0], abs=1e-2)
+    assert values == pytest.approx({NAMES[0][0]: 1.0, NAMES[1][1]: 1.0}, abs=1e-2)
 
 
 def test_controls_without_a_known_effect_have_none() -> None:
     """One without effect, a constant one, one that follows from the state, and one with an effect below the noise."""
-    assert effects(Mixed(1.0, 0.0), drive(0)).keys() == {NAMES[0]}
+    assert effects(Mixed(1.0, 0.0), drive(0)).keys() == {*NAMES[0]}
     constant = drive(0)
     constant.controls[:, 1] = 0.3
-    assert effects(Mixed(1.0, 1.0), constant).keys() == {NAMES[0]}
+    assert effects(Mixed(1.0, 1.0), constant).keys() == {*NAMES[0]}
     feedback = drive(0)
     feedback.controls[1:, 1] = 0.1 * feedback.states[:-1, 0]
-    assert effects(Mixed(1.0, 1.0), feedback).keys() == {NAMES[0]}
+    assert effects(Mixed(1.0, 1.0), feedback).keys() == {*NAMES[0]}
     assert effects(Mixed(1.0, 1.0), drive(0, noise=2.0)) == {}
 
 
-def of_tractor(*gains: float) -> Checkpoint:
+def of_tractor(*gains: float | tuple[float, float]) -> Checkpoint:
     adapter = bs.Adapter(Mixed(*gains), batched=False, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
     return bs.load_filter(adapter, TRACTOR, name="tractor")
 
@@ -109,8 +117,12 @@ def profile() -> HealthyProfile:
 
 
 @pytest.mark.slow
-def test_the_wrong_sign_of_one_control_is_named() -> None:
+@pytest.mark.parametrize(
+    "gains", [(1.0, -1.0), pytest.param(((1.0, 1.0), (1.0, -1.0)), marks=pytest.mark.long)], ids=["both", "one"]
+)
+def test_the_wrong_sign_of_one_control_is_named(gains: tuple[Any, Any]) -> None:
+    """In both components, and in one of them."""
     episodes = {seed: drive(seed, task=TRACTOR) for seed in range(20, 25)}
-    result = diagnose(of_tractor(1.0, -1.0), episodes, profile=profile())
+    result = diagnose(of_tractor(*gains), episodes, profile=profile())
     assert result.causes[0].cause.name == "dynamics.inverted"
     assert "(throttle)" in result.headline
