@@ -143,7 +143,8 @@ def _with_restarts(diagnosis: Diagnosis, traces: Sequence[Trace]) -> Diagnosis:
     index = min(lost, key=lambda i: lost[i][0])
     where = f" in {len(lost)} of {len(traces)} episodes, first at" if len(traces) > 1 else " at"
     of_episode = f" of episode {index}" if len(traces) > 1 else ""
-    headline = f"{diagnosis.headline}; the filter diverges{where} step {lost[index][0]}{of_episode}"
+    text = f"the filter diverges{where} step {lost[index][0]}{of_episode}, and is restarted"
+    headline = f"{diagnosis.headline}; {text}"
     return replace(diagnosis, headline=headline, provenance={**diagnosis.provenance, RESTARTS: lost})
 
 
