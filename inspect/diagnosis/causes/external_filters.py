@@ -121,9 +121,12 @@ def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
     the filter, and the sensors, do not change.
     """
     cause = _in_predictions_of_run(cause)
-    cause = replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
-    if not has_true_starts:
-        return cause
+    if has_true_starts:
+        cause = _with_true_starts(cause)
+    return replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
+
+
+def _with_true_starts(cause: Cause) -> Cause:
     if cause.name == "dynamics.broken":  # a gain of the predicted changes is one of their spread about the slope, too
         first, _ = cause.symptoms
         return replace(cause, symptoms=(first, Symptom("dynamics spread/*", 1)))
