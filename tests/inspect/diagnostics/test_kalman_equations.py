@@ -151,6 +151,35 @@ def test_corrections_of_the_wrong_sign_are_named() -> None:
     assert re.fullmatch(r"corrections with radar have the wrong sign \(slope -(1.00|0.9\d)\)", alarm)
 
 
+class Inverted(Boat):
+    """A random walk with the compass, whose first call does not predict. Its corrections have the wrong sign."""
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        self.mean, self.covariance, self.noise = mean, covariance, np.zeros((4, 4))
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        mean, covariance, h = self.mean, self.covariance + self.noise, self.H["compass"]
+        self.noise = 1e-2 * np.eye(4)
+        innovation, size = wrapped(observations["compass"] - mean[2]), h @ covariance @ h.T + STD["compass"][0] ** 2
+        gain = covariance @ h.T / size
+        self.mean, self.covariance = mean - gain @ innovation, covariance - gain @ h @ covariance
+        return {
+            "estimate_mean": self.mean,
+            "estimate_covariance": self.covariance,
+            "predicted_mean": np.stack([mean] * 2),
+            "predicted_covariance": np.stack([covariance] * 2),
+            "innovation": [None, innovation],
+            "innovation_covariance": [None, size],
+        }
+
+
+def test_dynamics_that_include_an_update_of_the_wrong_sign_are_not_named() -> None:
+    result = equations(Inverted())
+    assert np.nanmax(result.dynamics) > 0.2
+    (alarm,) = result.alarms
+    assert alarm.startswith("corrections with compass have the wrong sign")
+
+
 def test_a_filter_without_finite_differences_is_refused() -> None:
     entry = DIAGNOSTICS["equations"]
     trace = run(Widening())
