@@ -41,7 +41,7 @@ from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
-from beliefscope.inspect.traces.restarts import RESTARTS, trace_with_restarts
+from beliefscope.inspect.traces.restarts import FAILURE, RESTARTS, trace_with_restarts
 
 BLOCK = 16
 """Number of episodes that run together. It does not depend on the number of workers, so neither do the values."""
@@ -136,15 +136,18 @@ def _runs(checkpoint: Checkpoint, episodes: Mapping[int, Episode], seed: int, pa
 
 
 def _with_restarts(diagnosis: Diagnosis, traces: Sequence[Trace]) -> Diagnosis:
-    """The diagnosis, whose headline states in how many episodes the filter was restarted."""
-    lost = {trace.episode_index: trace.settings[RESTARTS] for trace in traces if RESTARTS in trace.settings}
-    if not lost:
+    """The diagnosis, whose headline states in how many episodes the filter was restarted, and why."""
+    settings = {trace.episode_index: trace.settings for trace in traces if RESTARTS in trace.settings}
+    if not settings:
         return diagnosis
+    lost = {index: values[RESTARTS] for index, values in settings.items()}
     index = min(lost, key=lambda i: lost[i][0])
     where = f" in {len(lost)} of {len(traces)} episodes, first at" if len(traces) > 1 else " at"
     of_episode = f" of episode {index}" if len(traces) > 1 else ""
-    text = f"the filter diverges{where} step {lost[index][0]}{of_episode}, and is restarted"
-    headline = f"{diagnosis.headline}; {text}"
+    failure, at = settings[index][FAILURE], f"{where} step {lost[index][0]}{of_episode}"
+    diverges = failure.endswith((" diverges", " is not finite"))
+    text = f"the filter diverges{at}, and is restarted" if diverges else f"the filter is restarted{at}: {failure}"
+    headline = f"{diagnosis.headline.removesuffix('.')}; {text}"
     return replace(diagnosis, headline=headline, provenance={**diagnosis.provenance, RESTARTS: lost})
 
 

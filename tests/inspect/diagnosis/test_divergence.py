@@ -99,8 +99,28 @@ def test_a_component_that_does_not_change_has_the_scale_of_the_first_belief() ->
 def test_the_cause_of_a_divergence_is_named(filter_: Kalman) -> None:
     result = diagnose(loaded(filter_), {seed: drive(seed) for seed in range(20, 25)}, profile=profile())
     assert result.causes[0].cause.name == "updates.sign", result.headline
-    assert "; the filter diverges in 5 of 5 episodes, first at step " in result.headline
+    event = "is restarted" if np.isfinite(filter_.fails_beyond) else "diverges"
+    assert f"; the filter {event} in 5 of 5 episodes, first at step " in result.headline
     assert set(result.provenance[RESTARTS]) == set(range(20, 25))
+
+
+class Failing(Kalman):
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        super().initialize_beliefs(mean=mean, covariance=covariance)
+        self.steps = 0
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        self.steps += 1
+        if self.steps > 20:
+            raise np.linalg.LinAlgError("Matrix is not positive definite")
+        return super().__call__(observations=observations, controls=controls)
+
+
+def test_the_headline_states_the_failure_of_a_filter_that_does_not_diverge() -> None:
+    headline = diagnose(loaded(Failing()), {20: drive(20)}, profile=profile()).headline
+    failure = "Failing fails at step 20: LinAlgError: Matrix is not positive definite"
+    assert headline.endswith(f"; the filter is restarted at step 20: {failure}")
+    assert ".;" not in headline
 
 
 def test_a_filter_that_fails_at_once_has_no_diagnosis() -> None:
