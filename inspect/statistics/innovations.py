@@ -134,7 +134,7 @@ def _particle_moments(task: Task, particles: AnyArray, log_weights: AnyArray) ->
 
 
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
-    """``nu^T S^-1 nu`` (T, K), NaN without a measurement, and the number of its channels (T, K).
+    """``nu^T S^-1 nu`` (T, K), NaN without a measurement or for a singular S, and the number of its channels (T, K).
 
     None unless a Kalman filter.
     """
@@ -145,9 +145,11 @@ def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
     both = used[..., :, None] & used[..., None, :]
     s = np.where(both, s, np.eye(nu.shape[-1]))  # unused channels add nothing
     nu = np.where(used, nu, 0.0)
+    singular = np.isneginf(np.linalg.slogdet(s).logabsdet)  # the filter diverges
+    s = np.where(singular[..., None, None], np.eye(nu.shape[-1]), s)
     squared = np.einsum("tkm,tkm->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0])
     channels = used.sum(-1)
-    return np.where(channels > 0, squared, np.nan), channels
+    return np.where((channels > 0) & ~singular, squared, np.nan), channels
 
 
 def nis_of(trace: Trace) -> Array | None:

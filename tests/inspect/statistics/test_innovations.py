@@ -9,7 +9,8 @@ import pytest
 
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
-from beliefscope.inspect.statistics.innovations import autocorrelations, whiteness_of
+from beliefscope.inspect.diagnostics.gates import innovations_of
+from beliefscope.inspect.statistics.innovations import autocorrelations, nis_of, whiteness_of
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.trace import Trace, trace
 
@@ -50,3 +51,22 @@ def test_channels_without_a_valid_variance_or_a_counted_step_have_no_test(run: T
     early[counted(run), 1] = np.nan
     assert (haptics, "channel 0") not in autocorrelations(replace(run, innovation=early))
     assert [w.component for w in whiteness_of([run, invalid])] == ["channel 0", "channel 0"]
+
+
+def test_a_singular_covariance_has_no_squared_innovation(run: Trace) -> None:
+    """As that of a filter that diverges, whose large covariances are rounded."""
+    assert run.innovation_covariance is not None
+    covariance = run.innovation_covariance.copy()
+    covariance[3, 0] = 1e30
+    nis, usual = nis_of(replace(run, innovation_covariance=covariance)), nis_of(run)
+    assert nis is not None
+    assert usual is not None
+    assert np.argwhere(np.isnan(nis) & ~np.isnan(usual)).tolist() == [[3, 0]]
+
+
+def test_a_negative_squared_innovation_has_no_root(run: Trace) -> None:
+    result = innovations_of([with_variance(run, -1.0)])
+    with np.errstate(invalid="raise"):
+        values = result.curves()[0].values
+    assert np.isnan(values).any()
+    assert np.nanmin(values) >= 0.0
