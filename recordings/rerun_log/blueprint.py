@@ -15,6 +15,7 @@ from beliefscope.datasets.point_clouds import extent_of, point_sensors, points_o
 from beliefscope.datasets.task import Component, Task, display_name, with_unit
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
+from beliefscope.inspect.statistics.measures import deviations
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab
 from beliefscope.recordings.rerun_log.entities import SIGMAS, angles, plane_height, positions
@@ -180,7 +181,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
     limits = None
     if not growing:
         # Limits fit the true state and the fused 2 sigma band; diverging modalities may exceed them.
-        sigma = np.nan_to_num(SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i]))
+        sigma = np.nan_to_num(SIGMAS * deviations(trace.estimate_covariance)[:, i])
         mean = trace.estimate_mean[:, i]
         values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))

@@ -15,7 +15,7 @@ from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.task import Component, Task, with_unit
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.palette import colour
-from beliefscope.inspect.statistics.measures import contours, layer_label
+from beliefscope.inspect.statistics.measures import contours, deviations, layer_label
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
 
@@ -210,7 +210,7 @@ def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
             mean = task.near(raw, trace.episode.states[steps])
             yield f"states/{component.name}/{source}", series(mean[:, i] * scale)
             if source == "fused" and trace.has_covariance:
-                sigma = SIGMAS * np.sqrt(covariance[:, i, i])
+                sigma = SIGMAS * deviations(covariance)[:, i]
                 band = np.stack([mean[:, i] - sigma, mean[:, i] + sigma], axis=1)
                 yield f"states/{component.name}/two_sigma", series(band * scale)
 

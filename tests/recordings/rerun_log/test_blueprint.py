@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.inspect.trace import Trace
@@ -25,3 +28,15 @@ def test_the_view_of_the_belief_follows_an_estimate_that_exists_from_the_first_s
     (belief,) = (v for v in views(blueprint(trace, DOOR).root_container) if str(v.name).startswith("Belief"))
     (tracked,) = belief.properties["EyeControls3D"].tracking_entity.as_arrow_array().to_pylist()
     assert tracked in dict(columns(trace, DOOR, slice(0, 1)))
+
+
+def test_negative_variances_have_no_warnings(new_trace: Callable[..., Trace]) -> None:
+    """As those of a filter whose updates reduce the covariance too much."""
+    trace = new_trace("ekf")
+    covariance = trace.estimate_covariance.copy()
+    covariance[3] *= -1.0
+    negative = replace(trace, estimate_covariance=covariance)
+    with np.errstate(invalid="raise"):
+        blueprint(negative, DOOR)
+        bands = dict(columns(negative, DOOR, slice(0, len(trace))))
+    assert bands
