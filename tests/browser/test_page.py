@@ -394,6 +394,8 @@ def test_a_failed_run_is_reported_and_tried_again_and_names_are_whole(open_page:
     notes = [page.page.locator(f"{panel} > .note").first for panel in ("#scene", "#heatmaps", "#timeline .body")]
     assert [note.inner_text() for note in notes] == ["The filter failed.", *2 * ["No run to display."]]
     assert page.page.locator("#finding .sentence").inner_text().startswith("This run cannot be displayed.")
+    results = [page.page.locator(f"{panel} > .note").first for panel in ("#diagnostics", "#compare .result")]
+    assert [note.text_content() for note in results] == 2 * ["The filter failed."], "no results of the run before"
     page.errors[:] = [line for line in page.errors if "status of 500" not in line]
     page.page.unroute("**/api/trace/**")
     page.page.get_by_role("button", name="Try again").first.click()

@@ -100,7 +100,7 @@ export class DisplayedRun {
       const text = showError(error);
       this.failure = page.scene.failure = text;
       page.finding.fail(text, () => this.load());
-      page.tabs?.diagnosis.fail(text);
+      page.tabs?.fail(text);
     }
   }
 

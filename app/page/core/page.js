@@ -173,7 +173,7 @@ export class Page {
     document.documentElement.classList.add('with-tabs');
     tabs.open(this.#store.state.tab);
     const { trace, failure } = this.#run;
-    if (failure) tabs.diagnosis.fail(failure);
+    if (failure) tabs.fail(failure);
     if (!trace) return tabs;
     tabs.show(trace);
     tabs.move(this.#store.state.step, false);

@@ -72,6 +72,15 @@ export class ComparisonTab {
     this.choose();
   }
 
+  /** @param {string} reason why no run is displayed */
+  fail(reason) {
+    this.#loading.abort();
+    this.#trace = null;
+    this.#setOther(null, '');
+    this.#show(null);
+    setPanelState(this.#result, 'empty', reason);
+  }
+
   /** Loads the comparison run of the state. */
   choose() {
     if (!this.#trace) return;

@@ -89,6 +89,14 @@ export class Diagnostics {
     this.#load();
   }
 
+  /** @param {string} reason why no run is displayed */
+  fail(reason) {
+    this.#loading.abort();
+    this.#trace = null;
+    this.#stale = true;
+    setPanelState(this.#host, 'empty', reason);
+  }
+
   /** @param {number} step */
   move(step) {
     if (this.#open && this.#store.state.diagnostic) this.#figures.move(step);

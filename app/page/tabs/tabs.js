@@ -63,6 +63,13 @@ export class Tabs {
     this.compare.show(trace);
   }
 
+  /** @param {string} reason why no run is displayed */
+  fail(reason) {
+    this.diagnosis.fail(reason);
+    this.diagnostics.fail(reason);
+    this.compare.fail(reason);
+  }
+
   /**
    * Moves the cursor.
    * @param {number} step
