@@ -57,7 +57,7 @@ class KalmanEquations(Diagnostic):
         covariance, correction: (K,) relative errors of the reduction of the covariance and of the correction of the
             mean, in steps with the modality.
         process_noise: (n,) standard deviations of Q per step, SI units; NaN if unknown. process_lack: smallest
-            eigenvalue of Q, relative to the predicted covariance; NaN if unknown.
+            eigenvalue of Q, relative to the predicted covariance.
         measurement_noise: (K, m) standard deviations of R; NaN for absent channels. measurement_lack: (K,) as
             ``process_lack``, relative to S.
     """
@@ -81,10 +81,7 @@ class KalmanEquations(Diagnostic):
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        measurements = self._of_measurements()
-        # Of steps repeated by two calls, the dynamics include an update, whose error is not theirs.
-        dynamics = () if measurements and np.isnan(self.process_lack) else self._of_dynamics()
-        jacobians = (*dynamics, *measurements)
+        jacobians = (*self._of_dynamics(), *self._of_measurements())
         return jacobians or tuple(self._of_covariances())  # which a wrong Jacobian changes as well
 
     def _of_dynamics(self) -> list[str]:

@@ -101,7 +101,7 @@ class RepeatedSteps:
 
     They are the filter's own belief, those with a larger mean, a smaller mean and a larger variance of each component,
     and one with larger variances and covariances of all components, which shows the signs of columns. With two calls,
-    they are before the update of the step before: F and its Jacobian include this update.
+    they are before the update of the step before.
 
     Attributes:
         mean: (J, B, n) predictions. covariance: (J, B, n, n) of these.
@@ -109,7 +109,8 @@ class RepeatedSteps:
         innovation: (J, B, K, m), NaN without a measurement; K = 0 if they are not reported. size: (J, B, K, m, m) their
             covariance, 0 without a measurement.
         correction, posterior: (J, n) and (J, n, n), from the filter's own belief.
-        before: (J, n, n) covariance of the filter's own belief before the calls. calls: their number.
+        before: (J, n, n) covariance of the filter's own belief before the calls.
+        between_mean, between_covariance: (J, B, n), (J, B, n, n) before the last call; means relative to the first one.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class RepeatedSteps:
         self.steps, self.task, n = steps, trace.task, len(trace.task.components)
         before, covariance = _beliefs(trace, steps - 1, calls == 1)
         before = trace.episode.states[steps - 1].astype(np.float64) if at_truth else before
-        self.before, self.calls = covariance, calls
+        self.before = covariance
         variance = np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
         smallest = SMALLEST_SHIFT * np.maximum(np.abs(before).max(0), 1e-6)
         self.shift, self.growth = np.maximum(SHIFT * np.sqrt(variance), smallest), GROWTH * variance  # (J, n)
@@ -141,6 +142,15 @@ class RepeatedSteps:
         values, _ = checkpoint.run(episodes, start=start)
         arrays = {k: v[-1].unflatten(0, (len(steps), -1)).double().numpy() for k, v in values.items()}
         self.prior_mean, self.prior_covariance = arrays["predicted_mean"], arrays["predicted_covariance"]
+        if calls == 1:
+            self.between_mean = shifts
+            self.between_covariance = start.covariance.unflatten(0, (len(steps), -1)).double().numpy()
+        else:
+            mean, self.between_covariance = (
+                values[name][-2].unflatten(0, (len(steps), -1)).double().numpy()
+                for name in ("estimate_mean", "estimate_covariance")
+            )
+            self.between_mean = self.task.difference(mean, mean[:, :1])
         rows, first = np.arange(len(steps)), least_certain(self.prior_covariance[:, 0])
         self.mean, self.covariance = (a[rows, :, first] for a in (self.prior_mean, self.prior_covariance))
         self.correction = self.task.difference(arrays["estimate_mean"][:, 0], self.mean[:, 0])
@@ -180,12 +190,12 @@ class RepeatedSteps:
         return part
 
     def dynamics_errors(self) -> Array:
-        """(J, n) of the columns of F, relative to their differences from constant states."""
-        columns, unit = self.dynamics_jacobian.mT, np.eye(self.shift.shape[1])
-        weights = weights_of(self.covariance[:, :1]) * self.growth[..., None, None]  # (J, i, n, n)
-        expected = weights * columns[..., :, None] * columns[..., None, :]
-        growth = weights_of(self.covariance[:, :1]) * self._growth(self.covariance)[:, :-1]
-        change = expected - weights * unit[:, :, None] * unit[:, None, :]
+        """(J, n) of F, relative to the difference from constant states, with a larger variance of each component."""
+        weights, f = weights_of(self.covariance[:, :1]), self.dynamics_jacobian[:, None]
+        before = self._growth(self.between_covariance)[:, :-1]  # (J, i, n, n)
+        expected = weights * (f @ before @ f.mT)
+        growth = weights * self._growth(self.covariance)[:, :-1]
+        change = expected - weights * before
         smallest = SMALLEST_CHANGE * np.sqrt(np.square(expected).sum((-2, -1)))
         return relative(growth - expected, change, (-2, -1), smallest)
 
@@ -200,20 +210,24 @@ class RepeatedSteps:
         return relative(difference, expected, (-2, -1), SMALLEST_CHANGE * largest)
 
     def process_noise(self) -> Array:
-        """(J, n, n) ``P - F P F^T`` of the prediction; NaN if it is after another update."""
+        """(J, n, n) ``P - F P F^T`` of the prediction."""
         f = self.dynamics_jacobian
-        return self.covariance[:, 0] - f @ self.before @ f.mT + (0.0 if self.calls == 1 else np.nan)
+        return self.covariance[:, 0] - f @ self.between_covariance[:, 0] @ f.mT
 
     @cached_property
     def dynamics_jacobian(self) -> Array:
-        """(J, n, n) derivative of the predicted mean."""
+        """(J, n, n) F, derivative of the predicted mean by that before the last call."""
+        return self._prediction_by_start @ np.linalg.pinv(np.moveaxis(self._derivative(self.between_mean), 1, -1))
+
+    @cached_property
+    def _prediction_by_start(self) -> Array:
         return np.moveaxis(self._derivative(self.task.difference(self.mean, self.mean[:, :1])), 1, -1)
 
     @cached_property
     def measurement_jacobian(self) -> Array:
         """(J, K, m, n) derivative of the predicted measurements by the prediction; 0 without a measurement."""
         by_mean = np.moveaxis(self._derivative(self.innovation), 1, -1)
-        return np.nan_to_num(-by_mean @ np.linalg.pinv(self.dynamics_jacobian)[:, None])
+        return np.nan_to_num(-by_mean @ np.linalg.pinv(self._prediction_by_start)[:, None])
 
     @cached_property
     def _measured_growth(self) -> tuple[Array, Array]:

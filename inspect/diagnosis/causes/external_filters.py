@@ -17,7 +17,7 @@ def _dynamics(*kinds: str) -> str:
 
 
 JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*|covariance update/*"
-"""The derivative of the prediction may include the update of the step before."""
+"""Statistics of repeated steps (``RepeatedSteps``)."""
 
 EFFECTS = "dynamics effect/*"
 """Effects of the controls on the state, relative to the predicted ones."""

@@ -173,9 +173,10 @@ class Inverted(Boat):
         }
 
 
-def test_dynamics_that_include_an_update_of_the_wrong_sign_are_not_named() -> None:
+def test_an_update_before_the_prediction_does_not_change_the_jacobian_of_the_dynamics() -> None:
     result = equations(Inverted())
-    assert np.nanmax(result.dynamics) > 0.2
+    assert np.nanmax(result.dynamics) < 0.01
+    np.testing.assert_allclose(result.process_noise, 0.1, rtol=0.01)
     (alarm,) = result.alarms
     assert alarm.startswith("corrections with compass have the wrong sign")
 
