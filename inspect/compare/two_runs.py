@@ -31,6 +31,7 @@ from beliefscope.inspect.statistics.measures import (
     phases,
 )
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.restarts import restarts_text
 
 LEVEL = 0.02
 """Minimum relative change of the error that is reported."""
@@ -67,6 +68,7 @@ class Comparison(Diagnostic):
         effective_weights_at: (T, K, 2) effective weights by step, or None.
         contact, blackout: (T,) bool; image blackout in either run.
         time: (T,) s, times of the steps; None without timestamps.
+        restarts: of both runs (``restarts_text``).
     """
 
     task: Task
@@ -88,6 +90,7 @@ class Comparison(Diagnostic):
     contact: NDArray[np.bool_]
     blackout: NDArray[np.bool_]
     time: Array | None
+    restarts: tuple[str, str] = ("", "")
 
     @property
     def verdict(self) -> str:
@@ -97,7 +100,8 @@ class Comparison(Diagnostic):
         first, second = map(float, self.position[0])
         change = second / first - 1.0 if first else math.inf
         errors = f"{self.names[0]} {main.text(first)}, {self.names[1]} {main.text(second)}"
-        parts = [f"RMSE over {plural(self.steps[0], 'step')}: {errors} ({_change(change)}){self._other_components()}."]
+        parts = [f"{name} is {text}." for name, text in zip(self.names, self.restarts, strict=True) if text]
+        parts += [f"RMSE over {plural(self.steps[0], 'step')}: {errors} ({_change(change)}){self._other_components()}."]
         if abs(change) >= LEVEL and (phase := self._dominant_phase()) is not None:
             before, after = map(float, self.position[phase])
             parts.append(
@@ -267,6 +271,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         contact=this.episode.contact.astype(bool),
         blackout=either_blackout,
         time=this.episode.time,
+        restarts=(restarts_text(this), restarts_text(other)),
     )
 
 

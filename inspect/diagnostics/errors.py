@@ -23,6 +23,7 @@ from beliefscope.inspect.statistics.outages import (
     without_reading,
 )
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.restarts import RESTARTS
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Errors(Diagnostic):
         outages: of each modality that has some.
         readings: observation key that measures the map components (``Task.positions``) -> root mean square distances of
             its readings and of the estimate from the truth, in the steps with a reading, m.
+        restarts: number of traces in which the filter was restarted at the true state.
         distance: (T,) m, of a single trace. missing: modality -> (T,) steps of its outages, of a single trace.
     """
 
@@ -64,6 +66,7 @@ class Errors(Diagnostic):
     readings: dict[str, tuple[float, float]]
     distance: Array
     missing: dict[str, Mask]
+    restarts: int = 0
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -87,6 +90,9 @@ class Errors(Diagnostic):
             text += f"; largest in {worst.name}: {self._text(worst.position)}"
             text += f" ({percent(worst.share)} of the squared error in {percent(steps)} of the steps)"
         parts = [f"{text}."]
+        if self.restarts:
+            runs = "this run" if self.trajectories == 1 else f"{self.restarts} of {self.trajectories} runs"
+            parts.insert(0, f"The filter fails and is restarted at the true state in {runs}.")
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
             outages, verb = plural(outage.count, "outage"), "has" if outage.count == 1 else "have"
             text = f"{outages} of {display_name(outage.modality)}, up to {outage.longest:.3g} s, {verb} "
@@ -211,6 +217,7 @@ def errors_of(traces: Sequence[Trace]) -> Errors:
         readings=_readings(traces, distance, missing),
         distance=distance[0] if single else np.zeros(0),
         missing=missing[0] if single else {},
+        restarts=sum(RESTARTS in trace.settings for trace in traces),
     )
 
 

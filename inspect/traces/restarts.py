@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.text import plural
 from beliefscope.filters.external.adapter import FailedStep
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
@@ -56,6 +57,13 @@ def trace_with_restarts(
         reason = reason or failure
     joined = _joined(runs, seen, {RESTARTS: starts[1:-1], FAILURE: reason} if reason else {})
     return replace(joined, episode_index=episode_index, faults=faults, data_hash=episode.digest())
+
+
+def restarts_text(trace: Trace) -> str:
+    """``restarted at the true state 3 times: REASON``; empty for a run without restarts."""
+    if FAILURE not in trace.settings:
+        return ""
+    return f"restarted at the true state {plural(len(trace.settings[RESTARTS]), 'time')}: {trace.settings[FAILURE]}"
 
 
 def _until_lost(

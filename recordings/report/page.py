@@ -19,6 +19,7 @@ from beliefscope.datasets.text import plural
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.traces.restarts import restarts_text
 from beliefscope.recordings.report.sections import Item, Report, Section
 from beliefscope.recordings.report.text import definitions, methods
 
@@ -104,6 +105,8 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
         "Episodes": f"{episodes}: {steps} in total, {durations}",
         "Sensor faults": "; ".join(dict.fromkeys(str(trace.faults) or "none" for trace in report.traces)),
     }
+    if texts := list(filter(None, map(restarts_text, report.traces))):
+        facts["Restarts"] = "; ".join(dict.fromkeys(texts))
     if first.particle_count is not None:
         facts["Particles"] = str(first.particle_count)
     main = first.task.main_error

@@ -14,10 +14,12 @@ from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, drive
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.compare.two_runs import compare_runs
 from beliefscope.inspect.diagnosis.diagnose import DIVERGED, diagnose
+from beliefscope.inspect.diagnostics.errors import errors_of
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
-from beliefscope.inspect.traces.restarts import FAILURE, RESTARTS, trace_with_restarts
+from beliefscope.inspect.traces.restarts import FAILURE, RESTARTS, restarts_text, trace_with_restarts
 
 
 class Kalman:
@@ -121,6 +123,19 @@ def test_the_headline_states_the_failure_of_a_filter_that_does_not_diverge() -> 
     failure = "Failing fails at step 20: LinAlgError: Matrix is not positive definite"
     assert headline.endswith(f"; the filter is restarted at step 20: {failure}")
     assert ".;" not in headline
+
+
+def test_restarts_are_named_in_comparisons_and_errors() -> None:
+    failing, right = trace_with_restarts(loaded(Failing()), drive(20)), bs.trace(loaded(Kalman()), drive(20))
+    reason = (
+        "restarted at the true state 2 times: Failing fails at step 20: LinAlgError: Matrix is not positive definite"
+    )
+    assert restarts_text(failing) == reason
+    assert compare_runs(right, failing, ("right", "failing")).verdict.startswith(f"failing is {reason}. RMSE over ")
+    assert compare_runs(right, right).restarts == ("", "")
+    text = "The filter fails and is restarted at the true state in "
+    assert errors_of([failing]).verdict.startswith(f"{text}this run. Position RMSE")
+    assert errors_of([failing, right]).verdict.startswith(f"{text}1 of 2 runs. ")
 
 
 def test_a_filter_that_fails_at_once_has_no_diagnosis() -> None:
