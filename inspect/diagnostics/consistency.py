@@ -204,7 +204,7 @@ class Consistency(Diagnostic):
             title = "Innovation in predicted standard deviations (root of NIS/n)"
             charts.append((title, "innovation", self.nis, self.layers[:-1], str))
         return [
-            Curve(f"{name(layer)} {quantity}", np.sqrt(values[:, k]), chart, "standard deviations", layer, bounds)
+            Curve(f"{name(layer)} {quantity}", measures.root(values[:, k]), chart, "standard deviations", layer, bounds)
             for chart, quantity, values, names, name in charts
             for k, layer in enumerate(names)
         ]

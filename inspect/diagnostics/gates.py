@@ -152,7 +152,7 @@ class Innovations(Diagnostic):
     def curves(self) -> list[Curve]:
         title = "Innovation in predicted standard deviations (root of NIS/m)"
         return [
-            Curve(display_name(e.modality), _root(self.nis[:, k]), title, "standard deviations", e.modality)
+            Curve(display_name(e.modality), measures.root(self.nis[:, k]), title, "standard deviations", e.modality)
             for k, e in enumerate(self.modalities)
             if len(self.nis)
         ]
@@ -178,11 +178,6 @@ def innovations_of(traces: Sequence[Trace]) -> Innovations:
         nis=_nis(first)[:keep],
         rejected=rejected[:keep],
     )
-
-
-def _root(nis: Array) -> Array:
-    """NaN for a negative one, of a covariance that is not positive definite."""
-    return np.sqrt(np.where(nis >= 0.0, nis, np.nan))
 
 
 def _nis(trace: Trace) -> Array:

@@ -61,6 +61,11 @@ def deviations(covariance: NDArray[Any]) -> NDArray[Any]:
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
 
 
+def root(squared: Array) -> Array:
+    """Square roots; NaN for negative values, of covariances that are not positive definite."""
+    return np.sqrt(np.where(squared >= 0.0, squared, np.nan))
+
+
 def covariances(trace: Trace) -> Array:
     """(T, L, n, n): each layer's covariance, invertible (``with_floor``); NaN for filters without covariances."""
     both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
