@@ -246,8 +246,7 @@ class ExternalFilter(Checkpoint):
         """Returned values of one more step from the filter's state, (N, ...), SI units. Raises BadInput as ``run``."""
         with torch.no_grad(), self._errors_at("one step"):
             output = copied(self._call(observations, controls, device_of(self.adapter.module)))
-        sizes = {"n": len(self._task.components)}
-        return self._units.to_si(check_values(output, (len(controls),), sizes, self.source))
+        return self._units.to_si(check_values(output, (len(controls),), {"n": len(self._task.components)}, self.source))
 
     def snapshot(self) -> Any:
         """The filter's state, for ``restore``. Raises BadInput if it can be neither returned nor copied."""
