@@ -14,6 +14,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.text import plural
 from beliefscope.filters.external.adapter import FailedStep
+from beliefscope.filters.external.calls import has_own_start, is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
@@ -40,10 +41,14 @@ def trace_with_restarts(
     """The run over an episode; a filter that fails at a step is restarted at the true state where it has lost it.
 
     It also fails if it returns a number that is not finite, or with an error of more than ``largest`` standard
-    deviations (``LOST``). The trace has the settings ``RESTARTS`` and ``FAILURE`` if it fails.
+    deviations (``LOST``). The trace then has the settings ``RESTARTS`` and ``FAILURE``. Filters that cannot start at a
+    given belief are not restarted, nor are those of episodes without ground truth.
 
     Raises BadInput as ``trace``, and if the filter fails within ``MIN_STEPS`` of a start.
     """
+    module = external.adapter.module
+    if not is_stepwise(module) or has_own_start(module) or not np.isfinite(episode.states).all():
+        return trace_external(external, episode, episode_index, seed, faults)
     seen, start = faults.apply(episode, seed), external.start([episode]).covariance[0].numpy()
     # Some components, such as a bias, do not change in an episode.
     std = np.fmax(episode.states.std(0), np.sqrt(np.fmax(np.diagonal(start), 1e-24)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -92,6 +93,20 @@ def test_a_run_that_does_not_diverge_has_no_restarts() -> None:
 def test_a_component_that_does_not_change_has_the_scale_of_the_first_belief() -> None:
     """The bias of the boat is constant."""
     assert RESTARTS not in trace_with_restarts(boats.loaded(boats.Boat()), boats.sail(3, 4), largest=DIVERGED).settings
+
+
+class OwnStart(Kalman):
+    def initialize_beliefs(self) -> None:  # type: ignore[override]
+        super().initialize_beliefs(mean=np.zeros(2), covariance=np.eye(2))
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_filter_that_starts_at_its_own_belief_is_not_restarted(is_known: bool) -> None:
+    episode = drive(20)
+    blind = replace(episode, states=np.full_like(episode.states, np.nan))
+    run = trace_with_restarts(loaded(OwnStart(sign=-1.0)), episode if is_known else blind, largest=100.0)
+    assert np.abs(run.estimate_mean).max() > 100.0
+    assert RESTARTS not in run.settings
 
 
 @pytest.mark.slow
