@@ -10,7 +10,6 @@ from typing import Any
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.adapter import FailedStep
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
@@ -59,12 +58,10 @@ class StoredRuns:
 
 def _traced(checkpoint: Checkpoint, episode: Episode, progress: Progress, settings: dict[str, Any]) -> Trace:
     """The run; an external filter that fails at a step is restarted at the true state."""
-    try:
+    if not isinstance(checkpoint, ExternalFilter):
         return trace(checkpoint, episode, progress=progress, **settings)
-    except FailedStep:
-        assert isinstance(checkpoint, ExternalFilter)
-        own = {name: value for name, value in settings.items() if name != "particles"}
-        return trace_with_restarts(checkpoint, episode, **own)
+    own = {name: value for name, value in settings.items() if name != "particles"}
+    return trace_with_restarts(checkpoint, episode, progress=progress, **own)
 
 
 def _run_or_load(

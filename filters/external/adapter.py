@@ -264,15 +264,13 @@ def joined(name: str, runs: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(runs), dim=1)
 
 
-def check_values(
-    values: Values, leading: Sequence[int], sizes: dict[str, int], source: str, step: int | None = None
-) -> Values:
+def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str, step: int = 0) -> Values:
     """Returns the values. Raises BadInput for inconsistent shapes, and FailedStep for numbers that are not finite.
 
     Args:
-        step: of the values, if they have no axis of time.
-        leading: expected sizes of the axes before those in ``SHAPES``. sizes: of the axes' letters; extended by those
-            that occur for the first time.
+        leading: expected sizes of the axes before those in ``SHAPES``: (T, N) or (N). sizes: of the axes' letters;
+            extended by those that occur for the first time.
+        step: of the values, if they have no axis T.
     """
     for name, value in values.items():
         shape, letters = tuple(value.shape), letters_of(name)
@@ -288,8 +286,9 @@ def check_values(
         if _is_finite(value):
             continue
         if (not may_be_nan and value.isnan().any()) or (not may_be_infinite and value.isinf().any()):
-            failed = int((~value.isfinite()).flatten(1).any(1).int().argmax()) if step is None else step
-            raise FailedStep(f"{source} returns {name} with a number that is not finite", failed)
+            if len(leading) > 1:
+                step = int((~value.isfinite()).flatten(1).any(1).int().argmax())
+            raise FailedStep(f"{source} returns {name} with a number that is not finite", step)
     if "effective_weights" in values and values["effective_weights"].shape[-2] > 1:
         _check_sum(values["effective_weights"].sum(-2), source)
     sizes.pop("m", None)  # the number of channels may change between steps

@@ -42,6 +42,11 @@ def has_own_start(filter_: Any) -> bool:
         return False
 
 
+def takes_start(filter_: Any) -> bool:
+    """Whether the filter is called step by step from a belief that it is given."""
+    return is_stepwise(filter_) and not has_own_start(filter_)
+
+
 def device_of(filter_: Any) -> torch.device:
     """The device of a module's parameters and buffers."""
     return next((tensor.device for tensor in _tensors(filter_)), CPU)

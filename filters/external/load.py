@@ -230,7 +230,7 @@ class ExternalFilter(Checkpoint):
         with torch.no_grad(), seeded(seed, self.adapter.module):
             sizes = {"n": len(self._task.components)}
             for t, (values, models) in enumerate(self._steps(observations, controls, self.start([episode]))):
-                step = check_values(with_ancestors(values), (1,), sizes, f"{self.source} at step {t}")
+                step = check_values(with_ancestors(values), (1,), sizes, f"{self.source} at step {t}", t)
                 yield self._units.to_si(copied(step)), self._names({n: v[None] for n, v in step.items()}, models)
 
     def own_states(self, states: Tensor, dtype: torch.dtype) -> Tensor:

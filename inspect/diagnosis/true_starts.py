@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.external.calls import has_own_start, is_stepwise
+from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.statistics import measures
@@ -38,8 +38,7 @@ LEAST_STEPS = 12
 
 def has_true_starts(checkpoint: ExternalFilter) -> bool:
     """Whether the filter is here, and can start a single step at a given belief."""
-    module = checkpoint.adapter.module
-    return not isinstance(checkpoint, UnavailableFilter) and is_stepwise(module) and not has_own_start(module)
+    return not isinstance(checkpoint, UnavailableFilter) and takes_start(checkpoint.adapter.module)
 
 
 def some_steps(trace: Trace, checkpoint: ExternalFilter) -> NDArray[np.intp]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.calls import has_own_start, is_stepwise
+from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.statistics.innovations import least_certain
@@ -48,10 +48,9 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         return "the Jacobians of this project's filters are derivatives by construction"
     if isinstance(checkpoint, UnavailableFilter):
         return f"filter {trace.filter} is not available here, only its run"
-    module = checkpoint.adapter.module
     if trace.particles is not None or trace.predicted_covariance is None or not trace.has_covariance:
         return f"filter {trace.filter} does not report covariances of its predictions and estimates"
-    if has_own_start(module) or not is_stepwise(module):
+    if not takes_start(checkpoint.adapter.module):
         return f"filter {trace.filter} does not start each call at a given belief"
     if trace.task.rotations:
         return "derivatives by rotations are not supported"

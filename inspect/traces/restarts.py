@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.text import plural
 from beliefscope.filters.external.adapter import FailedStep
-from beliefscope.filters.external.calls import has_own_start, is_stepwise
+from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
@@ -36,6 +36,7 @@ def trace_with_restarts(
     episode_index: int = 0,
     seed: int = 0,
     faults: Faults = NO_FAULTS,
+    progress: Callable[[float], None] | None = None,
     largest: float = math.inf,
 ) -> Trace:
     """The run over an episode; a filter that fails at a step is restarted at the true state where it has lost it.
@@ -46,9 +47,10 @@ def trace_with_restarts(
 
     Raises BadInput as ``trace``, and if the filter fails within ``MIN_STEPS`` of a start.
     """
-    module = external.adapter.module
-    if not is_stepwise(module) or has_own_start(module) or not np.isfinite(episode.states).all():
-        return trace_external(external, episode, episode_index, seed, faults)
+    external.check_task(episode)
+    faults.check(external.task, len(episode))
+    if not takes_start(external.adapter.module) or not np.isfinite(episode.states).all():
+        return trace_external(external, episode, episode_index, seed, faults, progress)
     seen, start = faults.apply(episode, seed), external.start([episode]).covariance[0].numpy()
     # Some components, such as a bias, do not change in an episode.
     std = np.fmax(episode.states.std(0), np.sqrt(np.fmax(np.diagonal(start), 1e-24)))
@@ -56,12 +58,12 @@ def trace_with_restarts(
     starts, reason = [0], ""
     while starts[-1] < len(episode):
         part = seen.part(starts[-1], len(episode))
-        run, failure = _until_lost(external, part, seed, std, LOST if runs else largest)
+        run, failure = _until_lost(external, part, seed, None if runs else progress, std, LOST if runs else largest)
         runs.append(run)
         starts.append(starts[-1] + len(run))
         reason = reason or failure
-    joined = _joined(runs, seen, {RESTARTS: starts[1:-1], FAILURE: reason} if reason else {})
-    return replace(joined, episode_index=episode_index, faults=faults, data_hash=episode.digest())
+    run = _joined(runs, seen, {RESTARTS: starts[1:-1], FAILURE: reason}) if reason else runs[0]
+    return replace(run, episode=seen, episode_index=episode_index, faults=faults, data_hash=episode.digest())
 
 
 def restarts_text(trace: Trace) -> str:
@@ -72,7 +74,12 @@ def restarts_text(trace: Trace) -> str:
 
 
 def _until_lost(
-    external: ExternalFilter, episode: Episode, seed: int, std: NDArray[Any], largest: float
+    external: ExternalFilter,
+    episode: Episode,
+    seed: int,
+    progress: Callable[[float], None] | None,
+    std: NDArray[Any],
+    largest: float,
 ) -> tuple[Trace, str]:
     """The run up to the step at which the filter has lost the true state, if it fails, and the reason; else all of it.
 
@@ -81,7 +88,7 @@ def _until_lost(
     """
     reason = f"{external.source} diverges"
     try:
-        run = trace_external(external, episode, seed=seed)
+        run = trace_external(external, episode, seed=seed, progress=progress)
     except FailedStep as error:
         if error.step < MIN_STEPS:
             raise

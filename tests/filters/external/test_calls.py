@@ -16,7 +16,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import evaluate, external_run
-from beliefscope.filters.external.adapter import Adapter
+from beliefscope.filters.external.adapter import Adapter, FailedStep, check_values
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.statistics.episode_sums import measures_of, sum_episodes
@@ -229,6 +229,16 @@ def test_invalid_measurements_are_refused(values: dict[str, Any], message: str) 
 
     with pytest.raises(BadInput, match=message):
         trace(external(Invalid(), batched=False), vehicle.drive(7, 10))
+
+
+def test_the_step_of_a_number_that_is_not_finite_is_known() -> None:
+    values = torch.tensor([[0.0, 0.0], [0.0, np.nan], [np.nan, 0.0]])
+    with pytest.raises(FailedStep) as error:
+        check_values({"extra/a": values}, (3, 2), {"n": 1}, "f")
+    assert error.value.step == 1
+    with pytest.raises(FailedStep) as error:
+        check_values({"extra/a": values[1]}, (2,), {"n": 1}, "f", 7)
+    assert error.value.step == 7
 
 
 def test_names_of_other_measurement_models_are_refused() -> None:
