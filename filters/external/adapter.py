@@ -268,8 +268,8 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
     """Returns the values. Raises BadInput for inconsistent shapes, and FailedStep for numbers that are not finite.
 
     Args:
-        leading: expected sizes of the axes before those in ``SHAPES``: (T, N) or (N). sizes: of the axes' letters;
-            extended by those that occur for the first time.
+        leading: expected sizes of the axes before those in ``SHAPES``: (T, N) or (N). sizes: of the axes' letters; new
+            ones are added.
         step: of the values, if they have no axis T.
     """
     for name, value in values.items():
