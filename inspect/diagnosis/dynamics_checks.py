@@ -15,7 +15,12 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.inspect.diagnosis.control_effects import control_effects
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts, predictions_from_truth, some_steps
+from beliefscope.inspect.diagnosis.true_starts import (
+    has_true_starts,
+    predictions_from_truth,
+    some_steps,
+    uses_start,
+)
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import prediction
@@ -44,7 +49,8 @@ def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     Of this project's filters also ``opposed/control``, of controls that do not command a measured hand: log-ratio of
     the size of r to that with the opposite sign of the channel; 0 if the present sign fits better. Of external filters
     also ``dynamics offset``: mean residual of the run's predictions, which start at the filter's estimates; it differs
-    between episodes if the filter does not estimate a bias; and ``dynamics effect`` of ``control_effects``.
+    between episodes if the filter does not estimate a bias; and ``dynamics effect`` of ``control_effects``; and
+    ``ignored start``: 1 if no step depends on the belief that it starts at, else 0.
     """
     if isinstance(checkpoint, ExternalFilter):
         return external_dynamics_statistics(trace, checkpoint)
@@ -100,6 +106,10 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     values = _lag(change, predicted, states.std(0))
     values |= _by_component(task, {"dynamics offset": measures.wrapped(task, predicted - change).mean(0)})
     if has_true_starts(checkpoint):
+        is_used = uses_start(trace, checkpoint)
+        values["ignored start//all"] = float(not is_used)
+        if not is_used:
+            return values
         steps = some_steps(trace, checkpoint)
         started = predictions_from_truth(trace, checkpoint, steps)
         if started is None:

@@ -41,6 +41,19 @@ def has_true_starts(checkpoint: ExternalFilter) -> bool:
     return not isinstance(checkpoint, UnavailableFilter) and takes_start(checkpoint.adapter.module)
 
 
+def uses_start(trace: Trace, checkpoint: ExternalFilter) -> bool:
+    """Whether a step of the filter depends on the mean of the belief that it starts at; false only for equal results.
+
+    Filters that ignore it, such as recurrent networks, show nothing by steps from true states.
+    """
+    step, states = some_steps(trace, checkpoint)[:1], trace.episode.states
+    moved = replace(trace, episode=replace(trace.episode, states=states + np.maximum(states.std(0), 1e-3)))
+    first, second = (run_from_truth(run, checkpoint, step, smallest_std(trace)) for run in (trace, moved))
+    if first is None or second is None:
+        return True
+    return any(not np.array_equal(value, second[name], equal_nan=True) for name, value in first.items())
+
+
 def some_steps(trace: Trace, checkpoint: ExternalFilter) -> NDArray[np.intp]:
     """Steps that are started at true states: counted ones, almost evenly spaced if they are not all."""
     steps = 1 + np.flatnonzero(measures.counted(trace)[1:])
@@ -140,6 +153,8 @@ def with_particles_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace
     the start is that of the estimates, within limits. The same trace if the steps cannot be run.
     """
     if trace.particles is None or trace.log_likelihood is None or not has_true_starts(checkpoint):
+        return trace
+    if not uses_start(trace, checkpoint):
         return trace
     states, counted = trace.episode.states.astype(np.float64), measures.counted(trace)
     read = (1 + np.flatnonzero((counted & ~measures.absent(trace, m))[1:]) for m in trace.modalities)

@@ -317,6 +317,7 @@ def test_recording_is_saved_and_synchronized_with_rerun(open_page: Any, tmp_path
     )
     status, links = page.page.evaluate(f"() => JSON.parse(JSON.stringify(({edges})()))")
     assert status["right"] <= links["left"]
+    page.page.set_viewport_size({"width": 600, "height": 450})  # software rendering of the viewer takes long
     page.page.get_by_role("button", name="Open in Rerun tab").click()
     page.until("() => document.querySelector('#rerun').dataset.state === 'ready'", 120)
     cursor = (

@@ -67,6 +67,14 @@ COVARIANCE = Cause(
 )
 """An update of the mean that is right, but not that of its covariance."""
 
+START = Cause(
+    "start.ignored",
+    "Filter ignores the belief that it starts at",
+    (Symptom("ignored start/*", 1),),
+    f"{JACOBIANS}|{DYNAMICS}|lag/dynamics/*|process noise/*|measurement noise/*|measurement function/*|{FILTER}",
+    "Use the mean and covariance that initialize_beliefs receives, or give it no parameters if its start is its own.",
+)
+
 ESTIMATE = Cause(
     "estimate.mean",
     "Estimate is not the mean of the particles",
@@ -94,6 +102,7 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         LARGE,
         COVARIANCE,
         ESTIMATE,
+        START,
         *([_wrong_sign(tuple(task.modalities))] if len(task.modalities) > 1 else []),
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
         *(cause for modality in task.modalities for cause in _of_updates(modality)),

@@ -172,7 +172,7 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
 ) -> None:
     (tmp_path / "boats.py").write_text(BOATS)
     filters = {name: load_external(f"{tmp_path}/boats.py:{name}", task(4)) for name in ("right", "wrong")}
-    write_dataset(tmp_path / "short.h5", task(4), [sail(seed).part(0, 40) for seed in range(12)])
+    write_dataset(tmp_path / "short.h5", task(4), [sail(seed).part(0, 30) for seed in range(10)])
     settings = Settings(
         tmp_path / "workspace",
         data={"short": tmp_path / "short.h5"},
@@ -188,8 +188,8 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
         (defect,) = client.get(url.replace("diagnosis", "trace")).json()["defects"]
         assert defect.startswith("the Jacobian of radar differs from finite differences by ")
         job = client.post(record).json()["job"]
-        assert job["title"] == "Healthy record of wrong, boat, 12 held-out episodes of short"
-        assert wait_for_record(client, record) == "12 held-out episodes of short"
+        assert job["title"] == "Healthy record of wrong, boat, 10 held-out episodes of short"
+        assert wait_for_record(client, record) == "10 held-out episodes of short"
         result = client.get(url).json()
         assert result["state"] == "healthy"
         assert result["headline"].startswith("The Jacobian of radar differs from finite differences by ")
@@ -197,8 +197,8 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
         first = repair_record(settings)
         by_right = f"{record}?healthy_filter=right"
         job = client.post(by_right).json()["job"]  # a measured record again
-        assert job["title"] == "Healthy record of wrong, boat, 12 held-out episodes of short, run by right"
-        assert wait_for_record(client, by_right) == "12 held-out episodes of short, run by right"
+        assert job["title"] == "Healthy record of wrong, boat, 10 held-out episodes of short, run by right"
+        assert wait_for_record(client, by_right) == "10 held-out episodes of short, run by right"
         assert client.get(url).status_code == 202  # the diagnosis is computed again, too
         assert repair_record(settings) != first  # and the repair, whose bound is from the record
     with open_client(settings) as client:  # the record is kept in the workspace
@@ -207,7 +207,7 @@ def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
         assert reply.json()["preliminary"]["causes"][0]["cause"] == "measurement.radar.jacobian", reply.text
     with closing(TraceStore(settings)) as store:
         checkpoint = store.checkpoint("boat", "wrong")
-    assert required_profile(checkpoint).episodes == 12
+    assert required_profile(checkpoint).episodes == 10
     assert checkpoint.hash == filters["wrong"].hash
 
 

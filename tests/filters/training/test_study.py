@@ -236,9 +236,9 @@ def test_trivial_predictor_returns_the_training_mean(finished: Path, data: Path)
 
 
 def test_figure_contains_filters_and_quantities(finished: Path) -> None:
-    image = np.asarray(Image.open(finished / "results.png").convert("RGB"))
-    assert image.shape[1] == round(300 * 7.16)
-    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 20
+    image = Image.open(finished / "results.png").convert("RGB")
+    assert image.width == round(300 * 7.16)
+    assert len(image.getcolors(image.width * image.height)) > 20
     text = (finished / "results.svg").read_text()
     for word in ("door: hinge", "door: angle", "RMSE (cm)", "RMSE (deg)", "image blackout", "40%", *FILTERS, TRIVIAL):
         assert word in text, word

@@ -40,11 +40,13 @@ def drive(seed: int) -> bs.Episode:
 class Cart:
     """Two updates of one prediction, averaged with weights."""
 
-    def __init__(self, gain: float = 1.0, noise: float = 0.005, weight: float | None = None) -> None:
-        self.gain, self.noise, self.weight = gain, noise, weight
+    def __init__(
+        self, gain: float = 1.0, noise: float = 0.005, weight: float | None = None, ignores_start: bool = False
+    ) -> None:
+        self.gain, self.noise, self.weight, self.ignores_start = gain, noise, weight, ignores_start
 
     def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
-        self.mean, self.covariance = mean, covariance
+        self.mean, self.covariance = (np.zeros(2) if self.ignores_start else mean), covariance
 
     def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
         mean, covariance = self.mean + self.gain * controls, self.covariance + self.noise**2 * np.eye(2)
@@ -71,7 +73,7 @@ def loaded(filter_: Cart) -> Checkpoint:
 
 @cache
 def profile() -> HealthyProfile:
-    return profile_of(loaded(Cart()), [drive(seed) for seed in range(20)], "cart")
+    return profile_of(loaded(Cart()), [drive(seed) for seed in range(12)], "cart")
 
 
 @pytest.mark.slow
@@ -84,6 +86,7 @@ def profile() -> HealthyProfile:
         pytest.param(Cart(noise=0.0), "process_noise.small", marks=pytest.mark.long),
         pytest.param(Cart(noise=0.05), "process_noise.large", marks=pytest.mark.long),
         (Cart(weight=0.98), "weights.constant"),
+        (Cart(ignores_start=True), "start.ignored"),
     ],
 )
 def test_defects_of_an_external_filter_are_named(filter_: Cart, cause: str) -> None:

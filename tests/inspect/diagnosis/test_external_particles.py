@@ -85,7 +85,7 @@ def filter_of(module: Particles) -> Any:
 
 @cache
 def record() -> HealthyProfile:
-    return profile_of(filter_of(Particles()), [ride(seed) for seed in range(24)], "test")
+    return profile_of(filter_of(Particles()), [ride(seed) for seed in range(14)], "test")
 
 
 def diagnosis(module: Particles) -> Diagnosis:

@@ -167,7 +167,7 @@ def run(filter_: Boat, every: int = 4) -> Trace:
 
 @cache
 def profile() -> HealthyProfile:
-    return profile_of(loaded(Boat()), [sail(seed) for seed in range(30)], "boat")
+    return profile_of(loaded(Boat()), [sail(seed) for seed in range(15)], "boat")
 
 
 @pytest.mark.parametrize(("radar", "compass"), [(1.0, 1.0), (0.1, 1.0), (5.0, 0.3)])
