@@ -51,7 +51,9 @@ def uses_start(trace: Trace, checkpoint: ExternalFilter) -> bool:
     first, second = (run_from_truth(run, checkpoint, step, smallest_std(trace)) for run in (trace, moved))
     if first is None or second is None:
         return True
-    return any(not np.array_equal(value, second[name], equal_nan=True) for name, value in first.items())
+    return first.keys() != second.keys() or any(
+        not np.array_equal(value, second[name], equal_nan=True) for name, value in first.items()
+    )
 
 
 def some_steps(trace: Trace, checkpoint: ExternalFilter) -> NDArray[np.intp]:
