@@ -48,9 +48,10 @@ def _forget_namesakes(folder: Path) -> None:
 
     Without this, two versions of a filter in two folders would share the imports of the first.
     """
+    here = {path.stem if path.suffix == ".py" else path.name for path in folder.iterdir()}
     for name, module in list(sys.modules.items()):
-        top, source = name.partition(".")[0], getattr(module, "__file__", None)
-        if source is None or not ((folder / f"{top}.py").is_file() or (folder / top).is_dir()):
+        top = name.partition(".")[0]
+        if top not in here or (source := getattr(module, "__file__", None)) is None:
             continue
         path = Path(source).resolve()
         homes = [home for home in (folder, *_folders) if path == home / f"{top}.py" or home / top in path.parents]

@@ -35,7 +35,7 @@ from beliefscope.inspect.diagnosis.cause import (
     matches,
     probability_text,
 )
-from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS
+from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
@@ -347,7 +347,7 @@ def _lower(title: str) -> str:
 def channels_text(case: Case, cause: Cause) -> str:
     """The channels of a sensor or of the controls that a cause concerns: `` (elbow)``. Empty for all, or without names.
 
-    Channels with more than half of the largest deviation. Of dynamics, the controls with a wrong effect.
+    Channels with more than half of the largest deviation; the controls with a wrong effect; modalities of late updates.
     """
     task, key, alarms = case.inputs.checkpoint.task, cause.component.rpartition(".")[2], symptoms_of(cause, case.alarms)
     if key == "dynamics":
@@ -357,9 +357,11 @@ def channels_text(case: Case, cause: Cause) -> str:
     for alarm in alarms:
         if channel := channel_of(alarm.statistic.split("/")[1], task):
             largest.setdefault(channel[1].name.removeprefix(f"{key} "), abs(alarm.t))
-    limit = 0.5 * max(largest.values(), default=0.0)
-    own = [channel.name for channel in task.channels.get(key, ()) if largest.get(channel.name, 0.0) > limit]
-    return f" ({', '.join(map(display_name, own))})" if 0 < len(own) < len(task.channels[key]) else ""
+    limit, names = 0.5 * max(largest.values(), default=0.0), [channel.name for channel in task.channels.get(key, ())]
+    if cause.name == LATE.name:
+        limit, names, largest = 0.0, list(task.modalities), {a.statistic.split("/")[1]: abs(a.t) for a in alarms}
+    own = [name for name in names if largest.get(name, 0.0) > limit]
+    return f" ({', '.join(map(display_name, own))})" if 0 < len(own) < len(names) else ""
 
 
 def _when(case: Case, candidate: Candidate) -> str:

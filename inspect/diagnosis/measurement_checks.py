@@ -12,7 +12,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
 from beliefscope.inspect.statistics.innovations import prediction
-from beliefscope.inspect.statistics.measures import counted
+from beliefscope.inspect.statistics.measures import Mask, counted
 from beliefscope.inspect.statistics.reading_features import Indices
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN, Array, wrapped
@@ -34,6 +34,12 @@ likelihoods of all particles are a line, which does not show where their maximum
 SEPARATE = 0.3
 """Smallest singular value of the errors of all channels over the particles, each of length 1, that separates them. Two
 distances along one line have the same error for all particles but for a factor."""
+
+MOST_LATE = 3
+"""Largest number of readings by which the used one is earlier."""
+
+SAME, OTHER = 0.3, 0.8
+"""Largest error of h(x) with the reading that the filter uses, and smallest one with another, relative to its noise."""
 
 MIN_PARTICLES = 3
 """Smallest number of particles on either side of the angle at which readings jump by a turn."""
@@ -80,6 +86,8 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
     estimate: other updates may come first. The healthy record's model of the sensor expects readings g there, and h(x)
     may be between those at both ends. Neither the sensor nor the dynamics matter. Of innovations with the channels of
     the sensors.
+
+    ``late readings/MODALITY/all``: by how many readings z is earlier than that of the step.
     """
     predicted = prediction(trace)
     if trace.innovation is None or predicted is None or trace.task.rotations:
@@ -90,17 +98,44 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
     values: dict[str, float] = {}
     for k in range(count):
         ends = [replace(trace.episode, states=x.astype(np.float32)) for x in (means[:, k], trace.estimate_mean)]
+        lateness = []
         for model, columns in _sensors(trace, k, models):
-            readings = readings_of(trace.episode, model.key)
-            h = readings[:, model.channels] - trace.innovation[:, k, columns]
-            first, last = (model.relative(h - model.expected(end))[keep] for end in ends)
-            outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first)
-            for i, channel in enumerate(model.channels):
-                known = outside[np.isfinite(outside[:, i]), i]
-                if len(known) >= MIN_STEPS:
-                    name = f"measurement function/{axis_name(model.key, channel, readings.shape[1])}/all"
-                    values[name] = float(np.sqrt(np.square(known).mean()))
-    return values
+            readings, present = readings_of(trace.episode, model.key), trace.episode.present(model.key)
+            innovation, expected = trace.innovation[:, k, columns], [model.expected(end) for end in ends]
+            errors = []
+            for late in range(MOST_LATE + 1):
+                h = _earlier(readings[:, model.channels], present, late) - innovation
+                errors.append(_outside([model.relative(h - g)[keep] for g in expected]))
+            late, by_channel = _lateness(np.array(errors))
+            lateness.append(late)
+            for channel, value in zip(model.channels, by_channel.tolist(), strict=True):
+                values[f"measurement function/{axis_name(model.key, channel, readings.shape[1])}/all"] = value
+        if lateness:
+            values[f"late readings/{trace.modalities[k]}/all"] = float(max(lateness))
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def _earlier(readings: Array, present: Mask, late: int) -> Array:
+    """Readings (T, A) that came some readings before, at the steps with a reading; NaN where there is none."""
+    steps, earlier = np.flatnonzero(present), np.full_like(readings, np.nan, dtype=np.float64)
+    earlier[steps[late:]] = readings[steps[: len(steps) - late]]
+    return earlier
+
+
+def _outside(errors: Sequence[Array]) -> Array:
+    """(A,) root mean square of errors (T, A) at two ends, 0 at steps where they have different signs."""
+    first, last = errors
+    outside = np.where(first * last > 0.0, np.minimum(np.abs(first), np.abs(last)), 0.0 * first)
+    count = np.isfinite(outside).sum(0)
+    return np.where(count < MIN_STEPS, np.nan, np.sqrt(np.nansum(np.square(outside), axis=0) / np.maximum(count, 1)))
+
+
+def _lateness(errors: Array) -> tuple[int, Array]:
+    """By how many readings the used ones are late, and the errors (A,) with these, from those of each number (L, A)."""
+    largest = np.fmax.reduce(errors, axis=1)
+    best = int(np.nanargmin(largest)) if np.isfinite(largest).any() else 0
+    late = best if largest[best] < SAME and largest[0] > OTHER else 0
+    return late, errors[late]
 
 
 def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:

@@ -51,6 +51,7 @@ KINDS = {
     "covariance update": ("reduction of the covariance by updates, relative to that of correct ones,", False, 0.05),
     "inverted likelihood": ("likelihood{of} that grows with the error of the reading", False, 0.1),
     "ignored start": ("independence of the belief at the start", False, 0.1),
+    "late readings": ("number of readings by which the used ones{of} are late", False, 0.3),
     "innovation turns": ("share of innovations of about a full turn", False, 0.002),
     "updates": ("share of steps with an accepted measurement", False, 0.02),
     "absent updates": ("share of steps without a reading that have a measurement", False, 0.02),

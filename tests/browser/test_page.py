@@ -311,13 +311,12 @@ def test_recording_is_saved_and_synchronized_with_rerun(open_page: Any, tmp_path
         page.page.reload()  # the job continues and the page waits for it again
     download.value.save_as(tmp_path / "run.rrd")
     assert (tmp_path / "run.rrd").read_bytes()[:3] == b"RRF"
-    # The status covers no control.
-    edges = (
+    edges = (  # the status covers no control
         "() => ['#save-status', '#finding .links'].map((part) => document.querySelector(part).getBoundingClientRect())"
     )
     status, links = page.page.evaluate(f"() => JSON.parse(JSON.stringify(({edges})()))")
     assert status["right"] <= links["left"]
-    page.page.set_viewport_size({"width": 600, "height": 450})  # software rendering of the viewer takes long
+    page.page.set_viewport_size({"width": 600, "height": 450})  # the viewer is rendered by software
     page.page.get_by_role("button", name="Open in Rerun tab").click()
     page.until("() => document.querySelector('#rerun').dataset.state === 'ready'", 120)
     cursor = (

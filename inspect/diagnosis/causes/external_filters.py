@@ -67,6 +67,14 @@ COVARIANCE = Cause(
 )
 """An update of the mean that is right, but not that of its covariance."""
 
+LATE = Cause(
+    "updates.late",
+    "Updates use earlier readings",
+    (Symptom("late readings/*", 1),),
+    f"{JACOBIANS}|{DYNAMICS}|lag/dynamics/*|measurement noise/*|measurement function/*|{FILTER}",
+    "Check which reading the filter uses: a buffer or a queue may return the one before.",
+)
+
 START = Cause(
     "start.ignored",
     "Filter ignores the belief that it starts at",
@@ -103,6 +111,7 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         COVARIANCE,
         ESTIMATE,
         START,
+        LATE,
         *([_wrong_sign(tuple(task.modalities))] if len(task.modalities) > 1 else []),
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
         *(cause for modality in task.modalities for cause in _of_updates(modality)),

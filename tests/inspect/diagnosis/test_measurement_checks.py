@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_innovation_checks import STD, Boat, run, sail
+from tests.inspect.diagnosis.test_innovation_checks import STD, Boat, run, sail, wrapped
 
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
@@ -66,6 +66,20 @@ def test_a_belief_before_each_update_is_that_of_its_measurement_function() -> No
     assert measurement_model_statistics(trace, models())[compass] < 0.2
     shared = replace(trace, predicted_mean=separate.predicted_mean)
     assert measurement_model_statistics(shared, models())[compass] > 5.0
+
+
+@pytest.mark.parametrize("late", [0, 1, 3])
+@pytest.mark.parametrize("key", STD)
+def test_innovations_show_by_how_many_readings_the_used_one_is_late(key: str, late: int) -> None:
+    """The radar has a reading at every fourth step only; with the used reading, the measurement function is right."""
+    trace, k = run(Boat()), list(STD).index(key)
+    steps, readings = np.flatnonzero(trace.episode.present(key)), trace.episode.observations[key]
+    used = readings[np.concatenate([steps[:late], steps[: len(steps) - late]])]
+    innovation = trace.innovation.copy()
+    innovation[steps, k, : readings.shape[1]] += wrapped(used - readings[steps])
+    values = measurement_model_statistics(replace(trace, innovation=innovation), models())
+    assert {name: values[f"late readings/{name}/all"] for name in STD} == {**dict.fromkeys(STD, 0.0), key: late}
+    assert max(value for name, value in values.items() if name.startswith("measurement function")) < 0.3
 
 
 def with_likelihoods(trace: Trace, scale: float, offset: float, spread: float | tuple[float, ...] = 0.3) -> Trace:
