@@ -254,14 +254,14 @@ def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -
     return values
 
 
-def joined(name: str, runs: Sequence[Tensor]) -> Tensor:
-    """Values (T, N, ...) of several runs along N; NaN after the last channels of smaller measurements."""
+def joined(name: str, runs: Sequence[Tensor], dim: int = 1) -> Tensor:
+    """Values (T, ...) of several runs along an axis, such as N; NaN after the last channels of smaller measurements."""
     if len(runs) == 1:
         return runs[0]
-    if axes := letters_of(name).count("m"):
+    if axes := SHAPES.get(name, "").count("m"):
         size = max(values.shape[-1] for values in runs)
         runs = [nn.functional.pad(v, (0, size - v.shape[-1]) * axes, value=math.nan) for v in runs]
-    return torch.cat(list(runs), dim=1)
+    return torch.cat(list(runs), dim=dim)
 
 
 def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str, step: int = 0) -> Values:

@@ -8,12 +8,13 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.text import plural
-from beliefscope.filters.external.adapter import FailedStep
+from beliefscope.filters.external.adapter import FailedStep, joined
 from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
@@ -108,7 +109,7 @@ def _joined(runs: Sequence[Trace], episode: Episode, settings: Mapping[str, Any]
     arrays = {f.name: [getattr(run, f.name) for run in runs] for f in fields(Trace) if not f.name.startswith("start_")}
     extra = {name: np.concatenate([run.extra[name] for run in runs])[:steps] for name in first.extra}
     by_step: dict[str, Any] = {
-        name: np.concatenate(values)[:steps]
+        name: joined(name, [torch.from_numpy(value) for value in values], dim=0).numpy()[:steps]
         for name, values in arrays.items()
         if all(isinstance(value, np.ndarray) for value in values)
     }

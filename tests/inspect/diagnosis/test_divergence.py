@@ -140,6 +140,34 @@ def test_the_headline_states_the_failure_of_a_filter_that_does_not_diverge() -> 
     assert ".;" not in headline
 
 
+class Occluded(Failing):
+    """The first sensor, of two channels, has no readings after the first failure; the other one has one channel."""
+
+    starts = 0
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        super().initialize_beliefs(mean=mean, covariance=covariance)
+        self.starts += 1
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        values = super().__call__(observations=observations, controls=controls)
+        seen = self.starts <= 2  # the run that fails, and that of the steps before
+        return values | {
+            "innovation": [values["innovation"][0] if seen else None, np.zeros(1)],
+            "innovation_covariance": [values["innovation_covariance"][0] if seen else None, np.eye(1)],
+        }
+
+
+def test_parts_of_a_run_have_different_channels() -> None:
+    run = trace_with_restarts(loaded(Occluded()), drive(20))
+    assert run.innovation is not None
+    assert run.innovation.shape == (len(run), 2, 2)
+    assert run.innovation_covariance is not None
+    assert run.innovation_covariance.shape == (len(run), 2, 2, 2)
+    np.testing.assert_array_equal(np.isnan(run.innovation[:, 0, 0]), np.arange(len(run)) >= 20)
+    assert np.isnan(run.innovation[:, 1, 1]).all()
+
+
 def test_restarts_are_named_in_comparisons_and_errors() -> None:
     failing, right = trace_with_restarts(loaded(Failing()), drive(20)), bs.trace(loaded(Kalman()), drive(20))
     reason = (
