@@ -74,15 +74,17 @@ class FilterPy:
             self.filter.predict()
         else:
             self._predict(self.filter, controls)
-        mean, covariance = self._mean(), self._covariance()
-        results = [self._update(update, reading) for update, reading in self._readings(observations)]
+        results, before = [], []
+        for update, reading in self._readings(observations):
+            before.append((self._mean(), self._covariance()))
+            results.append(self._update(update, reading))
         values: dict[str, Any] = {"estimate_mean": self._mean(), "estimate_covariance": self._covariance()}
         if hasattr(self.filter, "y") and hasattr(self.filter, "S"):
             values |= {
                 "innovation": [None if r is None else r[0] for r in results],
                 "innovation_covariance": [None if r is None else r[1] for r in results],
-                "predicted_mean": np.stack([mean] * len(results)),
-                "predicted_covariance": np.stack([covariance] * len(results)),
+                "predicted_mean": np.stack([mean for mean, _ in before]),  # updates are in turn
+                "predicted_covariance": np.stack([covariance for _, covariance in before]),
             }
             if self._gate is not None:
                 values["accepted"] = [None if r is None else r[2] for r in results]

@@ -41,6 +41,15 @@ def test_kalman_filter_equals_its_equations() -> None:
     assert actual.modalities == ("gps", "speed")
 
 
+def test_each_innovation_is_that_of_the_prediction_before_its_update() -> None:
+    result, readings = run("kalman"), vehicle.drive(1).observations
+    assert result.predicted_mean is not None
+    assert result.innovation is not None
+    for k, key in enumerate(result.modalities):
+        expected = readings[key] - result.predicted_mean[:, k] @ vehicle.H[key].T
+        np.testing.assert_allclose(result.innovation[:, k, : expected.shape[1]], expected, atol=1e-5)
+
+
 def test_gate_rejects_outliers_and_restores_the_prediction() -> None:
     gated, free = run("gated", outliers=0.1), run("kalman", outliers=0.1)
     episode = vehicle.drive(1, outliers=0.1)
