@@ -128,6 +128,54 @@ def test_hash_is_the_same_in_python_and_on_the_command_line(tmp_path: Path, monk
     sys.modules.pop("own_place")
 
 
+def test_hash_covers_functions_that_a_filter_holds(tmp_path: Path) -> None:
+    """Functions in attributes and enclosed by methods, values that they enclose, classes, imported files, the start."""
+    code = """
+import beliefscope as bs
+from sensor_model import expected
+
+class Held:
+    def __init__(self, update): self._update = update
+    def initialize_beliefs(self, *, mean, covariance): self.mean = mean
+    def __call__(self, *, observations, controls): return self._update(self.mean)
+
+class Model:
+    def step(self, mean): return mean
+
+class Other(Model):
+    def step(self, mean): return -mean
+
+def held(r=1.0, model=Model, std=1.0):
+    filter_ = model()
+    filter_.update = lambda mean: r * filter_.step(mean)
+    return bs.Adapter(Held(filter_.update), initial_std=(std,) * 3, task="door")
+
+def noisy(): return held(r=2.0)
+def other(): return held(model=Other)
+def uncertain(): return held(std=2.0)
+
+def local(function):
+    class Local(Held):
+        def __call__(self, *, observations, controls): return function(self.mean)
+    return bs.Adapter(Local(None), task="door")
+
+def plus(): return local(lambda mean: mean + 1)
+def minus(): return local(lambda mean: mean - 1)
+"""
+    (tmp_path / "held.py").write_text(code)
+
+    def hash_of(name: str) -> str:
+        return load_external(f"{tmp_path}/held.py:{name}").hash
+
+    (tmp_path / "sensor_model.py").write_text("def expected(): return 1")
+    hashes = [hash_of(name) for name in ("held", "noisy", "other", "uncertain", "plus", "minus")]
+    assert len(set(hashes)) == len(hashes)
+    assert hash_of("held") == hashes[0]
+    (tmp_path / "sensor_model.py").write_text("def expected(): return 2")
+    assert hash_of("held") != hashes[0]
+    sys.modules.pop("sensor_model")
+
+
 def test_hash_covers_code_without_a_file() -> None:
     """Classes and functions of notebooks: their modules have no file."""
 
