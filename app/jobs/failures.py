@@ -13,6 +13,7 @@ from beliefscope.inspect.slices.covariates import EpisodeCovariates
 from beliefscope.inspect.slices.report import describe_slices
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
+from beliefscope.inspect.traces.restarts import RESTARTS, restarted_runs_text
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -32,6 +33,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             seed=store.settings.seed,
             particles=store.settings.particles,
             progress=progress,
+            restart=True,
         )
         return failure_document(traces, arguments, lambda: report(0.95, "searching for slices"))
 
@@ -43,7 +45,10 @@ def failure_document(
 
     selection: ``filter``, ``data``, ``faults`` and ``among``, as text. traced: called after the last trace.
     """
-    parts = [(EpisodeScores.from_trace(trace), EpisodeCovariates.from_trace(trace)) for trace in traces]
+    parts, restarted = [], 0
+    for trace in traces:
+        parts.append((EpisodeScores.from_trace(trace), EpisodeCovariates.from_trace(trace)))
+        restarted += RESTARTS in trace.settings
     traced()
     survey = Survey.from_episodes(scores for scores, _ in parts)
 
@@ -55,5 +60,7 @@ def failure_document(
     covariates = [covariates for _, covariates in parts]
     for score in document["scores"]:
         if not score["why_not"]:
+            if restarted:
+                score["verdict"] = f"{restarted_runs_text(restarted, len(parts))} {score['verdict']}"
             score["slices"] = describe_slices(survey, covariates, score["name"])
     return document

@@ -23,7 +23,7 @@ from beliefscope.inspect.statistics.outages import (
     without_reading,
 )
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.restarts import RESTARTS
+from beliefscope.inspect.traces.restarts import RESTARTS, restarted_runs_text
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,7 @@ class Errors(Diagnostic):
             text += f" ({percent(worst.share)} of the squared error in {percent(steps)} of the steps)"
         parts = [f"{text}."]
         if self.restarts:
-            runs = "this run" if self.trajectories == 1 else f"{self.restarts} of {self.trajectories} runs"
-            parts.insert(0, f"The filter fails and is restarted at the true state in {runs}.")
+            parts.insert(0, restarted_runs_text(self.restarts, self.trajectories))
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
             outages, verb = plural(outage.count, "outage"), "has" if outage.count == 1 else "have"
             text = f"{outages} of {display_name(outage.modality)}, up to {outage.longest:.3g} s, {verb} "

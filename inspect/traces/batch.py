@@ -19,6 +19,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
+from beliefscope.inspect.traces.restarts import trace_with_restarts
 from beliefscope.inspect.traces.run import assemble_trace, step_arrays, trace
 
 EPISODES, STEPS = 32, 10_000
@@ -36,6 +37,7 @@ def trace_all(
     particles: int = 300,
     faults: Faults = NO_FAULTS,
     progress: Progress | None = None,
+    restart: bool = False,
 ) -> Iterator[Trace]:
     """Trace the episodes with these indices, those of equal length together, with an external filter one by one.
 
@@ -44,12 +46,16 @@ def trace_all(
 
     Args:
         progress: called with the completed fraction, 0..1.
+        restart: whether an external filter that fails at a step is restarted (``trace_with_restarts``).
     """
     done = 0
     if isinstance(checkpoint, ExternalFilter):
         for index in indices:
             share = _part(progress, done, 1, len(indices))
-            yield trace(checkpoint, data[index], index, seed, particles, faults, share)
+            if restart:
+                yield trace_with_restarts(checkpoint, data[index], index, seed, faults, share)
+            else:
+                yield trace(checkpoint, data[index], index, seed, particles, faults, share)
             done += 1
         return
     for episodes in _blocks(data, indices):

@@ -74,6 +74,12 @@ def restarts_text(trace: Trace) -> str:
     return f"restarted at the true state {plural(len(trace.settings[RESTARTS]), 'time')}: {trace.settings[FAILURE]}"
 
 
+def restarted_runs_text(restarted: int, runs: int) -> str:
+    """A sentence that states in how many of some runs the filter was restarted."""
+    where = "this run" if runs == 1 else f"{restarted} of {runs} runs"
+    return f"The filter fails and is restarted at the true state in {where}."
+
+
 def _until_lost(
     external: ExternalFilter,
     episode: Episode,

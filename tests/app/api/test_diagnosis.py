@@ -162,6 +162,12 @@ def test_a_run_of_a_filter_that_fails_has_restarts(tmp_path: Path, open_client: 
         while (reply := client.get("/api/trace/boat/failing/1")).status_code == 202:
             time.sleep(0.05)
         header = reply.json()
+        client.post(url := "/api/failures/boat/failing?among=all")
+        while (reply := client.get(url)).status_code == 202 and reply.json()["job"]["state"] != "failed":
+            time.sleep(0.05)
+        assert reply.status_code == 200, reply.text
+        verdict = reply.json()["scores"][0]["verdict"]
+    assert verdict.startswith("The filter fails and is restarted at the true state in 4 of 4 runs. ")
     reason = f"{source}:failing fails at step 15: ArithmeticError: not positive definite"
     assert header["steps"] == 40
     assert header["failure"] == {"failure": reason, "restarts": [15, 30]}
