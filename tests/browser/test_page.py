@@ -394,7 +394,11 @@ def test_a_failed_run_is_reported_and_tried_again_and_names_are_whole(open_page:
     notes = [page.page.locator(f"{panel} > .note").first.text_content() for panel in panels]
     assert notes == ["The filter failed.", *2 * ["No run to display."], *2 * ["The filter failed."]]
     assert page.page.locator("#finding .sentence").inner_text().startswith("This run cannot be displayed.")
+    exports = [page.page.locator(button) for button in ("#save", "#report")]
+    assert all(button.is_disabled() for button in exports)
     page.errors[:] = [line for line in page.errors if "status of 500" not in line]
     page.page.unroute("**/api/trace/**")
     page.page.get_by_role("button", name="Try again").first.click()
     page.until("() => document.querySelector('#scene').dataset.state !== 'error'")
+    page.until("() => !document.querySelector('#save').disabled")
+    assert all(button.is_enabled() for button in exports)

@@ -27,6 +27,7 @@ export const useful = new Promise((resolve) => {
  * @param {number} [share] 0..1
  */
 export function showLoading(text, share) {
+  enableExports(false);
   for (const body of bodies) setPanelState(body, 'loading', text, share);
 }
 
@@ -57,8 +58,15 @@ export function showError(error) {
   html('#step-summary').textContent = '';
   [html('#readout b').textContent, html('#readout span').textContent] = ['–', ''];
   showDataWarning(null);
+  enableExports(false);
   for (const body of bodies) setPanelState(body, 'empty', 'No run to display');
   return text;
+}
+
+/** @param {boolean} hasRun whether there is a run, which can be saved and reported */
+function enableExports(hasRun) {
+  for (const selector of ['#save', '#report'])
+    element(selector, HTMLButtonElement).disabled = !hasRun;
 }
 
 /** @param {string | null | undefined} warning how the data differ from the training data */
@@ -73,6 +81,7 @@ function showDataWarning(warning) {
  * @param {Trace} trace
  */
 export function showProperties(trace) {
+  enableExports(true);
   for (const body of bodies.slice(1)) setPanelState(body, 'ready');
   const { no_maps: noMaps, data_warning: warning } = trace.header;
   showDataWarning(warning);

@@ -48,9 +48,11 @@ export function connectSaveButton(button, host, jobs, { request, openRerun, open
     close.ariaLabel = 'Dismiss';
     host.replaceChildren(create('p', {}, ...children, close));
   };
+  let isWriting = false;
   /** @param {RecordingRequest | null} body */
   const save = async (body) => {
-    if (button.disabled || !body) return;
+    if (isWriting || !body) return;
+    isWriting = true;
     sessionStorage.setItem(PENDING_REQUEST, JSON.stringify(body));
     [button.disabled, button.textContent] = [true, 'Writing …'];
     const progress = create('progress', { ariaLabel: 'Progress of the recording', hidden: true });
@@ -81,13 +83,15 @@ export function connectSaveButton(button, host, jobs, { request, openRerun, open
       show(`The recording was not written: ${messageOf(error)}`);
     } finally {
       sessionStorage.removeItem(PENDING_REQUEST);
-      [button.disabled, button.textContent] = [false, 'Save .rrd'];
+      isWriting = false;
+      [button.disabled, button.textContent] = [!request(), 'Save .rrd'];
     }
   };
-  button.addEventListener('click', () => save(request()));
+  const saveDisplayed = () => save(button.disabled ? null : request());
+  button.addEventListener('click', saveDisplayed);
   const unfinished = sessionStorage.getItem(PENDING_REQUEST);
   if (unfinished) save(JSON.parse(unfinished));
-  return () => save(request());
+  return saveDisplayed;
 }
 
 /**
