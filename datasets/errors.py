@@ -17,10 +17,14 @@ class BadInput(ValueError):
 
     The message is one line with the invalid value and the valid ones. The command line prints it and exits with
     code 2; the page shows it (HTTP 4xx, JSON). Undecodable bytes of a name are shown as ``\\udcff``.
+
+    Attributes:
+        advice: a command that helps, which the command line adds; empty if there is none.
     """
 
-    def __init__(self, message: str) -> None:
+    def __init__(self, message: str, advice: str = "") -> None:
         super().__init__(message.encode(errors="backslashreplace").decode())
+        self.advice = advice
 
 
 def check_name(kind: str, name: str, available: Container[str]) -> None:

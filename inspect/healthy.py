@@ -114,7 +114,8 @@ def profile_of(
         if not isinstance(checkpoint, ExternalFilter):  # which run together
             raise
         failed = len(rows) if indices is None else indices[len(rows)]
-        raise BadInput(f"{error} (healthy episode {failed})") from None
+        advice = "`--profile-filter` measures the record with another version of the filter"
+        raise BadInput(f"{error} (healthy episode {failed})", advice) from None
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     lengths = [len(episode) for episode in episodes]

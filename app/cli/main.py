@@ -96,7 +96,7 @@ def main() -> None:
         if debug:
             raise
         if isinstance(error, BadInput):
-            console.fail(str(error), 2)
+            console.fail(f"{error}; {error.advice}" if error.advice else str(error), 2)
         with suppress(OSError):
             console.flush()
         if isinstance(error, BrokenPipeError):  # the reader has closed the pipe, as ``head`` does

@@ -59,10 +59,14 @@ PAIRS = (
 Values = dict[str, Tensor]
 
 
+MIN_STEPS = 5
+"""Smallest number of steps after which a filter that fails is restarted."""
+
+
 class FailedStep(BadInput):
     """A filter fails at a step, or returns a number that is not finite."""
 
-    def __init__(self, message: str, step: int) -> None:
+    def __init__(self, message: str, step: int = 0) -> None:  # the default is for pickle, which then sets it
         super().__init__(message)
         self.step = step
 

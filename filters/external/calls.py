@@ -16,7 +16,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import check_shapes
-from beliefscope.filters.external.adapter import Adapter
+from beliefscope.filters.external.adapter import MIN_STEPS, Adapter, FailedStep
 
 CPU = torch.device("cpu")
 
@@ -45,6 +45,22 @@ def has_own_start(filter_: Any) -> bool:
 def takes_start(filter_: Any) -> bool:
     """Whether the filter is called step by step from a belief that it is given."""
     return is_stepwise(filter_) and not has_own_start(filter_)
+
+
+@contextmanager
+def with_advice(filter_: Any, episodes: Sequence[Episode]) -> Iterator[None]:
+    """Adds to a ``FailedStep`` which readings are removed, or how to examine the filter if ``diagnose`` restarts it."""
+    try:
+        yield
+    except FailedStep as error:
+        removed = [key for key, values in episodes[0].observations.items() if np.isnan(values).any()]
+        if removed:
+            text = f"{error}; the removed readings of {', '.join(removed)} are NaN, by Adapter(absent='nan')"
+            raise FailedStep(text, error.step) from error
+        is_known = all(np.isfinite(episode.states).all() for episode in episodes)
+        if error.step >= MIN_STEPS and takes_start(filter_) and is_known:
+            error.advice = "`beliefscope diagnose` restarts it at the true state and names the cause"
+        raise
 
 
 def device_of(filter_: Any) -> torch.device:

@@ -58,6 +58,7 @@ from beliefscope.filters.external.calls import (
     seeded,
     snapshot,
     steps_of,
+    with_advice,
 )
 from beliefscope.filters.external.derived_values import derived
 from beliefscope.filters.external.fingerprint import fingerprint
@@ -176,10 +177,9 @@ class ExternalFilter(Checkpoint):
 
             belief = Gaussian(start.mean[group], start.covariance[group])
             runs.append(self._run([episodes[i] for i in group], seed, share, belief))
-        models = runs[0][1]
         common = [name for name in runs[0][0] if all(name in values for values, _ in runs)]
         values = {name: joined(name, [values[name] for values, _ in runs]) for name in common}
-        return derived(self._units.to_si(values), self._task), self._names(values, models)
+        return derived(self._units.to_si(values), self._task), self._names(values, runs[0][1])
 
     def _run(
         self, episodes: Sequence[Episode], seed: int, progress: Callable[[float], None], start: Gaussian
@@ -187,7 +187,7 @@ class ExternalFilter(Checkpoint):
         """One call of a filter of whole sequences, or T calls; values (T, N, ...) in the filter's units."""
         observations, controls = inputs_of(self._task, episodes, dtype_of(self.adapter.module))
         models: tuple[int, ...] = ()
-        with torch.no_grad(), seeded(seed, self.adapter.module):
+        with torch.no_grad(), seeded(seed, self.adapter.module), with_advice(self.adapter.module, episodes):
             if not is_stepwise(self.adapter.module):
                 values = self._at_once(observations, controls)
                 progress(1.0)

@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.text import plural
-from beliefscope.filters.external.adapter import FailedStep, joined
+from beliefscope.filters.external.adapter import MIN_STEPS, FailedStep, joined
 from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
-
-MIN_STEPS = 5
-"""Smallest number of steps between two restarts."""
 
 LOST = 3.0
 """Error of an estimate that has lost the true state, in standard deviations of the true states, or of the first belief

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from urllib.parse import parse_qs
 
 import pytest
@@ -85,3 +86,28 @@ def test_permalink_escapes_names() -> None:
     assert (query["filter"], query["data"]) == ("my filter*~", "a&b=ü")
     assert query["faults"] == "blackout=1:from=2,delay=image:steps=3"
     assert query["weights"] == "effective"
+
+
+FAILING = """
+class Failing:
+    task = "door"
+    def initialize_beliefs(self, *, mean, covariance): self.mean, self.steps = mean, 0
+    def __call__(self, *, observations, controls):
+        self.steps += 1
+        if self.steps > {steps}:
+            raise ValueError("not positive definite")
+        return self.mean
+"""
+"""A filter that fails in a step."""
+
+
+@pytest.mark.parametrize(("steps", "workers"), [(20, 1), (3, 1), (20, 2)])
+def test_an_error_of_a_failing_filter_names_the_command_that_finds_its_cause(
+    run: Run, tmp_path: Path, steps: int, workers: int
+) -> None:
+    (tmp_path / "failing.py").write_text(FAILING.format(steps=steps))
+    code, _, error = run("failures", "door", "--filter", f"{tmp_path}/failing.py:Failing", "--workers", workers)
+    assert code == 2
+    failure = f"error: {tmp_path}/failing.py:Failing fails at step {steps}: ValueError: not positive definite"
+    advice = "; `beliefscope diagnose` restarts it at the true state and names the cause" if steps == 20 else ""
+    assert error.splitlines()[-1] == failure + advice

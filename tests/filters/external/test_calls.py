@@ -16,6 +16,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import evaluate, external_run
+from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.adapter import Adapter, FailedStep, check_values
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.finetuning.slices import Slice
@@ -124,6 +125,16 @@ def test_evaluation_and_sums_of_episodes_wrap_angles() -> None:
     assert metrics.rmse["heading_deg"] == pytest.approx(np.degrees(0.1), rel=1e-5)
     assert by_name["heading"] == pytest.approx(0.1, rel=1e-5)
     assert by_name["nees"] == pytest.approx(metrics.nees, rel=1e-6) == pytest.approx(0.01, rel=1e-4)
+
+
+def test_an_error_names_the_removed_readings() -> None:
+    def repeated(observations: dict[str, Any], controls: np.ndarray) -> np.ndarray:
+        return np.concatenate([observations["gps"], *[observations["speed"]] * 2], axis=-1)
+
+    filter_, episode = ExternalFilter(Adapter(repeated, absent="nan"), vehicle.TASK, "repeated"), vehicle.drive(6)
+    filter_.run([episode])
+    with pytest.raises(BadInput, match="not finite; the removed readings of speed are NaN, by Adapter"):
+        filter_.run([without(episode, ["speed"], "nan")])
 
 
 def test_global_generators_are_seeded_and_restored() -> None:
