@@ -27,6 +27,10 @@ DT = "dt"
 """Key under which a filter receives the durations of irregular steps."""
 
 
+PRESENT = ".present"
+"""End of the keys under which a filter receives the masks of sensors."""
+
+
 def is_stepwise(filter_: Any) -> bool:
     """Whether the filter is called for one step at a time."""
     return hasattr(filter_, "initialize_beliefs")
@@ -138,7 +142,7 @@ def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tu
         observations[DT] = torch.from_numpy(np.stack([episode.durations for episode in episodes], axis=1))
     for key in task.masks:
         present = np.stack([episode.present(key) for episode in episodes], axis=1)
-        observations[f"{key}.present"] = torch.from_numpy(present)
+        observations[key + PRESENT] = torch.from_numpy(present)
     controls = torch.from_numpy(np.stack([episode.controls for episode in episodes], axis=1)).to(dtype)
     return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
@@ -256,6 +260,6 @@ def step_inputs(
     if episode.time is not None:
         observations[DT] = torch.as_tensor(episode.durations[index])
     for key in task.masks:
-        observations[f"{key}.present"] = torch.as_tensor(episode.present(key)[index])
+        observations[key + PRESENT] = torch.as_tensor(episode.present(key)[index])
     typed = {key: v if v.dtype == torch.uint8 else v.to(dtype) for key, v in observations.items()}
     return typed, torch.as_tensor(episode.controls[index]).to(dtype)

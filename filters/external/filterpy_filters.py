@@ -14,16 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from beliefscope.filters.external.calls import DT
+from beliefscope.filters.external.calls import DT, PRESENT
 
 Array = NDArray[np.float64]
 Update = Callable[[Any, Array], None]
 
 
+def _reading(observations: Mapping[str, Array], key: str) -> Array:
+    """NaN at a step without a reading, by the mask of the sensor."""
+    return np.where(np.all(observations.get(key + PRESENT, 1.0)), observations[key], np.nan)
+
+
 class FilterPy:
     """A filterpy filter; use with ``Adapter(FilterPy(...), batched=False, absent="nan")``.
 
-    Every step calls ``predict``, then the update of each sensor in order. A reading with NaN is skipped.
+    Every step calls ``predict``, then the update of each sensor in order. A reading with NaN is skipped, and so is one
+    at a step at which the mask of the sensor has none.
 
     Attributes:
         filter: the running copy.
@@ -91,10 +97,12 @@ class FilterPy:
         return values | self._ensemble()
 
     def _readings(self, observations: Mapping[str, Array]) -> list[tuple[Update, Array]]:
+        """Updates and their readings, NaN at steps without one."""
         if self._updates is None:
-            joined = np.concatenate([np.ravel(reading) for key, reading in observations.items() if key != DT])
+            keys = [key for key in observations if key != DT and not key.endswith(PRESENT)]
+            joined = np.concatenate([np.ravel(_reading(observations, key)) for key in keys])
             return [(lambda filter_, z: filter_.update(z), joined)]
-        return [(update, observations[key]) for key, update in self._updates.items()]
+        return [(update, _reading(observations, key)) for key, update in self._updates.items()]
 
     def _update(self, update: Update, reading: Array) -> tuple[Array, Array, bool] | None:
         """Innovation, its covariance and whether the gate accepts it; None without a reading."""

@@ -1,4 +1,4 @@
-"""Source files of functions and classes: their own, and those that these import."""
+"""Source files of functions and classes, with their imports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def is_own(part: Any) -> bool:
 
 
 def files_with_imports(parts: Iterable[Any]) -> set[Path]:
-    """Files of functions and classes; of the user's code, also those that its files import, directly or not."""
+    """Files of functions and classes; of the user's code, also the files of all imports."""
     files: set[Path] = set()
     pending = [(sys.modules[part.__module__], is_own(part)) for part in parts if file_of(part) is not None]
     while pending:

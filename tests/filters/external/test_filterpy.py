@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,21 @@ def test_each_innovation_is_that_of_the_prediction_before_its_update() -> None:
     for k, key in enumerate(result.modalities):
         expected = readings[key] - result.predicted_mean[:, k] @ vehicle.H[key].T
         np.testing.assert_allclose(result.innovation[:, k, : expected.shape[1]], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("updates", [{"gps": lambda f, z: f.update(z)}, None])
+def test_steps_without_a_reading_are_those_of_the_mask(updates: Any) -> None:
+    observations = {"gps": (2,)}
+    task = replace(vehicle.TASK, observations=observations, modalities={"gps": ("gps",)}, masks={"gps": "fix"})
+    episode = vehicle.drive(1, gap=(40, 60))
+    episode = replace(episode, task=task, observations={"gps": episode.observations["gps"]})
+    inner = load_external(f"{SOURCE}:kalman", vehicle.TASK).adapter.module.filter
+    inner.H, inner.R = vehicle.H["gps"], vehicle.R["gps"]
+    adapter = Adapter(FilterPy(inner, updates, own_start=True), batched=False, modalities=("gps",))
+    result = trace(ExternalFilter(adapter, task, "masked"), episode)
+    assert result.innovation is not None
+    missing = np.isnan(result.innovation[:, 0, 0])
+    np.testing.assert_array_equal(missing, (np.arange(len(episode)) >= 40) & (np.arange(len(episode)) < 60))
 
 
 def test_gate_rejects_outliers_and_restores_the_prediction() -> None:
