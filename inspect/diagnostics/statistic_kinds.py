@@ -190,6 +190,9 @@ OF_COMPONENTS = frozenset(
 )
 """Kinds of statistics in the unit of the state component that their subject ends with; else m, of the controls."""
 
+OF_MODALITIES = frozenset({"measurement noise", "innovation std"})
+"""Kinds of statistics in the unit of all channels of a modality; without a unit if these differ."""
+
 
 def is_contact_known(task: Task) -> bool:
     """Whether contact is measured or labelled. Otherwise, statistics of these phases are those of whole episodes."""
@@ -236,6 +239,11 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
         channel = channel_of(subject, task)
         unit, factor = channel[1].conversion if channel else ("gray levels" if subject == "image" else "", 1.0)
         return f"{unit}{OF_READINGS[kind]}" if unit else "", factor
+    if kind in OF_MODALITIES:
+        shapes = {key: task.observations[key] for key in task.modalities.get(subject, ())}
+        channels = [task.channel(key, i) for key, shape in shapes.items() if len(shape) == 1 for i in range(shape[0])]
+        units = {channel.conversion for channel in channels}
+        return units.pop() if len(units) == 1 and all(len(shape) == 1 for shape in shapes.values()) else ("", 1.0)
     return OF_KINDS.get(kind, ("", 1.0))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.undo import brings_back
@@ -27,6 +29,16 @@ def test_statistics_have_the_units_of_their_components() -> None:
     assert unit_of("dynamics offset/rail x/all", TASK) == ("m", 1.0)
     assert unit_of("dynamics offset/train speed/all", TASK) == ("m/s", 1.0)
     assert unit_of("module bias/rad radar rail x/all", TASK) == ("m", 1.0)
+
+
+def test_noise_has_the_unit_of_all_channels_of_its_modality() -> None:
+    channels = {"rad radar": (Component("range", "m"), Component("height", "m"))}
+    task = replace(TASK, channels=channels, modalities={"radar": ("rad radar",)})
+    assert unit_of("measurement noise/radar/all", task) == task.channel("rad radar", 0).conversion
+    assert unit_of("measurement noise//all", task) == ("", 1.0)
+    observations = {**TASK.observations, "bearing": (1,)}
+    mixed = replace(task, observations=observations, modalities={"radar": ("rad radar", "bearing")})
+    assert unit_of("innovation std/radar/all", mixed) == ("", 1.0)
 
 
 def test_subjects_of_statistics_are_sensors() -> None:
