@@ -134,9 +134,9 @@ def _particle_moments(task: Task, particles: AnyArray, log_weights: AnyArray) ->
 
 
 def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
-    """``nu^T S^-1 nu`` (T, K), NaN without a measurement or for a singular S, and the number of its channels (T, K).
+    """``nu^T S^-1 nu`` (T, K) and the number of its channels (T, K); None unless a Kalman filter.
 
-    None unless a Kalman filter.
+    NaN without a measurement, or if S is not positive definite, as that of a filter that diverges.
     """
     if (pair := innovations(trace)) is None:
         return None
@@ -145,11 +145,13 @@ def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
     both = used[..., :, None] & used[..., None, :]
     s = np.where(both, s, np.eye(nu.shape[-1]))  # unused channels add nothing
     nu = np.where(used, nu, 0.0)
-    singular = np.isneginf(np.linalg.slogdet(s).logabsdet)  # the filter diverges
-    s = np.where(singular[..., None, None], np.eye(nu.shape[-1]), s)
+    valid = np.asarray(np.isfinite(s).all((-2, -1)))
+    s = np.where(valid[..., None, None], s, np.eye(nu.shape[-1]))
+    valid &= (np.linalg.slogdet(s).sign > 0.0) & (np.linalg.eigvalsh(s)[..., 0] > 0.0)
+    s = np.where(valid[..., None, None], s, np.eye(nu.shape[-1]))
     squared = np.einsum("tkm,tkm->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0])
     channels = used.sum(-1)
-    return np.where((channels > 0) & ~singular, squared, np.nan), channels
+    return np.where((channels > 0) & valid, squared, np.nan), channels
 
 
 def nis_of(trace: Trace) -> Array | None:
