@@ -78,6 +78,11 @@ def test_keys_change_the_step_and_the_theme_and_open_the_help(open_page: Any) ->
     page.page.keyboard.press("Enter")
     page.until("() => beliefscope.state().step === 15")
     assert find("ekf filter cross") == "Filtercrossmodal-ekf"
+    for words, command in {"export recording": "ActionSave .rrd", "tables pdf": "ActionReport"}.items():
+        page.page.keyboard.press("Control+k")  # closes the palette
+        assert find(words).startswith(command)
+    page.page.keyboard.press("Control+k")
+    assert find("ekf filter cross") == "Filtercrossmodal-ekf"
     options.first.click()
     page.until("() => beliefscope.state().filter === 'crossmodal-ekf'")
     find("image frozen faults")
