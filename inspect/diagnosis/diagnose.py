@@ -13,6 +13,7 @@ from functools import partial
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import capitalised
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
 from beliefscope.filters.external.adapter import FailedStep
@@ -147,8 +148,13 @@ def _with_restarts(diagnosis: Diagnosis, traces: Sequence[Trace]) -> Diagnosis:
     failure, at = settings[index][FAILURE], f"{where} step {lost[index][0]}{of_episode}"
     diverges = failure.endswith((" diverges", " is not finite"))
     text = f"the filter diverges{at}, and is restarted" if diverges else f"the filter is restarted{at}: {failure}"
-    headline = f"{diagnosis.headline.removesuffix('.')}; {text}"
-    return replace(diagnosis, headline=headline, provenance={**diagnosis.provenance, RESTARTS: lost})
+    headline, state = diagnosis.headline.removesuffix("."), diagnosis.state
+    if state == "fault":
+        headline = f"{headline}; {text}"
+    else:  # the failure is all that is certain
+        other = headline.replace("Healthy: ", "otherwise ", 1) if state == "healthy" else headline
+        headline, state = f"{capitalised(text)}; {other[0].lower()}{other[1:]}", "unsure"
+    return replace(diagnosis, state=state, headline=headline, provenance={**diagnosis.provenance, RESTARTS: lost})
 
 
 def diagnose_traces(

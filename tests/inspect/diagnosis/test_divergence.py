@@ -134,10 +134,11 @@ class Failing(Kalman):
 
 
 def test_the_headline_states_the_failure_of_a_filter_that_does_not_diverge() -> None:
-    headline = diagnose(loaded(Failing()), {20: drive(20)}, profile=profile()).headline
+    """First, as no cause is known."""
+    result = diagnose(loaded(Failing()), {20: drive(20)}, profile=profile())
     failure = "Failing fails at step 20: LinAlgError: Matrix is not positive definite"
-    assert headline.endswith(f"; the filter is restarted at step 20: {failure}")
-    assert ".;" not in headline
+    assert result.headline.startswith(f"The filter is restarted at step 20: {failure}; ")
+    assert (result.state, ".;" in result.headline) == ("unsure", False)
 
 
 class Occluded(Failing):
