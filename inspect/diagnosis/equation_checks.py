@@ -21,6 +21,7 @@ from beliefscope.filters.models.fusion import in_one_turn, product_of_experts, w
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.trace import Trace
 
 INDEPENDENT = 0.15
@@ -35,6 +36,13 @@ MOST_NUMBERS = 3_000_000
 
 NO_EVIDENCE = 1e-6
 """Variation of a log-likelihood over the particles of an episode, nats, below which its use cannot be seen."""
+
+
+LOST = 0.1
+"""Smallest change of the log-weights between two steps, relative to their spread, of weights that are not kept."""
+
+MIN_STEPS = 10
+"""Minimum number of steps of a statistic."""
 
 
 @torch.no_grad()
@@ -134,6 +142,7 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
 
     ``prior ess`` is of the steps after a resampling, of all steps if there is none: not every filter resamples always.
     ``ancestors`` and ``offspring`` (``relative_spread``) are of the steps with a resampling.
+    ``lost weights``: share of the steps without resampling after which the weights are not kept.
     ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
     to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it. ``estimate mean`` and
     ``reported variance``: as ``_estimate_statistics``.
@@ -144,6 +153,7 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     count = log_weights.shape[1]
     values = {"particles//all": float(count), "prior ess//all": _ess_after_resampling(log_weights, prior)}
     values |= _estimate_statistics(trace)
+    values |= _lost_weights(trace, log_weights.numpy(), prior.numpy())
     ancestors = np.arange(count)[None] if trace.ancestors is None else trace.ancestors
     resampled = np.flatnonzero((ancestors != np.arange(count)).any(-1) & (ancestors >= 0).all(-1))
     if len(resampled):
@@ -203,6 +213,21 @@ def _absent_updates(trace: Trace) -> dict[str, float]:
             used = np.ptp(trace.log_likelihood[absent, k], axis=-1) > NO_EVIDENCE
             values[f"absent updates/{modality}/all"] = float(used.mean())
     return values
+
+
+def _lost_weights(trace: Trace, log_weights: Array, prior: Array) -> dict[str, float]:
+    """``lost weights//all``: share of steps without resampling whose weights (T, M) are not the next prior weights."""
+    if trace.ancestors is None:
+        return {}
+    spread = np.abs(log_weights - log_weights.mean(-1, keepdims=True)).mean(-1)[:-1]
+    kept = (
+        (trace.ancestors == np.arange(log_weights.shape[1])).all(-1)[:-1] & np.isfinite(spread) & (spread > NO_EVIDENCE)
+    )
+    if kept.sum() < MIN_STEPS:
+        return {}
+    normalised = log_weights - np.logaddexp.reduce(log_weights, axis=-1, keepdims=True)
+    change = np.abs(prior[1:] - normalised[:-1]).mean(-1)
+    return {"lost weights//all": float((change[kept] > LOST * spread[kept]).mean())}
 
 
 def _ess_after_resampling(log_weights: Tensor, prior: Tensor) -> float:

@@ -12,7 +12,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
 from beliefscope.inspect.statistics.innovations import prediction
-from beliefscope.inspect.statistics.measures import Mask, counted
+from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_features import Indices
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN, Array, wrapped
@@ -59,9 +59,10 @@ def measurement_model_statistics(
     near_truth: with other particles and their likelihoods, which show noise and functions; default: those of the run.
     """
     models = [model.with_weak_channels() for model in models]
+    offsets = {} if near_truth is None or near_truth is trace else _offsets(near_truth)
     values, turns = _likelihoods(near_truth or trace, models), _turns(trace, models)
     turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
-    return _functions(trace, models) | values | turns
+    return _functions(trace, models) | values | turns | offsets
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
@@ -198,6 +199,32 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
             values[f"innovation turns/{modality}/all"] = float(turned.any(1).mean())
         names = [axis_name(m.key, i, len(m.channels)) for m in sensors for i in m.channels]
         values |= {f"measurement function/{name}/all": b for name, b in zip(names, bias.tolist(), strict=True)}
+    return values
+
+
+def _offsets(trace: Trace) -> dict[str, float]:
+    """``likelihood offset/MODALITY COMPONENT/all``, of particles around the true states.
+
+    Mean distance by which the likelihood of a modality alone moves the mean of the particles, in their standard
+    deviations: 0 in a filter whose measurement function is right, whatever its noise.
+    """
+    if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
+        return {}
+    values = {}
+    for k, modality in enumerate(trace.modalities):
+        at = np.isfinite(trace.log_likelihood[:, k]).all(-1) & ~absent(trace, modality)
+        if at.sum() < MIN_STEPS:
+            continue
+        likelihood, particles = trace.log_likelihood[at, k].astype(np.float64), trace.particles[at].astype(np.float64)
+        weights = np.exp(likelihood - likelihood.max(-1, keepdims=True))
+        weights /= weights.sum(-1, keepdims=True)
+        around = trace.task.difference(particles, particles[:, :1])  # angles have no mean
+        std = around.std(1)
+        moved = np.einsum("tp,tpn->tn", weights, around) - around.mean(1)
+        for i, component in enumerate(trace.task.components):
+            if (known := std[:, i] > 0.0).sum() >= MIN_STEPS:
+                mean = float((moved[known, i] / std[known, i]).mean())
+                values[f"likelihood offset/{modality} {component.name}/all"] = mean
     return values
 
 

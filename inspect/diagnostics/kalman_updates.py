@@ -42,9 +42,11 @@ def expected_updates(steps: RepeatedSteps) -> Updates:
     """Updates with the filter's own P and S, and the H of its innovations: all measurements at once, or in turn.
 
     At once, ``K = P H^T S^-1`` with the cross-covariances ``H P H^T`` of the measurements; in turn, each measurement
-    starts at the belief after the one before. The kind and order with the smallest errors count.
+    starts at the belief after the one before, or at its mean with the predicted covariance, if the filter does not
+    update it. The kind and order with the smallest errors count.
     """
-    results = [_together(steps), *(_in_turn(steps, order) for order in _orders(steps.size.shape[2]))]
+    orders = list(_orders(steps.size.shape[2]))
+    results = [_together(steps), *(_in_turn(steps, order, keeps) for keeps in (False, True) for order in orders)]
     return min(results, key=lambda r: _size(r.covariance_error) + _size(r.correction_error))
 
 
@@ -87,7 +89,8 @@ def _together(steps: RepeatedSteps) -> Updates:
     return _compared(steps, noise, prior - gain @ rows @ prior, corrections)
 
 
-def _in_turn(steps: RepeatedSteps, order: tuple[int, ...]) -> Updates:
+def _in_turn(steps: RepeatedSteps, order: tuple[int, ...], keeps: bool) -> Updates:
+    """keeps: whether the gain of each measurement is that with the predicted covariance."""
     prior, unit = steps.covariance[:, 0], np.eye(steps.covariance.shape[-1])
     covariance, noise = prior, np.zeros_like(steps.size[:, 0])
     corrections = np.zeros((*noise.shape[:2], len(unit)))
@@ -95,8 +98,9 @@ def _in_turn(steps: RepeatedSteps, order: tuple[int, ...]) -> Updates:
     for k in order:
         size, nu = steps.size[:, 0, k], np.nan_to_num(steps.innovation[:, 0, k])
         h = steps.measurement_jacobian[:, k] @ np.linalg.pinv(change)
-        noise[:, k] = size - h @ covariance @ h.mT
-        gain = covariance @ h.mT @ np.linalg.pinv(_invertible(size))
+        before = prior if keeps else covariance
+        noise[:, k] = size - h @ before @ h.mT
+        gain = before @ h.mT @ np.linalg.pinv(_invertible(size))
         corrections[:, k] = (gain @ nu[..., None])[..., 0]
         covariance = covariance - gain @ h @ covariance
         change = (unit - gain @ h) @ change

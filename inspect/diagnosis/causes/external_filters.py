@@ -67,6 +67,14 @@ COVARIANCE = Cause(
 )
 """An update of the mean that is right, but not that of its covariance."""
 
+WEIGHTS = Cause(
+    "weights.lost",
+    "Particle weights not kept without resampling",
+    (Symptom("lost weights/*", 1),),
+    f"ancestors/*|offspring/*|prior ess/*|likelihood share/*|{FILTER}",
+    "Multiply the likelihood by the weights of the step before; make them equal only after a resampling.",
+)
+
 LATE = Cause(
     "updates.late",
     "Updates use earlier readings",
@@ -112,6 +120,7 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         ESTIMATE,
         START,
         LATE,
+        WEIGHTS,
         *([_wrong_sign(tuple(task.modalities))] if len(task.modalities) > 1 else []),
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
         *(cause for modality in task.modalities for cause in _of_updates(modality)),
@@ -214,7 +223,7 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
         Cause(
             f"measurement.{modality}.bias",
             f"Measurement function of {name} biased",
-            (Symptom(f"innovation bias/{modality} *", 0),),
+            (Symptom(f"innovation bias/{modality} *|likelihood offset/{modality} *", 0),),
             FILTER,
             f"Compare h of {name} at the true states with its readings: offsets, positions of landmarks.",
             prior=-0.6,

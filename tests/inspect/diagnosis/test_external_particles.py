@@ -18,6 +18,8 @@ from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.equation_checks import relative_spread, reported_particle_statistics
+from beliefscope.inspect.diagnosis.model_checks import model_statistics
+from beliefscope.inspect.diagnosis.true_starts import with_particles_near_truth
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 
@@ -49,7 +51,10 @@ class Particles:
         best_only: bool = False,
         weighted: bool = True,
         variance: float = 1.0,
+        keeps_weights: bool = True,
+        offset: float = 0.0,
     ) -> None:
+        self.keeps_weights, self.offset = keeps_weights, offset
         self.count, self.powers, self.resample, self.best_only = count, powers or {}, resample, best_only
         self.weighted, self.variance = weighted, variance
 
@@ -60,8 +65,10 @@ class Particles:
 
     def __call__(self, *, observations: Any, controls: Any) -> dict[str, Any]:
         self.x = self.x + 0.1 * controls + 0.05 * self.rng.standard_normal((self.count, 1))
-        prior = self.log_weights
-        likelihood = np.stack([-0.5 * ((observations[k] - self.x[:, 0]) / s) ** 2 for k, s in STD.items()])
+        prior = self.log_weights if self.keeps_weights else np.full(self.count, -np.log(self.count))
+        offsets = {"near": self.offset, "far": 0.0}
+        errors = {k: observations[k] - self.x[:, 0] - offsets[k] for k in STD}
+        likelihood = np.stack([-0.5 * (errors[k] / s) ** 2 for k, s in STD.items()])
         posterior = prior + sum(self.powers.get(k, 1.0) * row for k, row in zip(STD, likelihood, strict=True))
         posterior -= np.logaddexp.reduce(posterior)
         values = {"particles": self.x, "log_weights": posterior, "prior_log_weights": prior}
@@ -140,6 +147,25 @@ def test_estimates_are_compared_with_the_moments_of_the_particles() -> None:
     assert quarter["reported variance//all"] == pytest.approx(np.log(0.25), abs=1e-4)
 
 
+def test_weights_are_kept_without_resampling() -> None:
+    for keeps, share in ((True, 0.0), (False, 1.0)):
+        values = reported_particle_statistics(bs.trace(filter_of(Particles(keeps_weights=keeps)), [ride(0)], 0))
+        assert values["lost weights//all"] == share
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, -0.2])
+def test_a_likelihood_with_an_offset_moves_the_particles_around_true_states(offset: float) -> None:
+    """As a Kalman update of their mean does; without a model of the readings."""
+    filter_ = filter_of(Particles(offset=offset))
+    values = [model_statistics(bs.trace(filter_, [ride(seed)], 0), filter_) for seed in range(5)]
+    near, far = (np.mean([v[f"likelihood offset/{key} x/all"] for v in values]) for key in STD)
+    variance = with_particles_near_truth(bs.trace(filter_, [ride(0)], 0), filter_).particles.var(1)
+    std = np.sqrt(np.nanmean(variance))
+    # Five runs of 40 steps with noise of the readings: 0.1 is four standard deviations of their mean.
+    assert near == pytest.approx(-offset * std / (std**2 + STD["near"] ** 2), abs=0.1)
+    assert far == pytest.approx(0.0, abs=0.1)
+
+
 def test_moments_of_angles_are_those_of_their_differences() -> None:
     """Particles on both sides of half a turn: the estimate at the turn is right, their arithmetic mean, 0, is wrong."""
     task = replace(TASK, components=(bs.Component("x", "rad", wraps=True),))
@@ -176,6 +202,8 @@ def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
         (Particles(resample=False), "resampling.off"),
         (Particles(best_only=True), "particles.deprived"),
         (Particles(weighted=False), "estimate.mean"),
+        pytest.param(Particles(keeps_weights=False), "weights.lost", marks=pytest.mark.long),
+        pytest.param(Particles(offset=0.1), "measurement.near.function", marks=pytest.mark.long),
         pytest.param(Particles(powers=dict.fromkeys(STD, -1.0)), "weights.ignores_likelihood", marks=pytest.mark.long),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
