@@ -55,11 +55,17 @@ def test_corrections_with_the_wrong_sign_have_a_slope_of_minus_one() -> None:
 
 @pytest.mark.parametrize("filter_", [Boat(), Boat(radar=5.0), Boat(gain=0.5), Boat(reduction=0.0), Boat(reduction=0.8)])
 def test_the_reduction_of_the_covariance_is_relative_to_that_of_a_right_update(filter_: Boat) -> None:
-    """Whatever R and the gain of the mean. Without any reduction, the gains are those of the predicted covariance."""
-    values = jacobian_statistics(run(filter_, 4), loaded(filter_, 4))
-    assert values["covariance update//all"] == pytest.approx(filter_.reduction, abs=0.01)
-    if filter_.gain == 1.0:
-        assert values["correction slope/radar/all"] == pytest.approx(1.0, abs=0.05)
+    """Whatever R and the gain of the mean."""
+    slope = jacobian_statistics(run(filter_, 4), loaded(filter_, 4))["covariance update//all"]
+    assert slope == pytest.approx(filter_.reduction, abs=0.01)
+
+
+def test_corrections_with_a_covariance_that_is_not_updated_have_a_slope_of_one() -> None:
+    """All gains are those of the predicted covariance; both sensors have a reading at every step."""
+    filter_ = Boat(reduction=0.0)
+    values = jacobian_statistics(run(filter_, 1), loaded(filter_, 1))
+    for key in STD:
+        assert values[f"correction slope/{key}/all"] == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_wrong_sign_in_one_column_shows_in_its_modality() -> None:
