@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType
+from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,10 @@ from torch import Tensor, nn
 
 from beliefscope.filters.external.adapter import Adapter, unchanged
 from beliefscope.filters.external.source_files import file_of, files_with_imports, is_own
+
+
+OF_PROCESS = {"asyncio", "concurrent", "logging", "multiprocessing", "threading"}
+"""Modules whose objects lead to the state of the process, such as all loggers."""
 
 
 def fingerprint(adapter: Adapter) -> str:
@@ -137,6 +141,8 @@ def _items(value: Any) -> Mapping[Any, Any]:
     if isinstance(value, FunctionType):
         defaults = {"defaults": value.__defaults__, "keywords": value.__kwdefaults__}
         return {**inspect.getclosurevars(value).nonlocals, **defaults} if is_own(value) else {}
+    if isinstance(value, ModuleType) or type(value).__module__.partition(".")[0] in OF_PROCESS:
+        return {"class": type(value), "name": getattr(value, "__name__", "")}
     if isinstance(value, type):
         members = {
             name: member for base in reversed(value.__mro__) if is_own(base) for name, member in vars(base).items()

@@ -24,7 +24,8 @@ def file_of(part: Any) -> str | None:
 
 def is_own(part: Any) -> bool:
     """Whether a function or class is the user's: not of Python, an installed package or this package."""
-    return _is_own(part.__module__ or "", file_of(part))
+    module = part.__module__
+    return isinstance(module, str) and _is_own(module, file_of(part))
 
 
 def files_with_imports(parts: Iterable[Any]) -> set[Path]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -174,6 +176,20 @@ def minus(): return local(lambda mean: mean - 1)
     (tmp_path / "sensor_model.py").write_text("def expected(): return 2")
     assert hash_of("held") != hashes[0]
     sys.modules.pop("sensor_model")
+
+
+def test_hash_covers_no_state_of_the_process() -> None:
+    """A filter may hold a module, such as NumPy or PyTorch for its arithmetic, a logger or a lock."""
+
+    class Logging(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.library, self.log, self.stop = torch, logging.getLogger("filter"), threading.Event()
+
+    first = as_external(module := Logging(), "logging", "door").hash
+    logging.getLogger("another").setLevel("DEBUG")
+    module.stop.set()
+    assert first == as_external(module, "logging", "door").hash
 
 
 def test_hash_covers_code_without_a_file() -> None:
