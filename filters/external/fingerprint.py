@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from beliefscope.filters.external.adapter import Adapter, unchanged
 from beliefscope.filters.external.source_files import file_of, files_with_imports, is_own
 
-
 OF_PROCESS = {"asyncio", "concurrent", "logging", "multiprocessing", "threading"}
 """Modules whose objects lead to the state of the process, such as all loggers."""
 
