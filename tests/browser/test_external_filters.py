@@ -78,3 +78,20 @@ def test_wrong_equations_are_the_finding_of_a_filter_without_a_record(
     page.until("() => document.querySelector('#diagnostics').textContent.includes('Updates against')")
     assert (page.state["tab"], page.state["diagnostic"]) == ("diagnostics", "equations")
     page.screenshot("wrong-equations")
+
+
+@pytest.mark.long
+def test_restarts_of_a_failing_filter_are_marked_in_the_timeline(
+    open_page: Any, start_server: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "boats.py").write_text(BOATS)
+    write_dataset(tmp_path / "boats.h5", task(4), [sail(seed).part(0, 40) for seed in range(3)])
+    options = ["--task", f"{tmp_path}/boats.py:TASK", "--data", str(tmp_path / "boats.h5")]
+    page = open_page(url=start_server(*options, "--filter", f"{tmp_path}/boats.py:failing").url)
+    marks = page.page.locator("#marks button")
+    assert marks.count() == 2
+    label = "Step 15 (1.50 s): the filter is restarted at the true state"
+    assert marks.first.get_attribute("aria-label") == label
+    marks.first.click()
+    page.settle(15)
+    page.screenshot("restarts")

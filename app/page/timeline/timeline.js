@@ -134,7 +134,7 @@ export class Timeline {
     this.#trace = trace;
     const all = this.#allSteps;
     this.#window = fitWindow(sameLength ? parseWindow(window, all) : all, all);
-    this.#marks.set([]);
+    this.mark([]);
     this.showRepair(null);
     this.#standalone.show(trace);
     this.#group.show(trace.groups);
@@ -204,11 +204,18 @@ export class Timeline {
   }
 
   /**
-   * Marks events of the trace until the next call or the next trace.
+   * Marks events of the trace until the next call or the next trace, and the restarts of a filter that fails.
    * @param {EventMark[]} events
    */
   mark(events) {
-    this.#marks.set(events);
+    const restarts = this.#trace?.header.failure?.restarts ?? [];
+    const label = 'the filter is restarted at the true state';
+    const marks = restarts.map((step) => ({
+      step,
+      time: this.#trace?.seconds(step) ?? null,
+      label,
+    }));
+    this.#marks.set([...marks, ...events]);
     this.#overview.update();
     if (this.#trace) this.#marks.move(this.#store.state.step);
   }
