@@ -31,18 +31,17 @@ from beliefscope.inspect.diagnosis.cause import (
     Command,
     Diagnosis,
     Evidence,
-    index_ranges,
     matches,
     probability_text,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
+from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnosis.wrong_noise import too_small
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.diagnostics.statistic_kinds import channel_of, label_of, sensor_of
 
 SURE = 0.5
@@ -88,7 +87,7 @@ def healthy(case: Case) -> Diagnosis:
             noise = too_small(case.profile, case.inputs.checkpoint) if nees > 1 else None
             reason, action = (f": {noise.finding}", noise.action) if noise else ("", CONVENTIONS)
             headline = f"Always {overconfident}, even in its healthy record{reason}; {text[:-1]}; try: {action}."
-    if defect := _turned(case) or _wrong_equations(case):
+    if defect := defect_of(case):
         headline = f"{defect}; otherwise {text}"
     return Diagnosis("healthy", False, headline, (), largest, _provenance(case, defect))
 
@@ -98,27 +97,6 @@ def _nees(profile: HealthyProfile) -> float:
     values = profile.statistics.get("nees/fused/all", np.empty(0))
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else 1.0
-
-
-def _turned(case: Case) -> str:
-    """The modalities with innovations of about a full turn, and the episodes; empty if there is none.
-
-    They are wrong in any filter, but a few such episodes are no significant deviation, and the record may have them.
-    """
-    found: dict[str, list[int]] = {}
-    for trace, row in zip(case.traces, case.rows, strict=True):
-        for name in (name for name, value in row.items() if name.startswith("innovation turns/") and value > 0.0):
-            found.setdefault(name.split("/")[1], []).append(trace.episode_index)
-    if not found:
-        return ""
-    names = ", ".join(map(display_name, found))
-    episodes = sorted({episode for group in found.values() for episode in group})
-    return f"Innovations of {names} not wrapped in episode{'s' * (len(episodes) > 1)} {index_ranges(episodes)}"
-
-
-def _wrong_equations(case: Case) -> str:
-    """Wrong equations of an external Kalman filter, whatever the record, which may have them too; empty without any."""
-    return capitalised("; ".join(wrong_equations(case.traces, case.inputs.checkpoint)))
 
 
 def _is_miscalibrated(nees: float) -> bool:
@@ -218,7 +196,7 @@ def conclude(
     masked = is_effect_known and not is_visible(case.by_statistic, effect)
     headline = _headline(affected, candidates, masked, len(case.rows))
     deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
-    return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case, _turned(case)))
+    return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case, turned_text(case)))
 
 
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:

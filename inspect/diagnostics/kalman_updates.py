@@ -18,6 +18,10 @@ SMALLEST_UPDATE = 0.02
 """Smallest update to which an error is relative: in standard deviations, and relative to the variances."""
 
 
+KEPT = 0.05
+"""Largest slope of the reductions of a covariance that is not updated."""
+
+
 @dataclass(frozen=True)
 class Updates:
     """Of J steps with K modalities of m channels.
@@ -46,8 +50,14 @@ def expected_updates(steps: RepeatedSteps) -> Updates:
     update it. The kind and order with the smallest errors count.
     """
     orders = list(_orders(steps.size.shape[2]))
-    results = [_together(steps), *(_in_turn(steps, order, keeps) for keeps in (False, True) for order in orders)]
-    return min(results, key=lambda r: _size(r.covariance_error) + _size(r.correction_error))
+
+    def error(updates: Updates) -> float:
+        return _size(updates.covariance_error) + _size(updates.correction_error)
+
+    best = min([_together(steps), *(_in_turn(steps, order, False) for order in orders)], key=error)
+    if not abs(best.covariance_slope) < KEPT:
+        return best
+    return min([best, *(_in_turn(steps, order, True) for order in orders)], key=error)
 
 
 def correction_slopes(steps: RepeatedSteps, updates: Updates) -> Array:
