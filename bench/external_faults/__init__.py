@@ -1,1 +1,1 @@
-"""Planted faults of external filters and of their data, in four small tasks (docs/diagnose.md)."""
+"""Planted faults of external filters and of their data, in six small tasks (docs/diagnose.md)."""

@@ -1,4 +1,4 @@
-"""What the four tasks share: the description of a fault, a delay, and episodes with a masked sensor."""
+"""What the six tasks share: the description of a fault, angles, a delay, and episodes with a masked sensor."""
 
 from __future__ import annotations
 
@@ -18,11 +18,18 @@ class Fault(NamedTuple):
         where: ``data`` or ``filter``.
         description: with its magnitude.
         accepted: regular expression of the causes that are a correct diagnosis; chosen before the first one.
+        source: public report of the mistake, ``owner/repository#number``; empty for a fault without one.
     """
 
     where: str
     description: str
     accepted: str
+    source: str = ""
+
+
+def wrap(angle: Values) -> Values:
+    """Angles in [-pi, pi), rad."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def hold(values: Values, present: Values) -> Values:

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from external_faults.__main__ import Answer, rank_of, row, totals
+from external_faults.__main__ import TASKS, Answer, rank_of, row, totals
 from external_faults.fault import delay, hold
 
 import beliefscope as bs
@@ -20,7 +20,7 @@ from beliefscope.inspect.diagnosis.cause import Candidate
 from beliefscope.inspect.statistics.measures import nees
 
 STEPS = 80
-TASKS = ("shunter", "kiln", "turbine", "lid")
+REPORTED = ("mower", "shuttle")  # mistakes with a public report
 
 
 @pytest.fixture(params=TASKS)
@@ -37,7 +37,7 @@ def inputs(episode: bs.Episode) -> Mapping[str, np.ndarray]:
 
 @pytest.mark.slow
 def test_filter_is_consistent_and_each_fault_of_it_changes_its_estimates(task: ModuleType) -> None:
-    episode = task.simulate(1, steps=50)
+    episode = task.simulate(4, steps=50)  # the headings pass pi
 
     def run(fault: str) -> bs.Trace:
         torch.manual_seed(0)
@@ -46,14 +46,14 @@ def test_filter_is_consistent_and_each_fault_of_it_changes_its_estimates(task: M
     right = run("")
     assert 0.4 < nees(right)[10:, -1].mean() < 2
     faults = [name for name, fault in task.FAULTS.items() if fault.where == "filter"]
-    assert len(faults) == 7
+    assert len(faults) == (10 if task.TASK.name in REPORTED else 7)
     assert not [name for name in faults if np.array_equal(run(name).estimate_mean, right.estimate_mean)]
 
 
 def test_each_fault_of_the_data_changes_the_episode(task: ModuleType) -> None:
     clean = task.simulate(1, steps=STEPS)
     faults = [name for name, fault in task.FAULTS.items() if fault.where == "data"]
-    assert len(faults) == 5
+    assert len(faults) == (2 if task.TASK.name in REPORTED else 5)
     for name in faults:
         faulty = task.simulate(1, name, steps=STEPS)
         changed = [key for key, values in inputs(clean).items() if not np.array_equal(inputs(faulty)[key], values)]
@@ -72,6 +72,7 @@ def test_accepted_causes_are_in_the_catalog_and_counted(task: ModuleType) -> Non
         answer = Answer(task.TASK.name, name, fault, diagnosis, 1)
         assert f"{fault.where}: 1 of 1 (100 %, 21 to 100 %)" in totals([answer])
         assert row(answer).endswith("| Headline | 1 |")
+        assert re.search(r" \([\w-]+/[\w-]+#\d+\) \|", row(answer)) if task.TASK.name in REPORTED else not fault.source
 
 
 def test_late_and_held_readings() -> None:
