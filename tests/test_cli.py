@@ -328,7 +328,10 @@ def test_a_signal_prints_one_line_and_exits_with_the_code_of_the_shell(
         assert process.stderr is not None
         assert process.stderr.readline().count("%") == 1, "the first line of the progress"
         process.send_signal(number)
-        *_, last = process.stderr.read().splitlines()
+        try:
+            *_, last = process.communicate(timeout=60.0)[1].splitlines()
+        finally:
+            process.kill()
     assert (last, process.returncode) == (line, code)
 
 
