@@ -79,17 +79,17 @@ def _broken_law(case: Case) -> str:
     for law in LAWS:
         if is_weighted and law.kind in OF_UPDATES:
             continue
-        sizes = {}
+        broken = {}
         for name, values in case.profile.statistics.items():
             known = values[np.isfinite(values)]
             if name.split("/")[0] != law.kind or len(known) < MIN_HEALTHY:
                 continue
-            distance = abs(float(np.median(known)) - law.expected)
+            median = float(np.median(known))
+            distance = abs(median - law.expected)
             if distance > max(law.tolerance, PRECISION * float(known.std()) / np.sqrt(len(known))):
-                sizes[name] = distance
-        if sizes:
-            name = max(sizes, key=lambda key: sizes[key])
-            value = float(np.nanmedian(case.profile.statistics[name]))
+                broken[name] = distance, median
+        if broken:
+            name, (_, median) = max(broken.items(), key=lambda item: item[1][0])
             label = label_of(name, case.inputs.checkpoint.task).rstrip(",")
-            return f"{capitalised(label)} is {value:.2g}, in a right filter {law.expected:.0f}"
+            return f"{capitalised(label)} is {median:.2g}, in a right filter {law.expected:.0f}"
     return ""
