@@ -6,11 +6,12 @@ import multiprocessing
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from functools import partial
 from itertools import islice
+from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
 from typing import Any, TypeVar
 
@@ -27,36 +28,65 @@ def run_in_processes(
     """Call ``function`` with each item in ``workers`` processes; yields items and results in the order they finish.
 
     Function, items and results must be picklable. If a process is killed, for example by lack of memory, its item runs
-    again, like all others that the pool was working on. The processes end with this one, and when the generator is
-    closed.
+    again in another one. The processes end with this one, and when the generator is closed.
 
-    Raises what the function raises, and ``BrokenProcessPool`` after ``LOSSES`` losses in a row.
+    Raises what the function raises, and ``ChildProcessError`` after ``LOSSES`` losses in a row.
     """
-    remaining, losses = iter(items), 0
-    queue: list[Item] = []
-    while True:
-        pool = ProcessPoolExecutor(workers, _context(_modules(function)), _start_worker, (function,))
-        running: dict[Future[Result], Item] = {}
-        try:
-            while True:
-                # A short queue, because a lost process loses everything in it; items may be many.
-                queue += islice(remaining, max(0, 2 * workers - len(running) - len(queue)))
-                while queue and len(running) < 2 * workers:
-                    running[pool.submit(_call, queue[0])] = queue[0]
-                    del queue[0]
-                if not running:
-                    return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    result = future.result()
-                    losses = 0
-                    yield running.pop(future), result
-        except BrokenProcessPool:
-            losses += 1
-            if losses == LOSSES:
-                raise
-            queue = [*running.values(), *queue]
-        finally:
-            pool.shutdown(cancel_futures=True)
+    # Pipes, not the threads of a ProcessPoolExecutor: a signal that raises may leave one of its locks locked for ever.
+    context = _context(_modules(function))
+    remaining, queue, losses = iter(items), list[Item](), 0
+    processes, running = dict[Connection, Any](), dict[Connection, Item]()
+    finished: list[tuple[Item, Result]] = []
+    try:
+        while True:
+            queue += islice(remaining, max(0, workers - len(running) - len(queue)))
+            while queue and len(running) < workers:
+                idle = next((each for each in processes if each not in running), None)
+                connection = idle or _start(context, function, processes)
+                running[connection] = queue.pop(0)
+                with suppress(OSError):  # of a lost process: its connection ends without a result
+                    connection.send(running[connection])
+            yield from finished  # while the processes work
+            if not running:
+                return
+            ready = wait(running)
+            finished = []
+            for connection in [each for each in running if each in ready]:
+                item = running.pop(connection)
+                try:
+                    result, error = connection.recv()
+                except (EOFError, OSError):
+                    processes.pop(connection).join()
+                    queue.append(item)
+                    losses += 1
+                    if losses == LOSSES:
+                        raise ChildProcessError(f"{losses} processes in a row were killed") from None
+                    continue
+                if error is not None:
+                    raise error
+                finished.append((item, result))
+                losses = 0
+    except BaseException:
+        for process in processes.values():
+            process.terminate()
+        raise
+    finally:
+        for connection, process in processes.items():
+            connection.close()
+            process.join()
+
+
+def _start(context: Any, function: Callable[[Item], object], processes: dict[Connection, Any]) -> Connection:
+    """Start a process and add it to ``processes``; returns the connection that sends items and receives results."""
+    ours: Connection
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs,))
+    process.start()
+    processes[ours] = process
+    theirs.close()
+    with suppress(OSError):  # of a lost process
+        ours.send(function)
+    return ours
 
 
 def prepare_processes(module: str) -> None:
@@ -95,24 +125,26 @@ def _modules(function: Callable[..., object]) -> set[str]:
     return {getattr(owner, "__module__", __name__)} - {"__main__"}
 
 
-_function: Callable[[Any], Any]
-"""In a worker: the function to call. It is sent once, because it may contain a filter."""
+def _work(connection: Connection) -> None:
+    """In a process: receive a function, and call it with each item that follows until the connection is closed.
 
-
-def _call(item: Any) -> Any:
-    return _function(item)
-
-
-def _start_worker(function: Callable[[Any], Any]) -> None:
-    """Initialize a worker: keep the function, ignore Ctrl-C, and exit when the parent process ends for any reason."""
-    global _function
-    _function = function
+    Ignores Ctrl-C, and exits when the parent process ends for any reason.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, OSError):
+        function = connection.recv()
+        while True:
+            item = connection.recv()
+            try:
+                connection.send((function(item), None))
+            except Exception as error:  # also that of a result that cannot be pickled
+                error.add_note(f"In a process of its own:\n{traceback.format_exc()}")
+                connection.send((None, error))
+
+
+def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    parent.join()
+    os._exit(1)

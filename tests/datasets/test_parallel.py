@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import random
 import signal
 import subprocess
 import sys
-from concurrent.futures.process import BrokenProcessPool
+import threading
 from contextlib import closing
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -37,6 +39,14 @@ def process_of(number: int) -> int:
     return os.getpid()
 
 
+def reciprocal(number: int) -> float:
+    return 1 / number
+
+
+def lock(number: int) -> object:
+    return threading.Lock()
+
+
 def blocked_signals(number: int) -> set[int]:
     return signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
@@ -56,7 +66,7 @@ def test_items_of_killed_processes_run_again(tmp_path: Path) -> None:
 
 def test_fails_if_no_process_survives() -> None:
     assert LOSSES > 1
-    with pytest.raises(BrokenProcessPool):
+    with pytest.raises(ChildProcessError, match=f"{LOSSES} processes in a row were killed"):
         list(run_in_processes(always_killed, range(3), workers=1))
 
 
@@ -86,3 +96,37 @@ def test_processes_end_with_the_generator() -> None:
         _, process = next(results)
     with pytest.raises(ProcessLookupError):
         os.kill(process, 0)
+
+
+def test_keeps_the_traceback_of_the_process() -> None:
+    with pytest.raises(ZeroDivisionError) as caught:
+        list(run_in_processes(reciprocal, [1, 0], workers=2))
+    assert any("in reciprocal" in note for note in caught.value.__notes__)
+
+
+def test_results_that_cannot_be_pickled_are_errors() -> None:
+    with pytest.raises(TypeError, match="pickle"):
+        list(run_in_processes(lock, [0], workers=1))
+
+
+class Interruption(BaseException):
+    """Raised by a signal, as Ctrl-C does."""
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs interval timers")
+def test_signals_at_any_moment_end_the_processes() -> None:
+    def interrupt(*_: object) -> None:
+        raise Interruption
+
+    moments = random.Random(0)
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for _ in range(100):
+            with pytest.raises(Interruption):
+                signal.setitimer(signal.ITIMER_REAL, moments.uniform(0.001, 0.04))
+                for _ in run_in_processes(abs, count(), workers=2):
+                    pass
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert not multiprocessing.active_children()
