@@ -109,6 +109,12 @@ def test_results_that_cannot_be_pickled_are_errors() -> None:
         list(run_in_processes(lock, [0], workers=1))
 
 
+def run_until_interrupted(after: float) -> None:
+    signal.setitimer(signal.ITIMER_REAL, after)
+    for _ in run_in_processes(abs, count(), workers=2):
+        pass
+
+
 class Interruption(BaseException):
     """Raised by a signal, as Ctrl-C does."""
 
@@ -123,9 +129,7 @@ def test_signals_at_any_moment_end_the_processes() -> None:
     try:
         for _ in range(100):
             with pytest.raises(Interruption):
-                signal.setitimer(signal.ITIMER_REAL, moments.uniform(0.001, 0.04))
-                for _ in run_in_processes(abs, count(), workers=2):
-                    pass
+                run_until_interrupted(moments.uniform(0.001, 0.04))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
