@@ -25,6 +25,7 @@ from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.filters.external.ablation import with_only
+from beliefscope.filters.external.adapter import FailedStep
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.sequence import SequenceModel
@@ -67,7 +68,8 @@ class Metrics:
             there are no such steps.
         baselines: name in ``BASELINES`` -> its metrics; None for a filter that cannot run without observations.
         updates: modality -> metrics of its single-modality updates, which start at every step from the fused prior.
-        standalone: modality -> metrics of the filter with the observations of this modality only.
+        standalone: modality -> metrics of the filter with the observations of this modality only; None for an
+            external filter that fails without the others.
         squares: (R, 1 + keys of ``rmse``) of each episode: number of evaluated steps, sums of squared errors.
 
     ``nll``, ``nees`` and ``coverage95`` are NaN, and null in JSON, for an estimator without a covariance.
@@ -82,7 +84,7 @@ class Metrics:
     rmse_after_contact: dict[str, float] = field(default_factory=dict)
     baselines: Mapping[str, Metrics | None] = field(default_factory=dict)
     updates: Mapping[str, Metrics] = field(default_factory=dict)
-    standalone: Mapping[str, Metrics] = field(default_factory=dict)
+    standalone: Mapping[str, Metrics | None] = field(default_factory=dict)
     squares: FloatArray64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def to_dict(self) -> dict[str, Any]:
@@ -94,9 +96,10 @@ class Metrics:
                 document[key] = getattr(self, key)
         if self.baselines:
             document["baselines"] = {name: result and result._errors() for name, result in self.baselines.items()}
-        for key, by_modality in (("updates", self.updates), ("standalone", self.standalone)):
+        by_key: dict[str, Mapping[str, Metrics | None]] = {"updates": {**self.updates}, "standalone": self.standalone}
+        for key, by_modality in by_key.items():
             if by_modality:
-                document[key] = {name: result._errors() for name, result in by_modality.items()}
+                document[key] = {name: result and result._errors() for name, result in by_modality.items()}
         return document
 
     def __str__(self) -> str:
@@ -164,13 +167,14 @@ def evaluate(
         for name, (error, covariance) in results.items():
             pairs = zip(torch.from_numpy(error).unbind(1), torch.from_numpy(covariance).unbind(1), strict=True)
             runs.setdefault(name, {}).update(zip((number for number, *_ in block), pairs, strict=True))
-    pooled = {name: _pool(filter_.task, [by[i] for i in range(len(by))], episodes) for name, by in runs.items()}
+    complete = {name: [by[i] for i in range(len(by))] for name, by in runs.items() if len(by) == len(episodes)}
+    pooled = {name: _pool(filter_.task, by, episodes) for name, by in complete.items()}
     names = filter_.task.modalities if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
     return replace(
         pooled[FILTER],
         baselines={name: pooled.get(name) for name in BASELINES} if baselines else {},
         updates={name: pooled[UPDATE.format(name)] for name in names if UPDATE.format(name) in pooled},
-        standalone={name: pooled[STANDALONE.format(name)] for name in names if STANDALONE.format(name) in pooled},
+        standalone={name: pooled.get(STANDALONE.format(name)) for name in names} if modalities else {},
     )
 
 
@@ -271,7 +275,7 @@ def _external_runs(
     seed: int,
     modalities: bool,
 ) -> dict[str, Run]:
-    """As ``_filter_runs``; covariances are NaN where the filter gives none."""
+    """As ``_filter_runs``; covariances are NaN where the filter gives none. Standalone filters that fail are absent."""
     truth = torch.from_numpy(np.stack([episode.states for episode in episodes], axis=1))
     used = {FILTER: only} | {STANDALONE.format(name): name for name in external.task.modalities if modalities}
     runs = {}
@@ -280,7 +284,12 @@ def _external_runs(
             check_name(f"modality of task {external.task.name!r}", modality, external.task.modalities)
         kept = None if modality is None else (modality,)
         seen = [with_only(episode, kept, external.adapter.absent) for episode in episodes]
-        values, names = external.run(seen, seed, start=start)
+        try:
+            values, names = external.run(seen, seed, start=start)
+        except FailedStep:
+            if run_name == FILTER:
+                raise
+            continue
         runs[run_name] = external_run(external.task, values, truth)
         if run_name == FILTER and modalities and "modality_mean" in values:
             for k, name in enumerate(names):

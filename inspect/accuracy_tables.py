@@ -34,13 +34,13 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
     rows += [(name, _number(metrics[name]), "", "") for name in ("nll", "nees", "coverage95")]
     tables = [Table(title, ("measure", "filter", *metrics["baselines"]), tuple(rows))]
     errors = {
-        label.format(name): metrics[key][name]["rmse"]
+        label.format(name): (metrics[key][name] or {}).get("rmse", {})
         for name in metrics.get("standalone", {})
         for key, label in (("updates", UPDATE), ("standalone", STANDALONE))
         if name in metrics.get(key, {})
     }
     if errors:
-        rows = [(f"rmse {name}", *(_number(rmse[name]) for rmse in errors.values())) for name in metrics["rmse"]]
+        rows = [(f"rmse {name}", *(_number(rmse.get(name)) for rmse in errors.values())) for name in metrics["rmse"]]
         tables.append(Table("Modalities", ("measure", *errors), tuple(rows)))
     return tables
 

@@ -14,10 +14,11 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.evaluate import evaluate
+from beliefscope.filters.evaluate import STANDALONE, evaluate
 from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter, load_external
+from beliefscope.inspect.accuracy_tables import accuracy_tables
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
@@ -99,6 +100,25 @@ def test_standalone_runs_see_one_sensor() -> None:
     assert result.rmse["y_cm"] < result.standalone["speed"].rmse["y_cm"]  # the speed sensor measures vx only
     with pytest.raises(BadInput, match="modality 'lidar' of task 'vehicle' does not exist"):
         evaluate(filter_, [episode], only="lidar")
+
+
+class NeedsGps(vehicle.NumpyKalman):
+    def forward(self, **inputs: Any) -> dict[str, Any]:
+        if np.isnan(inputs["observations"]["gps"]).any():
+            raise ValueError("no position")
+        return super().forward(**inputs)
+
+
+def test_metrics_of_a_filter_that_fails_without_a_sensor() -> None:
+    result = evaluate(external(NeedsGps()), [vehicle.drive(2), vehicle.drive(3, 50)], modalities=True)
+    expected = evaluate(external(vehicle.NumpyKalman()), [vehicle.drive(2), vehicle.drive(3, 50)], modalities=True)
+    assert result.standalone["speed"] is None
+    assert (result.rmse, result.standalone["gps"].rmse) == (expected.rmse, expected.standalone["gps"].rmse)
+    _, table = accuracy_tables("", {**result.to_dict(), "baselines": {}})
+    column = table.columns.index(STANDALONE.format("speed"))
+    assert [row[column] for row in table.rows] == [None] * len(result.rmse)
+    with pytest.raises(BadInput, match="fails at step 0: ValueError: no position"):
+        evaluate(external(NeedsGps()), [vehicle.drive(2)], only="speed")
 
 
 def test_absent_sensors_have_their_mean() -> None:
