@@ -170,6 +170,7 @@ def measure(
         )
         results[f"{blackout:g}"] = result if first is None else replace(result, baselines=first.baselines)
     return {
-        blackout: {"fused": result.to_dict()} | {name: alone.to_dict() for name, alone in result.standalone.items() if alone}
+        blackout: {"fused": result.to_dict()}
+        | {name: alone.to_dict() for name, alone in result.standalone.items() if alone}
         for blackout, result in results.items()
     }
