@@ -47,7 +47,7 @@ class FailureEvent(Reply):
 
 @fields_of(Condition)
 class SliceCondition(Reply):
-    """Values of a covariate: ``low < value <= high`` in its SI unit, either may be None; or a category."""
+    """Values of a covariate: ``low < value <= high`` in its unit for display, either may be None; or a category."""
 
 
 @fields_of(ErrorSlice)

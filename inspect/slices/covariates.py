@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.episode import is_image
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import Task, display_name, display_unit
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
@@ -28,7 +28,7 @@ class StepCovariate:
     """A quantity of each of S steps.
 
     Attributes:
-        name: display name. unit: SI unit, may be empty.
+        name: display name. unit: for display, may be empty.
         values: (S,) numbers, or indices in ``categories``; NaN where it does not exist.
         categories: names of the values; empty for a number. A boolean has the categories ``no`` and ``yes``.
     """
@@ -45,7 +45,7 @@ class EpisodeCovariates:
 
     Attributes:
         index: of the episode. counted: (T,) steps that metrics use.
-        columns: name -> SI unit, values (T',) at the counted steps.
+        columns: name -> unit for display, values (T',) at the counted steps.
     """
 
     index: int
@@ -94,8 +94,8 @@ def _covariate(name: str, unit: str, values: NDArray[Any]) -> StepCovariate | No
 def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:
     """Name, unit and values (T',) of each covariate at the counted steps of a trace."""
     counted, task = measures.counted(trace), trace.task
-    for name, unit, values in _step_columns(trace, task):
-        yield name, (unit, values[counted])
+    for name, (unit, factor), values in _step_columns(trace, task):
+        yield name, (unit, values[counted] if factor == 1.0 else factor * values[counted])
     definition = TASKS.get(task.name, task)  # data files have no units
     units = {
         _name("ingredients", ingredient, parameter): unit
@@ -103,39 +103,49 @@ def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:
         for parameter, unit in drawn.units.items()
     }
     for name, value in _provenance(trace.episode.provenance):
-        yield name, (units.get(name, ""), np.full(int(counted.sum()), value))
+        unit, factor = _conversion(units.get(name, ""))
+        yield name, (unit, np.full(int(counted.sum()), value if factor == 1.0 else factor * value))
 
 
-def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[Any]]]:
-    """Name, unit and values (T,) of the covariates that vary within an episode, and of the truth."""
+def _conversion(unit: str) -> tuple[str, float]:
+    """Unit for display, also of a rate, and the factor from the SI unit."""
+    base, per, rest = unit.partition("/")
+    displayed, factor = display_unit(base)
+    return displayed + per + rest, factor
+
+
+def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, tuple[str, float], NDArray[Any]]]:
+    """Name, unit for display with its factor, and SI values (T,) of the covariates that vary within an episode."""
+    second, no_unit = ("s", 1.0), ("", 1.0)
     episode, times, durations = trace.episode, trace.episode.times, trace.episode.durations
     contact, outage = episode.contact.astype(bool), measures.blackout(trace)
-    yield "time since start", "s", times
+    yield "time since start", second, times
     if "contact" in task.covariates:
-        yield "contact", "", contact
-        yield "contact duration", "s", _duration(contact, durations)
+        yield "contact", no_unit, contact
+        yield "contact duration", second, _duration(contact, durations)
     for name, covariate in task.covariates.items():
         values = episode.group_values(name)
         if name != "contact" and covariate.kind == "continuous":
-            yield display_name(name), covariate.unit, values
+            yield display_name(name), (covariate.unit, 1.0), values  # as in the names of its groups
         elif name != "contact":
             groups = np.array([*covariate.group_names(name), ""], dtype=object)  # the last one: unknown
-            yield display_name(name), "", groups[covariate.group_index(values)]
-    yield "blackout", "", outage
-    yield "outage length", "s", _duration(outage, durations)
+            yield display_name(name), no_unit, groups[covariate.group_index(values)]
+    yield "blackout", no_unit, outage
+    yield "outage length", second, _duration(outage, durations)
     change = task.difference(episode.states, np.concatenate([episode.states[:1], episode.states[:-1]]))
     main = task.main_error
     if main.name == "position":
-        yield "object speed", f"{task.components[main.indices[0]].unit}/s", main.norm(change) / durations
+        yield "object speed", (f"{main.unit}/s", main.factor), main.norm(change) / durations
     for i, component in enumerate(task.components):
-        yield f"true {component.label}", component.unit, episode.states[:, i]
+        unit, factor = component.conversion
+        yield f"true {component.label}", (unit, factor), episode.states[:, i]
         if component.unit == "rad":
-            yield f"{component.label} speed", "rad/s", np.abs(change[:, i]) / durations
+            yield f"{component.label} speed", (f"{unit}/s", factor), np.abs(change[:, i]) / durations
     for key, array in episode.observations.items():
         known = np.maximum.accumulate(episode.present(key))  # there is no reading before the first one
         for name, values in _reading_columns(array):
-            yield f"{display_name(key)} {name}", "", np.where(known, values, np.nan)
-    yield "control magnitude", "", np.linalg.norm(episode.controls, axis=1)
+            yield f"{display_name(key)} {name}", no_unit, np.where(known, values, np.nan)
+    yield "control magnitude", no_unit, np.linalg.norm(episode.controls, axis=1)
 
 
 def _reading_columns(array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
-from beliefscope.datasets.task import display_unit
 from beliefscope.inspect.slices.covariates import StepCovariate
 from beliefscope.inspect.statistics.measures import Array, Mask
 
@@ -56,7 +55,7 @@ class Condition:
     """Values of a covariate: ``low < value <= high``, either end may be None; or a category.
 
     Attributes:
-        covariate, unit: name and SI unit.
+        covariate, unit: name, and unit of ``low`` and ``high``, that for display.
     """
 
     covariate: str
@@ -76,18 +75,10 @@ class Condition:
             yes, no = self.covariate, f"no {self.covariate}"
             switch = {"yes": yes, yes: yes, "no": no, no: no}
             return switch.get(self.category, f"{self.covariate} is {self.category}")
-        unit, factor = _shown(self.unit)
-        low, high = (None if end is None else f"{factor * end:.3g} {unit}".strip() for end in (self.low, self.high))
+        low, high = (None if end is None else f"{end:.3g} {self.unit}".strip() for end in (self.low, self.high))
         if low is None:
             return f"{self.covariate} <= {high}"
         return f"{self.covariate} > {low}" if high is None else f"{low} < {self.covariate} <= {high}"
-
-
-def _shown(unit: str) -> tuple[str, float]:
-    """Unit for display, also of a rate, and the factor from the SI unit."""
-    base, per, rest = unit.partition("/")
-    display, factor = display_unit(base)
-    return display + per + rest, factor
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ import test from 'node:test';
 
 import { conditionText, sliceSentence } from '../../app/page/tabs/slice_table.js';
 
-const CONDITION = { covariate: 'true angle', unit: 'rad', low: null, high: null, category: null };
+const CONDITION = { covariate: 'true angle', unit: 'deg', low: null, high: null, category: null };
 
 test('conditions have the units of the page', () => {
   const text = (change) => conditionText({ ...CONDITION, ...change });
-  assert.equal(text({ low: Math.PI / 8 }), 'true angle >\u00a022.5°');
+  assert.equal(text({ low: 22.5 }), 'true angle >\u00a022.5°');
   assert.equal(
-    text({ high: -0.5, covariate: 'true hinge x', unit: 'm' }),
+    text({ high: -50, covariate: 'true hinge x', unit: 'cm' }),
     'true hinge x ≤\u00a0−50\u00a0cm',
   );
   assert.equal(

@@ -102,6 +102,18 @@ def test_slices_are_searched_over_the_covariates(run: Trace) -> None:
     assert "contact" not in covariates
 
 
+@pytest.mark.parametrize(("half_width", "unit", "factor"), [(0.4, "cm", 100.0), (10.0, "m", 1.0)])
+def test_slices_have_the_units_of_the_page(run: Trace, half_width: float, unit: str, factor: float) -> None:
+    task = replace(TASK, map_half_width=half_width)
+    states = np.arange(2 * STEPS).reshape(STEPS, 2).astype(np.float32)
+    covariates = covariates_of([replace(run, episode=replace(run.episode, task=task, states=states))])
+    (x,) = (covariate for covariate in covariates if covariate.name == "true x")
+    (speed,) = (covariate for covariate in covariates if covariate.name == "object speed")
+    assert (x.unit, speed.unit) == (unit, f"{unit}/s")
+    np.testing.assert_allclose(x.values, factor * states[:, 0])
+    assert speed.values.max() == pytest.approx(factor * np.hypot(2.0, 2.0) / TASK.dt)
+
+
 def by_trace(run: Trace, folder: Path) -> Trace:
     save_trace(run, folder / "run.trace")
     return load_trace(folder / "run.trace")

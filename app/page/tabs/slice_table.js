@@ -8,14 +8,6 @@ import { navigateRows } from '../widgets/row_navigation.js';
 import { markRow } from './event_table.js';
 import { scoreUnit } from './failure_scores.js';
 
-/** Units of the page for those of covariates. @type {Record<string, {unit: string, scale: number}>} */
-const UNITS = {
-  m: { unit: 'cm', scale: 100 },
-  'm/s': { unit: 'cm/s', scale: 100 },
-  rad: { unit: '°', scale: 180 / Math.PI },
-  'rad/s': { unit: '°/s', scale: 180 / Math.PI },
-};
-
 const NO_BREAK = '\u00a0'; // space that keeps a unit on the line of its number
 
 /** @typedef {{slice: FailureSlice, row: HTMLTableRowElement, button: HTMLButtonElement}} SliceRow */
@@ -154,16 +146,12 @@ const factor = (value) => (value === null ? '–' : String(Number(value.toPrecis
  * Describes a condition in units of the page: 1 s < outage length ≤ 2 s, contact, or policy is push.
  * @param {SliceCondition} condition
  */
-export function conditionText({ covariate, unit: siUnit, low, high, category }) {
+export function conditionText({ covariate, unit, low, high, category }) {
   if (category === 'yes') return covariate;
   if (category === 'no') return `no ${covariate}`;
   if (category !== null) return `${covariate} is ${category}`;
-  const { unit, scale } = UNITS[siUnit] ?? { unit: siUnit, scale: 1 };
   const end = (/** @type {number | null} */ value) =>
-    withUnit(short(significant(value === null ? null : scale * value)), unit).replace(
-      ' ',
-      NO_BREAK,
-    );
+    withUnit(short(significant(value)), unit.replace('deg', '°')).replace(' ', NO_BREAK);
   if (high === null) return `${covariate} >${NO_BREAK}${end(low)}`;
   const above = low === null ? '' : `${end(low)}${NO_BREAK}< `;
   return `${above}${covariate} ≤${NO_BREAK}${end(high)}`;

@@ -1744,7 +1744,7 @@ export interface components {
         };
         /**
          * SliceCondition
-         * @description Values of a covariate: ``low < value <= high`` in its SI unit, either may be None; or a category.
+         * @description Values of a covariate: ``low < value <= high`` in its unit for display, either may be None; or a category.
          */
         SliceCondition: {
             /** Covariate */

@@ -61,7 +61,7 @@ def test_constant_covariates_and_names_are_left_out(traces: list[Trace]) -> None
 def test_ingredients_have_the_units_of_their_task(traces: list[Trace]) -> None:
     """Data files do not contain them."""
     covariates = covariates_of(traces)
-    units = {"camera pose turn z": "rad", "image quality blur": "pixels", "puck mass": "kg", "puck friction": ""}
+    units = {"camera pose turn z": "deg", "image quality blur": "pixels", "puck mass": "kg", "puck friction": ""}
     assert {name: column(covariates, name).unit for name in units} == units
     for task in TASKS.values():
         for ingredient in task.ingredients.values():
@@ -71,8 +71,8 @@ def test_ingredients_have_the_units_of_their_task(traces: list[Trace]) -> None:
 def test_conditions_in_words() -> None:
     assert str(Condition("friction", "", low=0.6234)) == "friction > 0.623"
     assert str(Condition("outage length", "s", 1.0, 2.0)) == "1 s < outage length <= 2 s"
-    assert str(Condition("puck radius", "m", low=0.0466)) == "puck radius > 4.66 cm"
-    assert str(Condition("object speed", "m/s", high=0.05)) == "object speed <= 5 cm/s"
+    assert str(Condition("puck radius", "cm", low=4.663)) == "puck radius > 4.66 cm"
+    assert str(Condition("object speed", "cm/s", high=5.0)) == "object speed <= 5 cm/s"
     assert str(Condition("policy", "", category="push")) == "policy is push"
     assert [str(Condition("contact", "", category=c)) for c in ("yes", "no")] == ["contact", "no contact"]
 
