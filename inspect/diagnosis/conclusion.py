@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -35,6 +36,7 @@ from beliefscope.inspect.diagnosis.cause import (
     probability_text,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
+from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
@@ -195,6 +197,9 @@ def conclude(
     effect = (effects or {}).get(candidates[0].cause.name) if sure else None
     masked = is_effect_known and not is_visible(case.by_statistic, effect)
     headline = _headline(affected, candidates, masked, len(case.rows))
+    if candidates and effects is not None and isinstance(case.inputs.checkpoint, ExternalFilter):
+        where = error_condition(affected.traces, case.inputs.checkpoint, candidates[0].cause)
+        candidates = (replace(candidates[0], next=f"{candidates[0].next} {where}".strip()), *candidates[1:])
     deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
     return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case, turned_text(case)))
 
