@@ -21,8 +21,8 @@ from beliefscope.datasets.text import capitalised
 SENSOR_UNITS = {"force": "N", "torque": "N m", "effector_position": "m"}
 """Observation key -> unit of its channels, for sensors that several tasks have."""
 
-DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
-"""SI unit -> unit for display, and the factor."""
+DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi), "1": ("", 1.0)}
+"""SI unit -> unit for display, and the factor; none for the unit 1."""
 
 HALF_WIDTHS = {"m": 0.135, "rad": 0.5}
 """Unit -> default of ``Task.map_half_width``; 1 in other units."""

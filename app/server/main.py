@@ -194,7 +194,12 @@ def serve(
             ws_per_message_deflate=False,  # compression reduces binary messages from 300 to 12 MB/s
             timeout_graceful_shutdown=3,
         )
-        _Server(config, started).run(sockets=[listener])
+        server = _Server(config, started)
+        if threading.current_thread() is threading.main_thread():
+            # uvicorn restores these handlers at its end, and the default ones would end the process before its own end.
+            for number in uvicorn.server.HANDLED_SIGNALS:
+                signal.signal(number, server.handle_exit)
+        server.run(sockets=[listener])
         log.info("stopped", extra={"event": {"url": url}})
 
 

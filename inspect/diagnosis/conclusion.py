@@ -250,7 +250,7 @@ def _is_trainable(checkpoint: ExternalFilter) -> bool:
 def _argument(checkpoint: Checkpoint) -> str:
     """A checkpoint as the value of ``--filter``: the name of a pretrained one, else that of its file, or its source."""
     if isinstance(checkpoint, ExternalFilter):
-        return checkpoint.source
+        return checkpoint.source if ":" in checkpoint.source else "FILE.py:FUNCTION"  # of a filter of Python
     path = checkpoint.path
     return checkpoint.name if path is None or path.parent.resolve() == PRETRAINED.resolve() else path.name
 
@@ -294,7 +294,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     first = candidates[0]
     similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:
-        return f"{first.cause.title} or {_lower(similar[0].cause.title)}, not separable; try: {first.next}"
+        actions = " ".join(dict.fromkeys((first.next, similar[0].next)))
+        return f"{first.cause.title} or {_lower(similar[0].cause.title)}, not separable; try: {actions}"
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"

@@ -83,27 +83,33 @@ def diagnose(
         engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
         progress: called with the completed fraction.
 
-    An external filter that fails at a step is restarted at the true state; the headline says so.
+    An external filter that fails at a step is restarted at the true state, and episodes in which it fails before it can
+    be restarted are left out; the headline says so.
 
-    Raises BadInput without episodes, without a healthy profile or with too small a one, for episodes of another task,
-    and for several workers with an external filter that has no build function.
+    Raises BadInput without episodes, if the filter fails so early in all of them, without a healthy profile or with too
+    small a one, for episodes of another task, and for several workers with an external filter that has no build function.
     """
     report = progress or (lambda fraction: None)
     if not episodes:
         raise BadInput("no episodes to diagnose")
     profile = profile or required_profile(checkpoint)
-    alarm_rate = checked_alarm_rate(profile.episodes, len(episodes), alarm_rate)
+    checked_alarm_rate(profile.episodes, len(episodes), alarm_rate)
     items = list(episodes.items())
     blocks = [items[i : i + BLOCK] for i in range(0, len(items), BLOCK)]
-    observed: dict[int, Observed] = {}
+    observed: dict[int, Observed | FailedStep] = {}
     run = partial(_observed, checkpoint, profile, seed, particles)
     for _, results in run_blocks(run, blocks, engine, workers, lambda share: report(0.6 * share)):
-        observed |= {result[0].episode_index: result for result in results}
-    traces, rows, sensors = zip(*(observed[index] for index in episodes), strict=True)
+        observed |= results
+    failed = {index: result for index in episodes if isinstance(result := observed[index], FailedStep)}
+    if len(failed) == len(episodes):
+        raise failed[items[0][0]]
+    known = [result for index in episodes if not isinstance(result := observed[index], FailedStep)]
+    traces, rows, sensors = zip(*known, strict=True)
+    alarm_rate = checked_alarm_rate(profile.episodes, len(traces), alarm_rate)
     inputs = _run_inputs(checkpoint, traces, particles, profile)
     case = compared(inputs, traces, rows, sensors, profile, alarm_rate)
     diagnosis = _diagnosed(case, seed, base, engine, workers, lambda share: report(0.6 + 0.4 * share))
-    return _with_restarts(diagnosis, traces)
+    return _with_failures(_with_restarts(diagnosis, traces), failed, len(episodes))
 
 
 Observed = tuple[Trace, dict[str, float], dict[str, float]]
@@ -117,23 +123,29 @@ def _observed(
     particles: int,
     block: Sequence[tuple[int, Episode]],
     progress: Progress,
-) -> list[Observed]:
-    episodes = dict(block)
-    observed: list[Observed] = []
-    for trace in _runs(checkpoint, episodes, seed, particles):
-        observed.append((trace, *observe(trace, checkpoint, profile)))
+) -> dict[int, Observed | FailedStep]:
+    """Of the episodes of a block, by index; the error where an external filter fails before it can be restarted."""
+    observed: dict[int, Observed | FailedStep] = {}
+    for index, run in _runs(checkpoint, dict(block), seed, particles):
+        observed[index] = run if isinstance(run, FailedStep) else (run, *observe(run, checkpoint, profile))
         if progress is not None:
             progress(len(observed) / len(block))
     return observed
 
 
-def _runs(checkpoint: Checkpoint, episodes: Mapping[int, Episode], seed: int, particles: int) -> Iterator[Trace]:
-    """The runs of all episodes, of external filters with restarts."""
-    if isinstance(checkpoint, ExternalFilter):
-        for index, episode in episodes.items():
-            yield trace_with_restarts(checkpoint, episode, index, seed, largest=DIVERGED)
-    else:
-        yield from trace_all(checkpoint, episodes, episodes, seed, particles)
+def _runs(
+    checkpoint: Checkpoint, episodes: Mapping[int, Episode], seed: int, particles: int
+) -> Iterator[tuple[int, Trace | FailedStep]]:
+    """Index and run of all episodes, of external filters with restarts."""
+    if not isinstance(checkpoint, ExternalFilter):
+        for trace in trace_all(checkpoint, episodes, episodes, seed, particles):
+            yield trace.episode_index, trace
+        return
+    for index, episode in episodes.items():
+        try:
+            yield index, trace_with_restarts(checkpoint, episode, index, seed, largest=DIVERGED)
+        except FailedStep as error:
+            yield index, error
 
 
 def _with_restarts(diagnosis: Diagnosis, traces: Sequence[Trace]) -> Diagnosis:
@@ -148,13 +160,26 @@ def _with_restarts(diagnosis: Diagnosis, traces: Sequence[Trace]) -> Diagnosis:
     failure, at = settings[index][FAILURE], f"{where} step {lost[index][0]}{of_episode}"
     diverges = failure.endswith((" diverges", " is not finite"))
     text = f"the filter diverges{at}, and is restarted" if diverges else f"the filter is restarted{at}: {failure}"
+    return replace(_failing(diagnosis, text), provenance={**diagnosis.provenance, RESTARTS: lost})
+
+
+def _with_failures(diagnosis: Diagnosis, failed: Mapping[int, FailedStep], count: int) -> Diagnosis:
+    """The diagnosis, whose headline states in how many of all episodes the filter fails before it can be restarted."""
+    if not failed:
+        return diagnosis
+    index = next(iter(failed))
+    text = f"{len(failed)} of {count} episodes are left out, as the filter fails at their start: {failed[index]}"
+    return _failing(diagnosis, f"{text}, of episode {index}")
+
+
+def _failing(diagnosis: Diagnosis, text: str) -> Diagnosis:
+    """The diagnosis of a filter that fails, with a text about it in the headline."""
     headline, state = diagnosis.headline.removesuffix("."), diagnosis.state
     if state == "fault":
-        headline = f"{headline}; {text}"
-    else:  # the failure is all that is certain
-        other = headline.replace("Healthy: ", "otherwise ", 1) if state == "healthy" else headline
-        headline, state = f"{capitalised(text)}; {other[0].lower()}{other[1:]}", "unsure"
-    return replace(diagnosis, state=state, headline=headline, provenance={**diagnosis.provenance, RESTARTS: lost})
+        return replace(diagnosis, headline=f"{headline}; {text}")
+    # the failure is all that is certain
+    other = headline.replace("Healthy: ", "otherwise ", 1) if state == "healthy" else headline
+    return replace(diagnosis, state="unsure", headline=f"{capitalised(text)}; {other[0].lower()}{other[1:]}")
 
 
 def diagnose_traces(

@@ -15,6 +15,9 @@ from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.diagnostics.statistic_kinds import label_of
 
+NOISE_SLOPE, LARGEST_NIS = 0.3, 2.0
+"""Smallest slope of the effect of a control that is noise only, below 0, and the largest NIS of right dynamics."""
+
 PRECISION = 3.0
 """Smallest distance from the expected value in standard errors of the record's mean."""
 
@@ -71,6 +74,16 @@ def _wrong_equations(case: Case) -> str:
     return capitalised("; ".join(wrong_equations(case.traces, case.inputs.checkpoint)))
 
 
+def _may_be_noise(case: Case, name: str, slope: float) -> bool:
+    """Whether the noise of a control can make the slope of its effect smaller than 1: if Q contains its errors.
+
+    The noise of measured controls, such as odometry, has no effect on the state.
+    """
+    nis = case.profile.statistics.get(f"dynamics nis/{name.split('/')[2]}/all", np.empty(0))
+    known = nis[np.isfinite(nis)]
+    return -NOISE_SLOPE <= slope <= 1.0 and len(known) > 0 and float(np.median(known)) < LARGEST_NIS
+
+
 def _broken_law(case: Case) -> str:
     """The first law that the healthy record contradicts, with its largest deviation; empty if there is none."""
     if not isinstance(case.inputs.checkpoint, ExternalFilter):
@@ -86,6 +99,8 @@ def _broken_law(case: Case) -> str:
                 continue
             median = float(np.median(known))
             distance = abs(median - law.expected)
+            if law.kind == "dynamics effect" and _may_be_noise(case, name, median):
+                continue
             if distance > max(law.tolerance, PRECISION * float(known.std()) / np.sqrt(len(known))):
                 broken[name] = distance, median
         if broken:

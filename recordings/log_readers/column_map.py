@@ -24,7 +24,7 @@ ROTATIONS = {"quaternion": (3, 0, 1, 2), "quaternion_wxyz": (0, 1, 2, 3)}
 UNITS = (
     {"mm": ("m", 1e-3)}
     | dict.fromkeys((QUATERNION, *ROTATIONS), ("rad", 1.0))
-    | {display: (unit, 1.0 / factor) for unit, (display, factor) in DISPLAY_UNITS.items()}
+    | {display: (unit, 1.0 / factor) for unit, (display, factor) in DISPLAY_UNITS.items() if display}
 )
 """Unit of a column -> internal unit, and its factor. Others are internal units."""
 

@@ -182,6 +182,25 @@ def test_restarts_are_named_in_comparisons_and_errors() -> None:
     assert errors_of([failing, right]).verdict.startswith(f"{text}1 of 2 runs. ")
 
 
+def test_episodes_in_which_a_filter_fails_at_once_are_left_out() -> None:
+    """The cart of episode 23 is farther from the origin than all others."""
+    episodes = {seed: drive(seed) for seed in range(20, 26)}
+    far = replace(episodes[23], states=episodes[23].states + np.float32(50.0))
+    far = replace(far, observations={key: values + np.float32(50.0) for key, values in far.observations.items()})
+    others = {seed: episode for seed, episode in episodes.items() if seed != 23}
+    for sign, seeds in ((1.0, others), (-1.0, others)):
+        checkpoint = loaded(Kalman(sign, fails_beyond=45.0))
+        expected = diagnose(checkpoint, seeds, profile=profile())
+        result = diagnose(checkpoint, {**episodes, 23: far}, profile=profile())
+        failure = (
+            "1 of 6 episodes are left out, as the filter fails at their start: Kalman fails at step 0: LinAlgError"
+        )
+        assert failure in result.headline
+        assert result.headline.startswith(failure) == (expected.state != "fault")
+        assert [c.cause.name for c in result.causes] == [c.cause.name for c in expected.causes]
+        assert result.provenance["episodes"] == 5
+
+
 def test_a_filter_that_fails_at_once_has_no_diagnosis() -> None:
     with pytest.raises(BadInput, match="Kalman fails at step 0: LinAlgError: Matrix is not positive definite"):
         diagnose(loaded(Kalman(fails_beyond=0.0)), {0: drive(20)}, profile=profile())

@@ -33,6 +33,10 @@ def headline(statistics: dict[str, float], spread: float = 0.01, weighted: bool 
         ({"likelihood offset/near x/all": -0.6}, "Offset of the particles by the likelihood, in their standard dev"),
         ({"absent updates/near/all": 1.0}, "Share of steps without a reading that have a measurement of near is 1, "),
         ({"dynamics effect/control/x": 1.2, "lost weights//all": 0.1}, "Healthy: "),
+        ({"dynamics effect/control/x": 0.1}, "True effect of control"),
+        ({"dynamics effect/control/x": 0.1, "dynamics nis/x/all": 1.1}, "Healthy: "),  # a control that is noise
+        ({"dynamics effect/control/x": 0.1, "dynamics nis/x/all": 9.0}, "True effect of control"),
+        ({"dynamics effect/control/x": -1.0, "dynamics nis/x/all": 1.1}, "True effect of control"),
         ({"dynamics effect/control/x": 0.4, "lost weights//all": 1.0}, "Share of steps without resampling that do"),
     ],
 )
