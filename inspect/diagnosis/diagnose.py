@@ -87,7 +87,7 @@ def diagnose(
     be restarted are left out; the headline says so.
 
     Raises BadInput without episodes, if the filter fails so early in all of them, without a healthy profile or with too
-    small a one, for episodes of another task, and for several workers with an external filter that has no build function.
+    small a one, for episodes of another task, and for several workers with an external filter without build function.
     """
     report = progress or (lambda fraction: None)
     if not episodes:
