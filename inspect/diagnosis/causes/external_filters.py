@@ -238,7 +238,7 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
                 ),
             ),
             f"{JACOBIANS}|dynamics slope/*|measurement function/*|process noise/*|{FILTER}",
-            f"Compare the Jacobian of {name} with finite differences of h: signs, columns, units.",
+            f"Compare the Jacobian of {name} with finite differences of h: signs, columns, units; and its gain's sign.",
         ),
     )
 
@@ -251,8 +251,9 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"updates.{modality}.gain",
             f"Gain of updates with {name} too small",
             (Symptom(f"correction slope/{modality}/*", -1, target="shrunk"),),
-            f"{JACOBIANS}|process noise/*|measurement noise/*|{FILTER}",
+            f"{JACOBIANS}|process noise/*|{FILTER}",
             f"Compare the gain of {name} with P Hᵀ S⁻¹.",
+            raises="measurement noise/*",
         ),
         Cause(
             f"likelihood.{modality}.inverted",

@@ -81,7 +81,10 @@ def _patterns(key: str, *kinds: str) -> str:
 
 
 def _changed_readings(key: str, modality: str) -> list[Cause]:
-    """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio."""
+    """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio.
+
+    A bias of a part of an episode adds to the noise around the mean error.
+    """
     of = partial(_patterns, key)
     delays = ("reading lag", "reading lag scatter")
     scaled = of(*BIASED, *delays, "change", "size", "noise", "reading noise", "reading scatter")
@@ -103,6 +106,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             f"{changed}|{_downstream(modality)}",
             action,
             f"{undo}drop {modality}",
+            raises=of("reading noise") if mechanism == "bias" else "",
         )
         for mechanism, words, symptoms, changed, action, undo in entries
     ]
@@ -215,5 +219,7 @@ def _delays(task: Task) -> tuple[Cause, ...]:
             Symptom(f"reading lag/{key}/*", weight=2.0, optional=True),
         )
         title = f"Sensor {display_name(key)} delayed"
-        result.append(Cause(f"{key}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {key}"))
+        # The readings of a sensor with gaps then jump at other steps than its gaps.
+        noise = _patterns(key, "noise") if key in task.masks else ""
+        result.append(Cause(f"{key}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {key}", raises=noise))
     return tuple(result)

@@ -191,6 +191,13 @@ def test_a_bias_that_is_not_estimated_explains_only_larger_measurement_noise(t: 
     assert (explain(drift, deviations).unexplained == {}) == explained
 
 
+@pytest.mark.parametrize(("t", "explained"), [(5.0, True), (-5.0, False)])
+def test_a_small_gain_explains_only_larger_measurement_noise(t: float, explained: bool) -> None:
+    deviations = [deviation("correction slope/front/all", -5.0), deviation("measurement noise/rear/all", t)]
+    (gain,) = (cause for cause in causes_in(cart(Cart())) if cause.name == "updates.front.gain")
+    assert (explain(gain, deviations).unexplained == {}) == explained
+
+
 @pytest.mark.slow
 def test_predicted_changes_that_are_all_too_small_are_not_broken() -> None:
     record = profile()

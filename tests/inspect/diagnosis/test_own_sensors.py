@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.inspect.diagnosis.test_catalog import deviation
 
 from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
@@ -49,6 +50,22 @@ def test_a_second_sensor_separates_a_moved_camera_from_labels_with_an_offset() -
     labels = ranked(TASK, seen_beside_label("image"), bias("image", 0.1), bias("gps", 0.1))
     assert camera["image.shift"] > 0.8 > 0.25 > camera["labels.offset"]
     assert labels["labels.offset"] > 0.8 > 0.25 > labels["image.shift"]
+
+
+@pytest.mark.parametrize(("noise", "explained"), [(8.0, True), (-8.0, False)])
+def test_a_bias_of_a_part_of_an_episode_adds_to_the_noise(noise: float, explained: bool) -> None:
+    """Around the mean error, which does not become smaller."""
+    values = [deviation("reading bias/gps x/all", 8.0), deviation("reading noise/gps x/all", noise)]
+    (cause,) = (cause for cause in causes_of(TASK) if cause.name == "gps.bias")
+    assert (explain(cause, values).unexplained == {}) == explained
+
+
+@pytest.mark.parametrize("masks", [{}, {"gps": "fix"}])
+def test_a_delay_of_a_sensor_with_gaps_adds_to_its_noise(masks: dict[str, str]) -> None:
+    task = replace(TASK, masks=masks, covariates=dict.fromkeys(masks.values(), CONTACT))
+    values = [deviation("reading lag/gps/all", 16.0), deviation("noise/gps x/extreme", 5.0)]
+    (cause,) = (cause for cause in causes_of(task) if cause.name == "gps.delay")
+    assert (explain(cause, values).unexplained == {}) == bool(masks)
 
 
 def test_with_the_camera_alone_both_remain_probable() -> None:
