@@ -1,14 +1,15 @@
-"""Diagnose planted faults of six external filters and of their data, and count the correct first causes.
+"""Diagnose planted faults of nine external filters and of their data, and count the correct first causes.
 
     python bench/external_faults
     python bench/external_faults kiln lid --cases healthy0 dt_short
     python bench/external_faults mower shuttle
 
-Each task has a simulator, a correct filter and 12 faults: shunter, lid and shuttle are particle filters, kiln, turbine
-and mower extended Kalman filters. The faults of mower and shuttle are the mistakes reported in public, 2 of the data
-and 10 of the filter; those of the other tasks are 5 of the data and 7 of the filter. The healthy record is 60 clean
+Each task has a simulator, a correct filter and 12 or 8 faults. Shunter, lid and shuttle are particle filters; kiln,
+turbine and mower extended Kalman filters; rover is an unscented, river an ensemble and skiff an error-state Kalman
+filter. The faults of mower and shuttle are mistakes reported in public, 2 of the data and 10 of the filter; those of
+the first four tasks are 5 of the data and 7 of the filter, of the last three 3 and 5. The healthy record is 60 clean
 episodes; a case has 10 other ones. A diagnosis is correct if its first cause is one of those accepted for the fault. A
-healthy sample with any other state than healthy is a false alarm. A task takes 2 to 6 min.
+healthy sample with any other state than healthy is a false alarm. A task takes 1 to 6 min.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
 from external_faults.fault import Fault
 
-TASKS = ("shunter", "kiln", "turbine", "lid", "mower", "shuttle")
+TASKS = ("shunter", "kiln", "turbine", "lid", "mower", "shuttle", "rover", "river", "skiff")
 HEALTHY = [f"healthy{k}" for k in range(5)]
 
 

@@ -1,4 +1,4 @@
-"""What the six tasks share: the description of a fault, angles, a delay, and episodes with a masked sensor."""
+"""What the tasks share: the description of a fault, angles, a delay, and episodes with a masked sensor."""
 
 from __future__ import annotations
 

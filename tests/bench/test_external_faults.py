@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from types import ModuleType
 
@@ -15,12 +16,15 @@ from external_faults.__main__ import TASKS, Answer, rank_of, row, totals
 from external_faults.fault import delay, hold
 
 import beliefscope as bs
+from beliefscope.filters.external.adapter import FailedStep
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Candidate
 from beliefscope.inspect.statistics.measures import nees
 
 STEPS = 80
 REPORTED = ("mower", "shuttle")  # mistakes with a public report
+COUNTS = dict.fromkeys(REPORTED, (2, 10)) | dict.fromkeys(("rover", "river", "skiff"), (3, 5))
+"""Numbers of faults of the data and of the filter; 5 and 7 of other tasks."""
 
 
 @pytest.fixture(params=TASKS)
@@ -46,16 +50,18 @@ def test_filter_is_consistent_and_each_fault_of_it_changes_its_estimates(task: M
     right = run("")
     assert 0.4 < nees(right)[10:, -1].mean() < 2
     faults = [name for name, fault in task.FAULTS.items() if fault.where == "filter"]
-    assert len(faults) == (10 if task.TASK.name in REPORTED else 7)
-    assert not [name for name in faults if np.array_equal(run(name).estimate_mean, right.estimate_mean)]
+    assert len(faults) == COUNTS.get(task.TASK.name, (5, 7))[1]
+    for name in faults:
+        with suppress(FailedStep):  # the faulty filter may fail
+            assert not np.array_equal(run(name).estimate_mean, right.estimate_mean), name
 
 
 def test_each_fault_of_the_data_changes_the_episode(task: ModuleType) -> None:
-    clean = task.simulate(1, steps=STEPS)
+    clean = task.simulate(2, steps=STEPS)  # some faults are not in all episodes
     faults = [name for name, fault in task.FAULTS.items() if fault.where == "data"]
-    assert len(faults) == (2 if task.TASK.name in REPORTED else 5)
+    assert len(faults) == COUNTS.get(task.TASK.name, (5, 7))[0]
     for name in faults:
-        faulty = task.simulate(1, name, steps=STEPS)
+        faulty = task.simulate(2, name, steps=STEPS)
         changed = [key for key, values in inputs(clean).items() if not np.array_equal(inputs(faulty)[key], values)]
         assert len(changed) == 1, name
         assert np.array_equal(faulty.states, clean.states)
