@@ -56,13 +56,18 @@ def measurement_model_statistics(
 ) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of measurement functions and, in particle filters, of noise and turns.
 
-    near_truth: with other particles and their likelihoods, which show noise and functions; default: those of the run.
+    near_truth: with values of steps from true states, which show noise and functions of particle filters, and functions
+        of Kalman filters, unless they use earlier readings: those of the run. Default: that run.
     """
     models = [model.with_weak_channels() for model in models]
     offsets = {} if near_truth is None or near_truth is trace else _offsets(near_truth)
     values, turns = _likelihoods(near_truth or trace, models), _turns(trace, models)
     turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
-    return _functions(trace, models) | values | turns | offsets
+    functions = _functions(trace, models)
+    if near_truth is not None and not any(functions[name] for name in functions if name.startswith("late readings/")):
+        near = _functions(near_truth, models)
+        functions |= {name: near[name] for name in near if name.startswith("measurement function/")}
+    return functions | values | turns | offsets
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
@@ -90,11 +95,13 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
 
     ``late readings/MODALITY/all``: by how many readings z is earlier than that of the step.
     """
-    predicted = prediction(trace)
-    if trace.innovation is None or predicted is None or trace.task.rotations:
+    if trace.innovation is None or trace.task.rotations:
         return {}
-    count = len(trace.modalities)
-    means = np.repeat(predicted.mean[:, None], count, axis=1) if trace.predicted_mean is None else trace.predicted_mean
+    count, means = len(trace.modalities), trace.predicted_mean
+    if means is None:
+        if (predicted := prediction(trace)) is None:
+            return {}
+        means = np.repeat(predicted.mean[:, None], count, axis=1)
     keep = counted(trace)
     values: dict[str, float] = {}
     for k in range(count):

@@ -24,7 +24,7 @@ from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
-from beliefscope.inspect.diagnosis.true_starts import with_particles_near_truth
+from beliefscope.inspect.diagnosis.true_starts import with_innovations_near_truth, with_particles_near_truth
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
@@ -61,7 +61,9 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
     has_truth = bool(np.isfinite(trace.episode.states).all())
     if isinstance(checkpoint, ExternalFilter):
         values = reported_particle_statistics(trace) | innovation_statistics(trace) | weight_statistics(trace)
-        near_truth = with_particles_near_truth(trace, checkpoint) if has_truth else trace
+        near_truth = trace
+        if has_truth:
+            near_truth = with_innovations_near_truth(with_particles_near_truth(trace, checkpoint), checkpoint)
         values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)

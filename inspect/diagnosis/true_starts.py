@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -154,18 +155,45 @@ def with_particles_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace
     Particles of a filter that has lost the state are too far from the readings to show its likelihood. Their spread at
     the start is that of the estimates, within limits. The same trace if the steps cannot be run.
     """
-    if trace.particles is None or trace.log_likelihood is None or not has_true_starts(checkpoint):
+    if trace.particles is None or trace.log_likelihood is None:
         return trace
-    if not uses_start(trace, checkpoint):
-        return trace
-    states, counted = trace.episode.states.astype(np.float64), measures.counted(trace)
-    read = (1 + np.flatnonzero((counted & ~measures.absent(trace, m))[1:]) for m in trace.modalities)
-    steps = np.unique(np.concatenate([some_steps(trace, checkpoint), *(_evenly(at, LEAST_STEPS) for at in read)]))
+    states = trace.episode.states.astype(np.float64)
     variance = np.nanmedian(np.diagonal(trace.estimate_covariance, axis1=-2, axis2=-1), axis=0).astype(np.float64)
     largest, smallest = LARGEST_STD * states.std(0), smallest_std(trace)
     std = np.maximum(np.minimum(np.sqrt(np.maximum(np.nan_to_num(variance), 0.0)), largest), smallest)
+    return _near_truth(trace, checkpoint, ("particles", "log_likelihood"), std)
+
+
+def with_innovations_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace:
+    """As ``with_particles_near_truth``, with innovations and the means before and after the updates.
+
+    At other steps these means are the true states: angles are continuous over all steps.
+    """
+    if trace.innovation is None or trace.predicted_mean is None:
+        return trace
+    names = ("innovation", "predicted_mean", "estimate_mean")
+    near = _near_truth(trace, checkpoint, names, smallest_std(trace))
+    predicted, estimate, truth = near.predicted_mean, near.estimate_mean, trace.episode.states
+    if near is trace or predicted is None:
+        return trace
+    return replace(
+        near,
+        predicted_mean=np.where(np.isnan(predicted), truth[:, None], predicted),
+        estimate_mean=np.where(np.isnan(estimate), truth, estimate),
+    )
+
+
+def _near_truth(trace: Trace, checkpoint: ExternalFilter, names: Sequence[str], std: Array) -> Trace:
+    """The trace with values of steps from true states, whose beliefs have standard deviations (n,), NaN at others.
+
+    Of ``some_steps``, and of steps with a reading of each modality.
+    """
+    if not has_true_starts(checkpoint) or not uses_start(trace, checkpoint):
+        return trace
+    counted = measures.counted(trace)
+    read = (1 + np.flatnonzero((counted & ~measures.absent(trace, m))[1:]) for m in trace.modalities)
+    steps = np.unique(np.concatenate([some_steps(trace, checkpoint), *(_evenly(at, LEAST_STEPS) for at in read)]))
     values = run_from_truth(trace, checkpoint, steps, std) if len(steps) else None
-    names = ("particles", "log_likelihood")
     if values is None or any(name not in values for name in names):
         return trace
     filled: dict[str, Any] = {n: np.full((len(trace), *values[n].shape[1:]), np.nan, np.float32) for n in names}

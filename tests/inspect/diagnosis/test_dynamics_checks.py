@@ -25,7 +25,12 @@ from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
 from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
 from beliefscope.inspect.diagnosis.scoring import explain
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts, predictions_from_truth, some_steps
+from beliefscope.inspect.diagnosis.true_starts import (
+    has_true_starts,
+    predictions_from_truth,
+    some_steps,
+    with_innovations_near_truth,
+)
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.healthy import profile_of, sensor_record
 
@@ -232,6 +237,18 @@ def test_the_noise_of_a_filter_that_has_always_been_overconfident_is_named(
     result = diagnose(checkpoint, {seed: episode(seed) for seed in range(40, 43)}, profile=record)
     start = rf"Always overconfident \(median NEES .*\), even in its healthy record: its {finding}"
     assert re.match(start, result.headline), result.headline
+
+
+@pytest.mark.parametrize("boat", [Boat(turn=-1.0), Boat(gain=-1.0), Boat(offset=2.0)])
+def test_innovations_at_true_states_show_the_measurement_functions_only(boat: Boat) -> None:
+    """Whatever the dynamics and updates do: that of the radar's range has an offset of 2 m, with a noise of 0.3 m."""
+    readings = sensor_record([sail(seed) for seed in range(20)]).readings
+    checkpoint = loaded(boat)
+    trace = bs.trace(checkpoint, [sail(30)])
+    values = measurement_model_statistics(trace, readings, with_innovations_near_truth(trace, checkpoint))
+    errors = [values[f"measurement function/{name}/all"] for name in ("radar x", "radar y", "compass")]
+    assert errors[0] == pytest.approx(boat.offset / 0.3, rel=0.1, abs=0.1)
+    assert max(errors[1:]) < 0.1
 
 
 def test_likelihoods_show_the_measurement_model_of_a_filter_that_has_lost_the_state() -> None:
