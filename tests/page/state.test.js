@@ -2,6 +2,7 @@ import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { Store, completeLink, parsePermalink, permalink } from '../../app/page/core/state.js';
+import { addLiveRuns } from '../../app/page/tabs/live_runs.js';
 import { Undo } from '../../app/page/core/undo.js';
 import { history, runFrames } from './browser.js';
 import { CATALOG, TASK } from './fixtures.js';
@@ -35,6 +36,30 @@ test('an address without a task opens the first example', () => {
   const others = ['?task=door', '?filter=crossmodal-pf', '?data=mine'];
   for (const search of others) assert.equal(completeLink(search, catalog), search);
   assert.equal(completeLink('?step=3', { ...CATALOG, examples: [] }), '?step=3');
+});
+
+test('live runs of one filter are all in the catalog', () => {
+  const runs = ['tue', 'mon'].map((name) => ({
+    name,
+    data: `live:${name}`,
+    task: 'rover',
+    filter: 'recorded',
+    kind: 'external',
+    episode: 0,
+    steps: 5,
+    state: 'ended',
+    message: '',
+  }));
+  const rover = { ...TASK, name: 'rover', filters: [], data: [] };
+  const catalog = { ...CATALOG, tasks: [TASK] };
+  addLiveRuns(catalog, /** @type {any} */ ({ runs, tasks: [rover] }));
+  for (const search of ['?task=rover&data=live:mon', '?data=live:mon', '?task=rover']) {
+    const { state, problems } = parsePermalink(completeLink(search, catalog), catalog);
+    assert.deepEqual(problems, []);
+    assert.equal(state.task, 'rover');
+    assert.equal(state.filter, 'recorded');
+    assert.equal(state.data, search.includes('mon') ? 'live:mon' : 'live:tue');
+  }
 });
 
 test('an episode opens at its start, unless it is the first of its data set', () => {

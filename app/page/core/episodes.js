@@ -1,6 +1,6 @@
 /** Episodes of a data set. The catalog lists large data sets in part. */
 
-/** @import { DataSet } from '../types/server.js' */
+/** @import { DataSet, Task } from '../types/server.js' */
 
 /** @param {Pick<DataSet, 'count' | 'episodes'>} set */
 export const isComplete = ({ count, episodes }) => episodes.length === count;
@@ -17,3 +17,17 @@ export function episodeRange(set) {
   const indices = set.episodes.map(({ index }) => index);
   return isComplete(set) ? [Math.min(...indices), Math.max(...indices)] : [0, set.count - 1];
 }
+
+/**
+ * Returns the filters of a task for a data set. A filter that is known only from live runs has only their data.
+ * @param {Task} task
+ * @param {string} data
+ */
+export const filtersOf = (task, data) => task.filters.filter(({ live }) => !live || live === data);
+
+/**
+ * Returns the first data set of a task that has a filter.
+ * @param {Task} task
+ */
+export const firstData = (task) =>
+  task.data.find(({ name }) => filtersOf(task, name).length) ?? task.data[0];

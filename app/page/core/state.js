@@ -5,7 +5,7 @@
 
 import { SCALAR, TRACKS } from '../timeline/tracks.js';
 import { MAP_QUANTITIES, SCENE_CHOICES } from './constants.js';
-import { episodeRange, hasEpisode } from './episodes.js';
+import { episodeRange, filtersOf, firstData, hasEpisode } from './episodes.js';
 import { displayName } from './units.js';
 
 /**
@@ -269,8 +269,8 @@ export function permalink(state) {
 export function parsePermalink(search, catalog) {
   const link = new LinkReader(search);
   const task = link.named('task', catalog.tasks);
-  const data = link.named('data', task.data);
-  const filters = task.filters.filter(({ live }) => !live || live === data.name);
+  const data = link.named('data', task.data, firstData(task).name);
+  const filters = filtersOf(task, data.name);
   const angle = Number(link.query.get('angle') ?? NaN);
   /** @type {Partial<State>} */
   const state = {
@@ -302,15 +302,20 @@ export function parsePermalink(search, catalog) {
 }
 
 /**
- * Completes the query string of an address that names no task by the first example, whose own values yield to those of
- * the address.
+ * Completes the query string of an address that names no task: by the task of the live run that it names, or else by
+ * the first example, whose own values yield to those of the address.
  * @param {string} search query string
  * @param {Catalog} catalog
  */
 export function completeLink(search, { examples, tasks }) {
   const query = new URLSearchParams(search);
+  if (query.has('task')) return search;
+  const owner = tasks.find(({ data }) =>
+    data.some(({ live, name }) => live && name === query.get('data')),
+  );
+  if (owner) return `?${new URLSearchParams([['task', owner.name], ...query])}`;
   const first = examples.find(({ setup }) => !setup);
-  if (query.has('task') || !first) return search;
+  if (!first) return search;
   const link = new URLSearchParams(first.link);
   const task = tasks.find(({ name }) => name === link.get('task'));
   /**

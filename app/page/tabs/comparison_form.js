@@ -6,6 +6,7 @@
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { create, element, html } from '../core/dom.js';
+import { filtersOf } from '../core/episodes.js';
 import { displayName, fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
@@ -108,9 +109,10 @@ export class ComparisonForm {
   show(trace) {
     const isNew = this.#trace?.steps !== trace.steps;
     this.#trace = trace;
-    const { against, filter, task: name, step, faults } = this.#store.state;
+    const { against, data, filter, task: name, step, faults } = this.#store.state;
     const task = this.#catalog.tasks.find((t) => t.name === name);
-    const others = (task?.filters ?? []).map((f) => f.name).filter((other) => other !== filter);
+    const filters = task ? filtersOf(task, data) : [];
+    const others = filters.map((f) => f.name).filter((other) => other !== filter);
     this.#filter.replaceChildren(...others.map((other) => new Option(other, other)));
     this.#only.replaceChildren(
       ...trace.inputs.map((name) => new Option(`${displayName(name)} standalone`, name)),

@@ -5,6 +5,7 @@
 /** @import { Catalog, ListedLiveRun, LiveList } from '../types/server.js' */
 
 import { create, element, html } from '../core/dom.js';
+import { filtersOf } from '../core/episodes.js';
 import { displayName, plural } from '../core/units.js';
 import * as api from '../data/api.js';
 import { liveStatus } from '../data/live_stream.js';
@@ -48,7 +49,7 @@ export function addLiveRuns(catalog, { runs, tasks }) {
       live: run,
       episodes: [{ index: run.episode, steps: run.steps, label }],
     });
-    if (!task.filters.some(({ name }) => name === run.filter))
+    if (!filtersOf(task, run.data).some(({ name }) => name === run.filter))
       task.filters.push({ name: run.filter, kind: run.kind, live: run.data });
   }
 }

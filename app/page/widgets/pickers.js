@@ -5,7 +5,7 @@
 /** @import { FaultDialog } from './fault_dialog.js' */
 
 import { create, element } from '../core/dom.js';
-import { isComplete } from '../core/episodes.js';
+import { filtersOf, firstData, isComplete } from '../core/episodes.js';
 import { SPEEDS } from '../core/state.js';
 import { percent, plural } from '../core/units.js';
 import { checkSelection, episodes } from '../data/api.js';
@@ -64,7 +64,7 @@ export function connectPickers(catalog, store, dialog, findEpisode) {
   /** @param {DataSet} set */
   const switchData = (set) => {
     const filters = filtersOf(currentTask(), set.name);
-    const { name } = byName(filters, filter.value) ?? currentTask().filters[0];
+    const { name } = byName(filters, filter.value) ?? filters[0] ?? currentTask().filters[0];
     return {
       data: set.name,
       filter: name,
@@ -134,13 +134,6 @@ const names = (list) => list.map(({ name }) => [name, name]);
 const selectedLabel = (select) => select.selectedOptions[0]?.label ?? '';
 
 /**
- * Returns the filters of a task for a data set. A filter that is known only from a live run has only that run's data.
- * @param {Task} task
- * @param {string} data
- */
-const filtersOf = (task, data) => task.filters.filter(({ live }) => !live || live === data);
-
-/**
  * Swaps the run and the comparison run if the comparison run is chosen.
  * @param {State} state
  * @param {'filter' | 'faults'} key
@@ -155,11 +148,12 @@ const swapped = (state, key, value) =>
  * @param {State} state
  */
 export function firstRun(task, state) {
-  const [{ name: data, first, first_step: step }] = task.data;
+  const { name: data, first, first_step: step } = firstData(task);
+  const filters = filtersOf(task, data);
   const hasFaults = task.fault_presets.some(({ faults }) => faults === state.faults);
   return {
     task: task.name,
-    filter: (byName(task.filters, state.filter) ?? task.filters[0]).name,
+    filter: (byName(filters, state.filter) ?? filters[0]).name,
     data,
     episode: first,
     faults: hasFaults ? state.faults : '',
