@@ -16,6 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import modalities_of, standalone_evidence
 from beliefscope.inspect.statistics import measures
@@ -41,8 +42,8 @@ def removal_note(checkpoint: Checkpoint) -> str:
 
 
 def standalone_runs(traces: Sequence[Trace], checkpoint: Checkpoint | None) -> dict[str, list[Trace]]:
-    """Modality -> standalone run of each trace; empty for one modality, and without checkpoint."""
-    if checkpoint is None:
+    """Modality -> standalone run of each trace; empty for one modality, and without a filter that can run."""
+    if checkpoint is None or isinstance(checkpoint, UnavailableFilter):
         return {}
     modalities = modalities_of(checkpoint)
     other = any("standalone" in trace.settings or trace.checkpoint_hash != checkpoint.hash for trace in traces)

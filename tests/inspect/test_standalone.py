@@ -18,10 +18,11 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.rollout import rollout
 from beliefscope.filters.subsets import standalone_evidence
-from beliefscope.inspect.standalone import standalone
+from beliefscope.inspect.standalone import standalone, standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import ARRAYS, Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.replay import Intervention, Replay
@@ -159,3 +160,9 @@ def test_unknown_modality_is_rejected_with_the_valid_ones(episode: Episode) -> N
         standalone(checkpoint, run, "touch")
     with pytest.raises(BadInput, match="the trace is from checkpoint 0000"):
         standalone(replace(checkpoint, hash="1" * 64), run, "image")
+
+
+def test_a_filter_that_is_not_available_has_no_standalone_runs(episode: Episode) -> None:
+    recorded = trace(untrained("crossmodal-ekf"), episode)
+    missing = UnavailableFilter(recorded.filter, recorded.checkpoint_hash, recorded.task)
+    assert standalone_runs([recorded], missing) == {}
