@@ -43,7 +43,13 @@ KEYS = ("task", "dt", *NAMES, "control", "state", "sensors", "modalities", "cova
 VALUES = ("mean", "std", "covariance", "particles")
 ESTIMATE = ("filter", *VALUES, "weights")
 
+PLANAR_ELEMENTS = "[0,1,5,6,7,11,30,31,35]"
+"""x, y and yaw in the covariance of x, y, z, roll, pitch and yaw of a ROS message."""
+
 References = str | list[str]
+
+MeanReferences = References | list[str | list[str]]
+"""Columns of a mean: a quaternion may have a list of four."""
 
 
 def base_name(reference: str) -> str:
@@ -51,8 +57,9 @@ def base_name(reference: str) -> str:
     return match[1] if (match := ELEMENTS.fullmatch(reference)) else reference
 
 
-def listed(references: References) -> list[str]:
-    return [references] if isinstance(references, str) else references
+def listed(references: MeanReferences) -> list[str]:
+    parts = [references] if isinstance(references, str) else references
+    return [name for part in parts for name in ([part] if isinstance(part, str) else part)]
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
@@ -199,7 +206,8 @@ def read_map(path: Path) -> ColumnMap:
         raise BadInput(f'[state] of {path.name} has no components, expected one or more: name = "column"')
     names = {key: values.get(key, "") for key in NAMES}
     control = values.get("control", [])
-    lists = [("control", control), *sensors.items(), *((key, estimate[key]) for key in VALUES if key in estimate)]
+    estimated = {key: estimate[key] for key in VALUES if key in estimate} | {"mean": _mean(estimate.get("mean", []))}
+    lists = [("control", control), *sensors.items(), *estimated.items()]
     for key, value in (*names.items(), *lists, *_table(estimate, "weights", path).items()):
         if not isinstance(value, str) and not (_texts(value) and (key, value) in lists):
             raise BadInput(f"{key} in {path.name} is {value!r:.100}, expected the name of a column or a list of names")
@@ -208,6 +216,13 @@ def read_map(path: Path) -> ColumnMap:
     modalities = _modalities(_table(values, "modalities", path), sensors, path)
     columns = {"control": control, "sensors": sensors, "valid": valid, "modalities": modalities}
     return ColumnMap(task, state, dt, covariates=covariates, estimate=estimate, **columns, **names)
+
+
+def _mean(value: Any) -> Any:
+    """A mean with the four columns of each quaternion as entries of their own."""
+    if not isinstance(value, list):
+        return value
+    return [name for part in value for name in (part if _texts(part) and len(part) == 4 else [part])]
 
 
 def _quoting(error: str, text: str) -> str:

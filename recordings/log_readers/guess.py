@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from beliefscope.recordings.log_readers.arrays import Columns
-from beliefscope.recordings.log_readers.column_map import QUATERNION, base_name
+from beliefscope.recordings.log_readers.column_map import PLANAR_ELEMENTS, QUATERNION, base_name
 from beliefscope.recordings.log_readers.messages import Preview
 from beliefscope.recordings.log_readers.table_folder import FILE
 
@@ -35,9 +35,6 @@ CHANNEL = re.compile(r"(.+?)[_.]?(x|y|z|lat|lon|alt|east|north|up|\d+)$", re.I)
 
 DT = 0.1
 """s per step, if the log has no times."""
-
-PLANAR = "[0,1,5,6,7,11,30,31,35]"
-"""x, y and yaw in the covariance of x, y, z, roll, pitch and yaw of a ROS message."""
 
 
 def guess_map(log: Preview, name: str) -> str:
@@ -108,7 +105,7 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
         lines += ["[estimate]", f"mean = {_texts([*poses[estimate].values()])}"]
         covariance = f"{estimate.removesuffix('.pose')}.covariance"
         if covariance in columns and columns[covariance].shape[1:] == (36,):
-            lines.append(f"covariance = {_text(covariance + PLANAR)}  # of x, y and yaw")
+            lines.append(f"covariance = {_text(covariance + PLANAR_ELEMENTS)}  # of x, y and yaw")
     return lines
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.episode import Episode, hold, time_error
 from beliefscope.datasets.errors import BadInput
@@ -21,17 +20,9 @@ from beliefscope.filters.external.derived_values import derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.recordings.log_readers.arrays import Columns
-from beliefscope.recordings.log_readers.column_map import (
-    QUATERNION,
-    ROTATIONS,
-    ColumnMap,
-    CovariateColumn,
-    References,
-    StateColumn,
-    base_name,
-    listed,
-)
+from beliefscope.recordings.log_readers.column_map import ColumnMap, CovariateColumn, base_name, listed
 from beliefscope.recordings.log_readers.columns import column, joined
+from beliefscope.recordings.log_readers.estimate import estimate_values, scalar
 from beliefscope.recordings.log_readers.messages import CLOCK, NEW
 from beliefscope.recordings.log_readers.table_folder import FILE
 
@@ -121,7 +112,7 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
         raise BadInput("the map has no estimate: add [estimate] with mean or particles, or write a data set (.h5)")
     rows, n, episode = sum(map(len, episodes)), len(mapping.components), episodes[index]
     at = list(_episodes(columns, mapping, rows).values())[index]
-    estimate = _estimate(columns, mapping)
+    estimate = estimate_values(columns, mapping)
     for name, array in estimate.items():
         if len(array) != rows:
             raise BadInput(f"{display_name(name)} has {plural(len(array), 'row')} and the state {rows}")
@@ -146,97 +137,10 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
     )
 
 
-def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
-    """(T, ...) values of the recorded estimate by the names of a trace, SI units."""
-    estimate, factors, n = mapping.estimate, mapping.factors, len(mapping.components)
-    values: dict[str, Array] = {}
-    if "mean" in estimate:
-        mean = _mean(columns, estimate["mean"], [*mapping.state.values()])
-        if mean.shape[1] != n:
-            raise BadInput(f"mean of [estimate] has {mean.shape[1]} columns, expected {n}: {_names(mapping)}")
-        values["estimate_mean"] = mean * factors
-    if "covariance" in estimate:
-        covariance = joined(columns, estimate["covariance"], "estimate")
-        if covariance.shape[1] != n * n:
-            raise BadInput(f"covariance of [estimate] has {covariance.shape[1]} numbers per row, expected {n * n}")
-        values["estimate_covariance"] = covariance.reshape(-1, n, n) * factors * factors[:, None]
-        _check_not_negative(covariance[:, :: n + 1], "covariance of [estimate] has the variance")
-    elif "std" in estimate:
-        std = joined(columns, estimate["std"], "estimate")
-        if std.shape[1] != n:
-            raise BadInput(f"std of [estimate] has {std.shape[1]} columns, expected {n}: {_names(mapping)}")
-        _check_not_negative(std, "std of [estimate] has the value")  # squares would hide a sign
-        with np.errstate(invalid="ignore"):  # infinite ones are reported with their row
-            values["estimate_covariance"] = np.square(std * factors)[:, :, None] * np.eye(n)
-    if "particles" in estimate:
-        values["particles"] = _particles(columns, estimate["particles"], n) * factors
-        values["log_weights"] = np.full(values["particles"].shape[:2], -np.log(values["particles"].shape[1]))
-        values.setdefault("estimate_mean", values["particles"].mean(axis=1))
-        values.setdefault("estimate_covariance", _sample_covariance(values["particles"]))
-    if weights := estimate.get("weights"):
-        values["weights"] = joined(columns, list(weights.values()), "weights")[:, :, None]
-    return values
-
-
-def _check_not_negative(values: Array, what: str) -> None:
-    """Raise BadInput for the first row of (T, d) values with a negative one."""
-    if (negative := values < 0.0).any():
-        row = int(np.argwhere(negative)[0][0])
-        raise BadInput(f"{what} {values[negative][0]:g} in row {row}, expected zero or more")
-
-
-def _names(mapping: ColumnMap) -> str:
-    return ", ".join(component.name for component in mapping.components)
-
-
-def _mean(columns: Columns, references: References, state: list[StateColumn]) -> Array:
-    """(T, d) means in the units of the state; quaternions as angles."""
-    references = [references] if isinstance(references, str) and len(state) == 1 else references
-    if isinstance(references, str) or len(references) != len(state):
-        return joined(columns, references, "estimate")
-    pairs = zip(references, state, strict=True)
-    return np.concatenate([_scalar(columns, name, s.unit, "estimate") for name, s in pairs], axis=1)
-
-
-def _particles(columns: Columns, references: References, n: int) -> Array:
-    """(T, M, n): from a column with M n numbers per row, or a column with M numbers for each component."""
-    if isinstance(references, list) and len(references) == n:
-        parts = [joined(columns, name, "estimate") for name in references]
-        if len({part.shape for part in parts}) == 1:
-            return np.stack(parts, axis=-1)
-    particles = joined(columns, references, "estimate")
-    if particles.shape[1] % n:
-        raise BadInput(f"particles of [estimate] have {particles.shape[1]} numbers per row, not a multiple of {n}")
-    return particles.reshape(len(particles), -1, n)
-
-
-def _scalar(columns: Columns, references: References, unit: str, purpose: str) -> Array:
-    """(T, d) values of columns; of a quaternion of any norm, its angle about z (T, 1) or its vector (T, 3), rad."""
-    values = joined(columns, references, purpose)
-    if unit in ROTATIONS:
-        if values.shape[1] != 4:
-            raise BadInput(f"{purpose} has a quaternion of {values.shape[1]} columns, expected 4")
-        norm = np.linalg.norm(values, axis=1, keepdims=True)
-        if len(zero := np.flatnonzero(norm == 0.0)):
-            raise BadInput(f"{purpose} has a quaternion of norm 0 in row {zero[0]}")
-        return rotations.to_vector((values / norm)[:, ROTATIONS[unit]])
-    if unit != QUATERNION or values.shape[1] != 4:
-        return values
-    x, y, z, w = values.T
-    with np.errstate(over="ignore", invalid="ignore"):  # no rotation; NaN is reported with its place
-        return np.arctan2(2.0 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)[:, None]
-
-
-def _sample_covariance(ensemble: Array) -> Array:
-    """(T, n, n): unbiased covariance of the members (T, M, n)."""
-    centred = ensemble - ensemble.mean(axis=1, keepdims=True)
-    return np.einsum("tmi,tmj->tij", centred, centred) / max(ensemble.shape[1] - 1, 1)
-
-
 def _states(columns: Columns, mapping: ColumnMap) -> Array:
     """(T, n) true states, SI units; NaN where they are unknown."""
     states = {
-        name: _scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column
+        name: scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column
     }
     count = len(next(iter((states or columns).values())))
     for name, part in states.items():
