@@ -83,6 +83,9 @@ def _reader(path: Path) -> str:
             "LeRobot or Zarr data, or one table per episode"
         )
     suffix = path.suffix.lower()
+    if suffix == ".bag":
+        command = f"rosbags-convert --src {path.name} --dst {path.stem}"
+        raise BadInput(f"{path.name} is a bag of ROS 1; convert it: pip install rosbags; {command}")
     if suffix not in SUFFIXES:
         raise BadInput(
             f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder"

@@ -16,7 +16,8 @@ from beliefscope.recordings.log_readers.table_folder import FILE
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"(?<![a-z])est|mean|pred|filter|posterior|belief"
 STD = r"std|sigma|\u03c3|(^|_)sd(_|$)"  # \u03c3 is the letter sigma
-POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
+POSE_ESTIMATES = (ESTIMATE + r"|ekf|ukf|amcl|slam|local", r"odom")
+"""Patterns of the names of estimated poses: of filters before odometry, which may be that of the wheels."""
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
 """Part of a column's name that marks a true value."""
@@ -90,7 +91,7 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     truth = next(iter(_named(TRUTH, [*poses])), "")
     state = poses.get(truth, {})
     others = [pose for pose in poses if pose != truth and (not truth or poses[pose].keys() == state.keys())]
-    estimate = next(iter(_named(POSE_ESTIMATE, others)), "")
+    estimate = next((name for pattern in POSE_ESTIMATES for name in _named(pattern, others)), "")
     used = [*state.values(), *poses.get(estimate, {}).values()]
     topics = {_topic(intervals, base_name(reference)) for reference in used}
     references = [

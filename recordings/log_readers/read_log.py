@@ -139,9 +139,7 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
 
 def _states(columns: Columns, mapping: ColumnMap) -> Array:
     """(T, n) true states, SI units; NaN where they are unknown."""
-    states = {
-        name: scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column
-    }
+    states = {name: scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column}
     count = len(next(iter((states or columns).values())))
     for name, part in states.items():
         if part.shape != (expected := (count, mapping.state[name].size)):

@@ -61,5 +61,5 @@ def test_wrong_entries_have_a_hint(tmp_path: Path, old: str, new: str, message: 
 
 
 def test_a_covariance_of_zeros_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="covariance of .estimate. is zero in all rows; remove it from the map"):
+    with pytest.raises(BadInput, match=r"covariance of .estimate. is zero in all rows; remove it from the map"):
         imported(tmp_path, np.zeros((STEPS, 36)))

@@ -1,11 +1,15 @@
-"""First maps of logs whose names are not English."""
+"""First maps: names that are not English, several estimates, and a format without a reader."""
 
 from __future__ import annotations
 
 import tomllib
+from pathlib import Path
 
 import numpy as np
+import pytest
 
+from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.log_readers.columns import preview_columns
 from beliefscope.recordings.log_readers.guess import guess_map
 from beliefscope.recordings.log_readers.messages import Preview
 
@@ -29,3 +33,18 @@ def test_a_guessed_map_keeps_letters_dates_and_texts() -> None:
     assert '# not numbers, for time, episode or [covariates]: ["Zeit", "Fahrt"]' in text
     del columns["timestamp"]
     assert tomllib.loads(guess_map(Preview(columns), "log"))["time"] == "Zeit"
+
+
+def test_the_estimate_of_a_filter_precedes_the_odometry_of_the_wheels() -> None:
+    fields = ("position.x", "position.y", "position.z", *(f"orientation.{axis}" for axis in "xyzw"))
+    poses = ("/wheel/odometry.pose.pose", "/mocap.pose", "/odometry/filtered.pose.pose")
+    columns = {f"{pose}.{field}": np.ones(3) for pose in poses for field in fields}
+    intervals = {"/wheel/odometry": 0.05, "/mocap": 0.01, "/odometry/filtered": 0.03}
+    values = tomllib.loads(guess_map(Preview(columns, intervals), "drive"))
+    assert values["state"]["x"] == "/mocap.pose.position.x"
+    assert values["estimate"]["mean"][0] == "/odometry/filtered.pose.pose.position.x"
+
+
+def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"drive.bag is a bag of ROS 1; convert it: .*--src drive.bag --dst drive"):
+        preview_columns(tmp_path / "drive.bag")
