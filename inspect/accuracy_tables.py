@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.evaluate import STANDALONE, UPDATE
 from beliefscope.inspect.diagnostics.views import Table
 
@@ -41,7 +42,9 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
     }
     if errors:
         rows = [(f"rmse {name}", *(_number(rmse.get(name)) for rmse in errors.values())) for name in metrics["rmse"]]
-        tables.append(Table("Modalities", ("measure", *errors), tuple(rows)))
+        failing = [name for name, alone in metrics["standalone"].items() if alone is None]
+        note = f"The filter fails with {' and with '.join(map(display_name, failing))} only." if failing else ""
+        tables.append(Table("Modalities", ("measure", *errors), tuple(rows), note))
     return tables
 
 

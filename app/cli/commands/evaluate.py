@@ -40,7 +40,6 @@ def evaluate(
       beliefscope evaluate door --filter crossmodal-pf --faults delay=haptics:steps=5 --only haptics
     """
     opt.prepare_workers(engine, workers, "beliefscope.filters.evaluate")
-    from beliefscope.datasets.task import display_name
     from beliefscope.filters.evaluate import evaluate as measure
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.start_offset import StartOffset
@@ -79,9 +78,7 @@ def evaluate(
         "start_offset": dict(offset.lengths),
         **metrics,
     }
-    failing = [display_name(name) for name, alone in metrics.get("standalone", {}).items() if alone is None]
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {plural(len(held_out), 'episode')}"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
-    notes = [removal_note(checkpoint), *(f"The filter fails with {name} only." for name in failing)]
-    text = "\n\n".join([*map(str, accuracy_tables(title, metrics)), *filter(None, notes)])
+    text = "\n\n".join([*map(str, accuracy_tables(title, metrics)), removal_note(checkpoint)]).strip()
     return console.Result(document, text)

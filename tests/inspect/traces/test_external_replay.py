@@ -115,6 +115,7 @@ def test_metrics_of_a_filter_that_fails_without_a_sensor() -> None:
     assert result.standalone["speed"] is None
     assert (result.rmse, result.standalone["gps"].rmse) == (expected.rmse, expected.standalone["gps"].rmse)
     _, table = accuracy_tables("", {**result.to_dict(), "baselines": {}})
+    assert table.note == "The filter fails with speed only."
     column = table.columns.index(STANDALONE.format("speed"))
     assert [row[column] for row in table.rows] == [None] * len(result.rmse)
     with pytest.raises(BadInput, match="fails at step 0: ValueError: no position"):
