@@ -56,7 +56,9 @@ def run_in_processes(
                 try:
                     result, error = connection.recv()
                 except (EOFError, OSError):
-                    processes.pop(connection).join()
+                    lost = processes.pop(connection)
+                    lost.terminate()  # or it cannot be read
+                    lost.join()
                     queue.append(item)
                     losses += 1
                     if losses == LOSSES:

@@ -26,6 +26,12 @@ from beliefscope.inspect.trace import Trace
 SMALLEST_RATIO = 2.0
 """Smallest ratio of the errors of the steps under a condition to those of the others that is mentioned."""
 
+LARGEST_RATIO = 100.0
+"""Ratios from which the text does not state the number."""
+
+EXACT = 1e-3
+"""Largest median of errors relative to their mean that is rounding."""
+
 MIN_STEPS = 100
 """Smallest number of steps that are searched."""
 
@@ -48,10 +54,10 @@ def error_condition(traces: Sequence[Trace], checkpoint: ExternalFilter, cause: 
             own = _innovations(trace, checkpoint, chosen, modality)
         if own is None:
             return ""
-        known = np.isfinite(own).all(-1)
+        known = np.isfinite(own).any(-1)
         errors.append(own[known])
         steps.append(chosen[known])
-    if sum(map(len, steps)) < MIN_STEPS:
+    if len({own.shape[1] for own in errors}) != 1 or sum(map(len, steps)) < MIN_STEPS:
         return ""
     score = _squares(np.concatenate(errors))
     number = np.repeat(np.arange(len(steps)), [len(each) for each in steps])
@@ -62,7 +68,8 @@ def error_condition(traces: Sequence[Trace], checkpoint: ExternalFilter, cause: 
             return ""
         what = "prediction errors" if part == "dynamics" else f"innovations of {display_name(modality)}"
         where = " and ".join(map(str, candidate.conditions))
-        return f"Start with the steps where {where}: their {what} are {ratio:.2g} times those of the other steps."
+        times = f"{ratio:.2g}" if ratio < LARGEST_RATIO else f"more than {LARGEST_RATIO:.0f}"
+        return f"Start with the steps where {where}: their {what} are {times} times those of the other steps."
     return ""
 
 
@@ -82,13 +89,15 @@ def _innovations(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.int
     if values is None or "innovation" not in values or modality not in trace.modalities:
         return None
     own = values["innovation"][:, trace.modalities.index(modality)].astype(np.float64)
-    return np.asarray(own[:, np.isfinite(own).any(0)])
+    return np.asarray(own)
 
 
 def _squares(errors: Array) -> Array:
-    """(S,) sums of squares of errors (S, n), each relative to the median of its size."""
-    sizes = np.median(np.abs(errors), axis=0)
-    return np.asarray(np.square(errors / np.where(sizes > 0.0, sizes, np.inf)).sum(-1))
+    """(S,) sums of squares of errors (S, n), each relative to the median of its size, or to its mean; without NaN."""
+    errors = errors[:, np.isfinite(errors).any(0)]
+    median, mean = np.nanmedian(np.abs(errors), axis=0), np.nanmean(np.abs(errors), axis=0)
+    sizes = np.where(median > EXACT * mean, median, mean)  # without noise, most errors are 0
+    return np.asarray(np.nansum(np.square(errors / np.where(sizes > 0.0, sizes, np.inf)), axis=-1))
 
 
 def _covariates(traces: Sequence[Trace], steps: Sequence[NDArray[np.intp]], before: int) -> Iterator[StepCovariate]:

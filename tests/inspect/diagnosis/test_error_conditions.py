@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,19 @@ def test_the_controls_with_wrong_predictions_are_named() -> None:
     assert found, text
     assert -0.05 < float(found[1]) <= 0.0
     assert float(found[2]) > 2.0
+
+
+def test_the_errors_of_exact_predictions_have_no_number() -> None:
+    """Without process noise, only the faulty steps have errors."""
+    still = []
+    for seed in EPISODES:
+        episode = drive(seed)
+        controls = np.where(episode.controls > 0.02, episode.controls, 0.1).astype(np.float32)
+        controls[episode.controls[:, 0] < -0.02, 0] = -0.1
+        still.append(replace(episode, controls=controls, states=np.cumsum(controls, 0, dtype=np.float32)))
+    traces = [trace(loaded(ForwardOnly()), episode, seed) for seed, episode in zip(EPISODES, still, strict=True)]
+    text = error_condition(traces, loaded(ForwardOnly()), Cause("dynamics.broken", "", (), "", ""))  # type: ignore[arg-type]
+    assert "their prediction errors are more than 100 times those of the other steps." in text
 
 
 def test_the_states_with_wrong_innovations_are_named() -> None:
