@@ -230,6 +230,10 @@ class _Uninitialised(TorchFunctionMode):
 
 
 def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    if "beliefscope-trace" in metadata:
+        raise BadInput(
+            f"{str(path)!r} is the trace of a run, not a filter; `beliefscope inspect`, `report` and `export` read it"
+        )
     if "beliefscope" not in metadata:
         raise BadInput(
             f"{str(path)!r} is a safetensors file, but not a checkpoint of Beliefscope; weights of an external filter "

@@ -130,7 +130,8 @@ def load_trace(path: Path, given: Iterable[Task] = ()) -> Trace:
     """
     path = Path(path)
     if not path.is_file():
-        raise BadInput(f"trace {str(path)!r} does not exist")
+        problem = f"is a folder; give its traces, such as {path}/*.trace" if path.is_dir() else "does not exist"
+        raise BadInput(f"trace {str(path)!r} {problem}")
     try:
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}

@@ -177,6 +177,10 @@ def test_invalid_trace_files(traced: Trace, tmp_path: Path) -> None:
     save_trace(traced, complete)
     with pytest.raises(BadInput, match="does not exist"):
         load_trace(tmp_path / "none.trace")
+    with pytest.raises(BadInput, match=r"is a folder; give its traces, such as .*/\*\.trace$"):
+        load_trace(tmp_path)
+    with pytest.raises(BadInput, match="is the trace of a run, not a filter; `beliefscope inspect`, "):
+        load_checkpoint(complete)
     truncated = tmp_path / "cut.trace"
     truncated.write_bytes(complete.read_bytes()[:-1000])
     with pytest.raises(BadInput, match="not a readable trace"):
