@@ -16,7 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.text import capitalised
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
-from beliefscope.filters.external.adapter import FailedStep
+from beliefscope.filters.external.adapter import MIN_STEPS, FailedStep
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import (
     Case,
@@ -168,8 +168,8 @@ def _with_failures(diagnosis: Diagnosis, failed: Mapping[int, FailedStep], count
     if not failed:
         return diagnosis
     index = next(iter(failed))
-    text = f"{len(failed)} of {count} episodes are left out, as the filter fails at their start: {failed[index]}"
-    return _failing(diagnosis, f"{text}, of episode {index}")
+    where = f"{len(failed)} of {count} episodes are left out, as the filter fails within {MIN_STEPS} steps of a start"
+    return _failing(diagnosis, f"{where}: {failed[index]}, in episode {index}")
 
 
 def _failing(diagnosis: Diagnosis, text: str) -> Diagnosis:
