@@ -94,12 +94,9 @@ class Metrics:
         for key in ("rmse_from_step_0", "rmse_before_contact", "rmse_after_contact"):
             if getattr(self, key):
                 document[key] = getattr(self, key)
-        if self.baselines:
-            document["baselines"] = {name: result and result._errors() for name, result in self.baselines.items()}
-        by_key: dict[str, Mapping[str, Metrics | None]] = {"updates": {**self.updates}, "standalone": self.standalone}
-        for key, by_modality in by_key.items():
-            if by_modality:
-                document[key] = {name: result and result._errors() for name, result in by_modality.items()}
+        for key in ("baselines", "updates", "standalone"):
+            if by_name := getattr(self, key):
+                document[key] = {name: result and result._errors() for name, result in by_name.items()}
         return document
 
     def __str__(self) -> str:

@@ -62,15 +62,17 @@ def error_condition(traces: Sequence[Trace], checkpoint: ExternalFilter, cause: 
     score = _squares(np.concatenate(errors))
     number = np.repeat(np.arange(len(steps)), [len(each) for each in steps])
     columns = _covariates(traces, steps, 1 if part == "dynamics" else 0)
-    for candidate in find_candidates(score, number, [each for each in columns if np.ptp(each.values) > 0.0]):
-        ratio = math.sqrt(score[candidate.steps].mean() / max(score[~candidate.steps].mean(), 1e-12))
-        if ratio < SMALLEST_RATIO:
-            return ""
-        what = "prediction errors" if part == "dynamics" else f"innovations of {display_name(modality)}"
-        where = " and ".join(map(str, candidate.conditions))
-        times = f"{ratio:.2g}" if ratio < LARGEST_RATIO else f"more than {LARGEST_RATIO:.0f}"
-        return f"Start with the steps where {where}: their {what} are {times} times those of the other steps."
-    return ""
+    found = find_candidates(score, number, [each for each in columns if np.ptp(each.values) > 0.0], most=1)
+    if not found:
+        return ""
+    inside = found[0].steps
+    ratio = math.sqrt(score[inside].mean() / max(score[~inside].mean(), 1e-12))
+    if ratio < SMALLEST_RATIO:
+        return ""
+    what = "prediction errors" if part == "dynamics" else f"innovations of {display_name(modality)}"
+    where = " and ".join(map(str, found[0].conditions))
+    times = f"{ratio:.2g}" if ratio < LARGEST_RATIO else f"more than {LARGEST_RATIO:.0f}"
+    return f"Start with the steps where {where}: their {what} are {times} times those of the other steps."
 
 
 def _prediction_errors(trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp]) -> Array | None:

@@ -60,11 +60,13 @@ def measurement_model_statistics(
         of Kalman filters, unless they use earlier readings: those of the run. Default: that run.
     """
     models = [model.with_weak_channels() for model in models]
-    offsets = {} if near_truth is None or near_truth is trace else _offsets(near_truth)
-    values, turns = _likelihoods(near_truth or trace, models), _turns(trace, models)
+    near_truth = near_truth or trace
+    offsets = {} if near_truth is trace else _offsets(near_truth)
+    values, turns = _likelihoods(near_truth, models), _turns(trace, models)
     turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
     functions = _functions(trace, models)
-    if near_truth is not None and not any(functions[name] for name in functions if name.startswith("late readings/")):
+    is_late = any(value for name, value in functions.items() if name.startswith("late readings/"))
+    if near_truth is not trace and not is_late:
         near = _functions(near_truth, models)
         functions |= {name: near[name] for name in near if name.startswith("measurement function/")}
     return functions | values | turns | offsets

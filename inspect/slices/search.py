@@ -98,6 +98,7 @@ def find_candidates(
     alpha: float = ALPHA,
     pairings: int = PAIRINGS,
     seed: int = 0,
+    most: int = MAX_SLICES,
     progress: Callable[[float], None] | None = None,
 ) -> list[Candidate]:
     """Slices whose scores are larger than those of the other steps, in the order of their discovery.
@@ -106,6 +107,7 @@ def find_candidates(
 
     Args:
         score: (S,) of each step, finite. episode: (S,) index of its episode, ascending.
+        most: largest number of slices.
         progress: called with the share done, 0..1.
     """
     families = _families(covariates, episode)
@@ -115,10 +117,10 @@ def find_candidates(
     value = ndtri((order + 0.5) / len(order))
     pairing = random_pairings(episode, pairings, np.random.default_rng(seed))
     result: list[Candidate] = []
-    for stage in range(MAX_SLICES):
+    for stage in range(most):
         best = _test(families, value, pairing, alpha)
         if progress is not None:
-            progress((stage + 1) / MAX_SLICES)
+            progress((stage + 1) / most)
         if best is None:
             break
         family, index, p_value = best
