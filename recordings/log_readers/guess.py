@@ -16,8 +16,13 @@ from beliefscope.recordings.log_readers.table_folder import FILE
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"(?<![a-z])est|mean|pred|filter|posterior|belief"
 STD = r"std|sigma|\u03c3|(^|_)sd(_|$)"  # \u03c3 is the letter sigma
-POSE_ESTIMATES = (ESTIMATE + r"|ekf|ukf|amcl|slam|local", r"odom")
+FILTERS = r"ekf|ukf|amcl|slam|kalman"
+POSE_ESTIMATES = (rf"{ESTIMATE}|{FILTERS}|local", r"odom")
 """Patterns of the names of estimated poses: of filters before odometry, which may be that of the wheels."""
+
+CONTROL = r"(^|[/_.])(actions?|controls?|cmd|commands?)([/_.]|$)|^u_?\d*$"
+VARIANCE = r"^(P|cov|covariance)[_.\[(]?\d"
+"""Pattern of the elements of a covariance in columns of their own."""
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
 """Part of a column's name that marks a true value."""
@@ -56,15 +61,17 @@ def _table(columns: Columns) -> list[str]:
     time = time or dates[:1]
     state = _components(_named(TRUTH, flat), rows, _named(TRUTH, [*rows]))
     std = _named(STD, flat) or [n for n in _named(STD, [*rows]) if rows[n].ndim == 2][:1]
-    mean = [n for n in _named(ESTIMATE, flat) if n not in std] or [
-        n for n in _named(ESTIMATE, [*rows]) if rows[n].ndim == 2 and n not in std
-    ][:1]
+    elements = _named(VARIANCE, flat)
+    mean = next(
+        (named for pattern in (ESTIMATE, FILTERS) if (named := _means(pattern, flat, rows, {*std, *elements}))), []
+    )
     ensemble = _named(r"ensemble|particle|sample", [n for n in rows if rows[n].ndim == 3])[:1]
     square = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]]
     covariance = [n for n in square if rows[n].dtype.kind == "f"][:1]
+    covariance = covariance or (elements if len(elements) == len(mean) ** 2 else [])
     if not mean and not ensemble:  # of an estimate: without it, they are sensors
         std, covariance = [], []
-    control = _named(r"(^|[/_.])(actions?|controls?)([/_.]|$)|^u$", [*columns])[:1]
+    control = _named(CONTROL, flat) or _named(CONTROL, [*rows])[:1]
     flags = [n for n in _named(r"contact|touch", flat) if {*np.unique(columns[n]).tolist()} <= {0, 1}][:1]
     used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control, *flags}
     used |= {n.partition("[")[0] for n in state.values()}
@@ -72,7 +79,7 @@ def _table(columns: Columns) -> list[str]:
     texts = [n for n, values in columns.items() if n not in used and n not in flat and n not in rows and n != FILE]
     lines = [f"time = {_text(time[0])}" if time else f"dt = {DT}  # s per row"]
     lines += [f"episode = {_text(episode[0])}"] if episode else []
-    lines += [f"control = {_text(control[0])}"] if control else []
+    lines += [f"control = {_text(control[0]) if len(control) == 1 else _texts(control)}"] if control else []
     lines += [f"contact = {_text(flags[0])}"] if flags else []
     lines += _sections({component: _value(component, reference) for component, reference in state.items()}, sensors)
     if mean or ensemble:
@@ -97,7 +104,8 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     references = [
         _vector(columns, n) for n in columns if _is_reading(columns, n) and _topic(intervals, n) not in topics
     ]
-    clock = intervals[_topic(intervals, base_name(used[0]))] if used else 0.0
+    steps = [*poses.get(estimate, state).values()]  # the filter's own, rather than those of the true states
+    clock = intervals[_topic(intervals, base_name(steps[0]))] if steps else 0.0
     clock = clock or min((interval for interval in intervals.values() if interval > 0.0), default=DT)
     lines = [f"dt = {clock:.3g}  # s per step of the common clock"]
     values = {_key(component): _component(reference) for component, reference in state.items()}
@@ -171,6 +179,12 @@ def _sections(state: Mapping[str, str], sensors: Mapping[str, str | list[str]]) 
     lines += [f"{_quoted(component)} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
     lines += ["[sensors]  # sensor = column or list of columns; each is a modality unless [modalities] groups them"]
     return lines + [f"{_quoted(key)} = {_text(n) if isinstance(n, str) else _texts(n)}" for key, n in sensors.items()]
+
+
+def _means(pattern: str, flat: Sequence[str], rows: Columns, others: set[str]) -> list[str]:
+    """Columns of an estimate of which ``others`` are deviations: single numbers, or one array (T, n)."""
+    arrays = [name for name in _named(pattern, [*rows]) if rows[name].ndim == 2 and name not in others]
+    return [name for name in _named(pattern, flat) if name not in others] or arrays[:1]
 
 
 def _named(pattern: str, names: Sequence[str]) -> list[str]:

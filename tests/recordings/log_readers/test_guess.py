@@ -43,6 +43,16 @@ def test_the_estimate_of_a_filter_precedes_the_odometry_of_the_wheels() -> None:
     values = tomllib.loads(guess_map(Preview(columns, intervals), "drive"))
     assert values["state"]["x"] == "/mocap.pose.position.x"
     assert values["estimate"]["mean"][0] == "/odometry/filtered.pose.pose.position.x"
+    assert values["dt"] == 0.03
+
+
+def test_a_table_of_a_filter_has_its_estimate_covariance_and_controls() -> None:
+    elements = [f"P{i}{j}" for i in range(2) for j in range(2)]
+    names = ["t", "true_x", "true_yaw", "gps_x", "cmd_v", "cmd_w", "ekf_x", "ekf_yaw", *elements]
+    values = tomllib.loads(guess_map(Preview({name: np.ones(3) for name in names}), "drive"))
+    assert values["control"] == ["cmd_v", "cmd_w"]
+    assert values["sensors"] == {"gps_x": "gps_x"}
+    assert values["estimate"] == {"mean": ["ekf_x", "ekf_yaw"], "covariance": elements}
 
 
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def test_a_guessed_map_imports_the_log(log: Path, tmp_path: Path) -> None:
     """The pose named truth becomes the state, the other one the estimate, the rest sensors; text is left out."""
     text = guess_map(preview_columns(log), log.stem)
     values = tomllib.loads(text)
-    assert values["dt"] == pytest.approx(0.02)
+    assert values["dt"] == pytest.approx(0.03)
     assert values["state"]["yaw"] == {"column": "/truth.pose.pose.orientation", "unit": "quaternion_yaw"}
     assert values["sensors"]["imu_angular_velocity"] == "/imu.angular_velocity"
     assert values["sensors"]["camera_data"] == "/camera.data"
