@@ -24,14 +24,19 @@ def import_(
     output: Path | None = opt.option(
         "RUN.trace|RUN.live|DATA.h5|DIR",
         "Output: a trace, a run for the folder live of a workspace, or a data set; or a folder of traces, one for each "
-        "file.",
+        "file or episode.",
         None,
         "-o",
         "--output",
     ),
     map: Path | None = opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", None, "--map"),
     guess: bool = opt.flag("Print a first map of a log instead of importing it.", "--guess"),
-    episode: int = opt.option("I", "Index of the episode of a log that becomes a trace.", 0, "--episode"),
+    episode: int | None = opt.option(
+        "I",
+        "Index of the episode of a log that becomes a trace. Default: all episodes for a folder, else 0.",
+        None,
+        "--episode",
+    ),
     split: str | None = opt.option(
         "NAME",
         "train, val or test: split of all episodes of a log; auto: of every ten, one for validation and one for "
@@ -45,7 +50,8 @@ def import_(
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
     Of a live run that is in progress or was killed, the complete steps are imported. With a folder as output, each file
-    becomes a trace of the same name in it; files that cannot be imported are reported, and the others are written.
+    becomes a trace of the same name in it, each of several episodes of a log one with its index after the name; files
+    that cannot be imported are reported, and the others are written.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
@@ -82,21 +88,23 @@ def import_(
     check_name("split", split or "test", (*SPLITS, "auto"))
     mapping = None if map is None else read_map(map)
 
-    def import_file(source: Path, output: Path) -> console.Result:
+    def import_file(source: Path, output: Path, chosen: int | None = episode) -> list[console.Result]:
         if source.suffix.lower() in RECORDINGS and mapping is None:
-            return _recording(source, output, split, task)
-        return _log(source, output, mapping, split or "test", episode)
+            return [_recording(source, output, split, task)]
+        return _log(source, output, mapping, split or "test", chosen)
 
     if not output.suffix or output.is_dir():
         return _folder(sources, output, import_file)
     opt.check_output(output, ".trace", ".live", ".h5")
     if len(sources) > 1:
         raise BadInput(f"{len(sources)} files need a folder as output, not {str(output)!r}")
-    return import_file(sources[0], output)
+    return import_file(sources[0], output, episode or 0)[0]
 
 
-def _folder(sources: list[Path], folder: Path, import_file: Callable[[Path, Path], console.Result]) -> console.Result:
-    """Write a trace for each file; report files with errors."""
+def _folder(
+    sources: list[Path], folder: Path, import_file: Callable[[Path, Path], list[console.Result]]
+) -> console.Result:
+    """Write a trace for each file or episode; report files with errors."""
     names = [f"{source.stem}.trace" for source in sources]
     if len(set(names)) < len(names):
         raise BadInput("files need different names, without their suffixes, to become traces of one folder")
@@ -104,19 +112,23 @@ def _folder(sources: list[Path], folder: Path, import_file: Callable[[Path, Path
     opt.check_output(folder / names[0] if folder.is_dir() else folder)
     folder.mkdir(exist_ok=True)
     if len(sources) == 1:
-        return import_file(sources[0], folder / names[0])
+        results = import_file(sources[0], folder / names[0])
+        if len(results) == 1:
+            return results[0]
+        described = [result.described() for result in results]
+        return console.Result({"files": [d for d, _ in described]}, "\n".join(line for _, line in described))
     documents: list[dict[str, Any]] = []
     lines: list[str] = []
     for source, name in zip(sources, names, strict=True):
         try:
-            document, line = import_file(source, folder / name).described()
-            lines.append(line)
+            for document, line in [result.described() for result in import_file(source, folder / name)]:
+                lines.append(line)
+                documents.append({"source": str(source), **document})
         except BadInput as error:
-            document = {"error": str(error)}
+            documents.append({"source": str(source), "error": str(error)})
             console.note(f"error: {source}: {error}")
-        documents.append({"source": str(source), **document})
-    lines.append(f"{len(lines)} of {plural(len(sources), 'file')} imported")
-    failed = any("error" in document for document in documents)
+    failed = sum("error" in document for document in documents)
+    lines.append(f"{len(sources) - failed} of {plural(len(sources), 'file')} imported")
     return console.Result({"files": documents}, "\n".join(lines), code=2 if failed else 0)
 
 
@@ -129,8 +141,10 @@ def _recording(source: Path, output: Path, split: str | None, task: str) -> cons
     return _written(open_recording(source, task), output)
 
 
-def _log(source: Path, output: Path, mapping: ColumnMap | None, split: str, episode: int) -> console.Result:
-    """Write a data set, or a trace of one episode."""
+def _log(
+    source: Path, output: Path, mapping: ColumnMap | None, split: str, episode: int | None
+) -> list[console.Result]:
+    """Write a data set, or the trace of an episode; of every episode, if it is None."""
     from beliefscope.recordings.log_readers.columns import read_columns
     from beliefscope.recordings.log_readers.messages import late_estimates
     from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
@@ -140,14 +154,20 @@ def _log(source: Path, output: Path, mapping: ColumnMap | None, split: str, epis
     columns = read_columns(source, mapping)
     episodes = read_log(columns, mapping, source.name, split)
     if output.suffix == ".h5":
-        return _data_set(episodes, output)
-    if not 0 <= episode < len(episodes):
+        return [_data_set(episodes, output)]
+    if episode is not None and not 0 <= episode < len(episodes):
         raise BadInput(f"episode {episode} does not exist: {source.name} has {plural(len(episodes), 'episode')}")
     if warning := late_estimates(columns, mapping):
         console.note(f"Warning: {source.name}: {warning}")
-    result = _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
-    values, text = _values([episodes[episode]])
-    return replace(result, document={**result.document, **values}, text=f"{result.text}, {text}")
+    results = []
+    for index in range(len(episodes)) if episode is None else [episode]:
+        is_one_of_several = episode is None and len(episodes) > 1
+        path = output.with_stem(f"{output.stem}-{index}") if is_one_of_several else output
+        result = _written(recorded_trace(columns, mapping, episodes, index, source.name), path)
+        values, text = _values([episodes[index]])
+        others = "" if episode is None or len(episodes) == 1 else f"; one of {len(episodes)} episodes (-o DIR: all)"
+        results.append(replace(result, document={**result.document, **values}, text=f"{result.text}, {text}{others}"))
+    return results
 
 
 def _data_set(episodes: list[Episode], output: Path) -> console.Result:

@@ -51,6 +51,16 @@ def test_the_episodes_are_in_the_selected_split(run: Run, log: Path, option: str
     assert load_trace(log.with_name("run.trace")).episode.split == expected
 
 
+def test_a_folder_gets_a_trace_of_each_episode(run: Run, log: Path) -> None:
+    inputs = (log, "--map", log.with_name("map.toml"), "-o")
+    code, output, _ = run("import", *inputs, log.with_name("traces"))
+    traces = [log.with_name("traces") / f"{log.stem}-{i}.trace" for i in range(3)]
+    assert code == 0
+    assert len(output.splitlines()) == 3
+    assert [load_trace(path).episode_index for path in traces] == [0, 1, 2]
+    assert "one of 3 episodes (-o DIR: all)" in run("import", *inputs, log.with_name("run.trace"))[1]
+
+
 def test_a_data_set_is_converted_by_the_name_of_its_own_task(run: Run, log: Path) -> None:
     data, copy = log.with_name("data.h5"), log.with_name("copy.h5")
     assert run("import", log, "--map", log.with_name("map.toml"), "-o", data)[0] == 0
@@ -102,7 +112,7 @@ def test_several_logs_become_a_folder_of_traces_and_a_damaged_one_is_reported(ru
     second, damaged, output = log.with_name("second.npz"), log.with_name("damaged.npz"), log.with_name("traces")
     second.write_bytes(log.read_bytes())
     damaged.write_bytes(log.read_bytes()[:100])
-    code, out, error = run("import", log, damaged, second, "--map", log.with_name("map.toml"), "-o", output)
+    code, out, error = run("import --episode 0", log, damaged, second, "--map", log.with_name("map.toml"), "-o", output)
     assert code == 2
     assert [line.partition(" (")[0] for line in out.splitlines()] == [
         str(output / "log.trace"),
@@ -113,7 +123,7 @@ def test_several_logs_become_a_folder_of_traces_and_a_damaged_one_is_reported(ru
     assert error.count("\n") == 1
     assert {path.name for path in output.iterdir()} == {"log.trace", "second.trace"}
     assert load_trace(output / "second.trace").task.name == "car"
-    code, out, _ = run("import --json -", log, damaged, "--map", log.with_name("map.toml"), "-o", output)
+    code, out, _ = run("import --episode 0 --json -", log, damaged, "--map", log.with_name("map.toml"), "-o", output)
     first, other = json.loads(out)["files"]
     assert (code, first["path"], set(other)) == (2, str(output / "log.trace"), {"source", "error"})
 
