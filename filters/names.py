@@ -15,6 +15,9 @@ from beliefscope.datasets.task_json import difference
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 
+RUNS = (".trace", ".live", ".rrd")
+"""Endings of files with the trace of a run."""
+
 MODELS: dict[str, Literal["each", "all", "one"]] = {
     "crossmodal-ekf": "each",
     "crossmodal-pf": "each",
@@ -130,6 +133,11 @@ def _is_callable(arguments: ast.arguments) -> bool:
 def is_path(text: str) -> bool:
     """Whether the text is the path of a checkpoint rather than a filter name."""
     return text.endswith(".safetensors") or os.sep in text
+
+
+def is_run(text: str) -> bool:
+    """Whether the text is the path of a recorded run, or of a folder of them, rather than a name."""
+    return text.endswith(RUNS) or (Path(text).is_dir() and text not in TASKS)
 
 
 def is_code(text: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, pret
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
+from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import Progress, trace_all
 
 MAX_EPISODES = 120
@@ -99,28 +100,47 @@ def profile_of(
     report = progress or (lambda share: None)
     measured = SENSOR_SHARE if sensors is None else 0.0
     sensors = sensors or sensor_record(episodes, reference, lambda share: report(measured * share))
-    rows: list[dict[str, float]] = []
-    particles = None
+    done = 0
+
+    def runs() -> Iterator[tuple[Trace, Mapping[str, float]]]:
+        nonlocal done
+        for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=on_run):
+            yield trace, sensors.rows[trace.episode_index]
+            done += 1
 
     def on_run(share: float) -> None:
         report(measured + (1.0 - measured) * share)
 
     try:
-        for trace in trace_all(checkpoint, episodes, range(len(episodes)), progress=on_run):
-            own = sensors.rows[trace.episode_index]
-            rows.append(episode_statistics(trace, checkpoint, own, sensors.readings))
-            particles = trace.particle_count
+        return _profile_of_runs(checkpoint, runs(), data, sensors)
     except BadInput as error:
         if not isinstance(checkpoint, ExternalFilter):  # which run together
             raise
-        failed = len(rows) if indices is None else indices[len(rows)]
+        failed = done if indices is None else indices[done]
         advice = "`--profile-filter` measures the record with another version of the filter"
         raise BadInput(f"{error} (healthy episode {failed})", advice) from None
+
+
+def recorded_profile(
+    checkpoint: Checkpoint, traces: Sequence[Trace], data: str, progress: Progress | None = None
+) -> HealthyProfile:
+    """The healthy profile of a filter over its recorded runs of clean episodes, as ``profile_of``."""
+    sensors = sensor_record([trace.episode for trace in traces], progress=progress)
+    return _profile_of_runs(checkpoint, zip(traces, sensors.rows, strict=True), data, sensors)
+
+
+def _profile_of_runs(
+    checkpoint: Checkpoint, runs: Iterable[tuple[Trace, Mapping[str, float]]], data: str, sensors: SensorRecord
+) -> HealthyProfile:
+    """The profile of runs, each with the statistics of its sensors."""
+    rows, lengths, particles = [], [], None
+    for trace, own in runs:
+        rows.append(episode_statistics(trace, checkpoint, own, sensors.readings))
+        lengths.append(len(trace))
+        particles = trace.particle_count
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    lengths = [len(episode) for episode in episodes]
-    steps = (min(lengths), max(lengths))
-    task = checkpoint.task.name
+    steps, task = (min(lengths), max(lengths)), checkpoint.task.name
     return HealthyProfile(data, len(rows), particles, columns, sensors.reference, sensors.readings, steps, task)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from beliefscope.datasets.catalog import load_task
@@ -10,6 +11,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.names import RUNS
 from beliefscope.inspect.trace import Trace, load_trace
 from beliefscope.inspect.traces.live_file import SUFFIX, load_live
 from beliefscope.inspect.traces.provenance import checkpoint_of
@@ -33,6 +35,40 @@ def open_traces(paths: Sequence[Path], filter_: str, task: str = "") -> tuple[li
     """Read traces of one filter, and its checkpoint if available; see ``open_trace`` and ``checkpoint_of``."""
     traces = [open_trace(path, task) for path in paths]
     return traces, checkpoint_of(traces, paths, filter_)
+
+
+def recorded_runs(path: Path) -> list[Trace]:
+    """The runs of a file or folder, by their episodes; in the order of the files if these have the same index.
+
+    Raises BadInput as ``open_trace``, for a folder without runs, and for runs of different filters or tasks.
+    """
+    files = sorted(file for file in path.iterdir() if file.suffix in RUNS) if path.is_dir() else [path]
+    if not files:
+        raise BadInput(f"{path} has no recorded runs, files that end in {', '.join(RUNS)}")
+    traces = [open_trace(file) for file in files]
+    checkpoint_of(traces, files)
+    traces = of_one_task(traces, [str(file) for file in files])
+    if len({trace.episode_index for trace in traces}) < len(traces):
+        return [replace(trace, episode_index=index) for index, trace in enumerate(traces)]
+    return sorted(traces, key=lambda trace: trace.episode_index)
+
+
+def of_one_task(traces: Sequence[Trace], places: Sequence[str]) -> list[Trace]:
+    """The runs with the same definition of their task. Raises BadInput for runs of other tasks. places: for messages.
+
+    An angle wraps in all of them if it does in one: a log shows this only if its values span more than half a turn.
+    """
+    wraps = [any(bools) for bools in zip(*([c.wraps for c in t.task.components] for t in traces), strict=False)]
+
+    def wrapped(task: Task) -> Task:
+        pairs = zip(task.components, wraps, strict=False)
+        return replace(task, components=tuple(replace(component, wraps=wrap) for component, wrap in pairs))
+
+    first = wrapped(traces[0].task)
+    for trace, place in zip(traces, places, strict=True):
+        if other := difference(first, wrapped(trace.task)):
+            raise BadInput(f"{place} is of {other}, not of that of {places[0]}")
+    return [replace(trace, episode=replace(trace.episode, task=first)) for trace in traces]
 
 
 def _open(read: Callable[[Path, Sequence[Task]], Trace], path: Path, name: str) -> Trace:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_origin, get_type_hints
 
 import typer
 from typer.models import ParameterInfo
@@ -197,8 +197,8 @@ OPTIONS: dict[str, Any] = {
 def with_options(command: Callable[..., console.Result | None]) -> Callable[..., None]:
     """The command as typer runs it: prints its result, with option ``--json``.
 
-    The default of a parameter is its description, or a plain value, with a description in ``OPTIONS``. A parameter
-    whose type is a dataclass, such as ``Run``, stands for an option for each of its fields.
+    The default of a parameter is its description, or a plain value, with a description in its type or ``OPTIONS``. A
+    parameter whose type is a dataclass, such as ``Run``, stands for an option for each of its fields.
     """
     hints = get_type_hints(command)
     has_result = hints.pop("return") is console.Result
@@ -207,7 +207,7 @@ def with_options(command: Callable[..., console.Result | None]) -> Callable[...,
     for name, parameter in inspect.signature(command).parameters.items():
         group = groups.get(name)
         parameters += inspect.signature(group).parameters.values() if group else [parameter]
-        hints |= get_type_hints(group) if group else {}
+        hints |= get_type_hints(group, include_extras=True) if group else {}
     if has_result:
         parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None))
         hints["json"] = str | None
@@ -229,7 +229,7 @@ def with_options(command: Callable[..., console.Result | None]) -> Callable[...,
 
 def _described(parameter: inspect.Parameter, type_: Any) -> inspect.Parameter:
     """A parameter in typer's form."""
-    own = isinstance(parameter.default, ParameterInfo)
+    own = isinstance(parameter.default, ParameterInfo) or get_origin(type_) is Annotated
     annotation = type_ if own else Annotated[type_, OPTIONS[parameter.name]]
     return parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=annotation)
 
@@ -282,6 +282,34 @@ class Runs:
         if warning := data_warning(checkpoint, episodes):
             console.note(f"Warning: {warning}")
         return episodes
+
+
+@dataclass(frozen=True)
+class RunsOrRecorded(Runs):
+    """Options of a command that also takes recorded runs, by their path in place of the task."""
+
+    task: Annotated[
+        str,
+        argument(
+            "TASK|RUN.trace|DIR",
+            "Task: a built-in one such as door, or your own as FILE.py:NAME; the name is enough if --data or a "
+            "checkpoint contains the definition. Or a recorded run (.trace, .live or .rrd), or a folder of them.",
+        ),
+    ]
+    filter: str = ""
+
+    def __post_init__(self) -> None:
+        """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
+        if not self.is_recorded:
+            if not self.filter:
+                raise BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
+            super().__post_init__()
+
+    @property
+    def is_recorded(self) -> bool:
+        from beliefscope.filters.names import is_run
+
+        return self.data is None and is_run(self.task)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.causes import (
     data,
@@ -22,6 +23,7 @@ from beliefscope.inspect.diagnosis.causes import (
     particles,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
+from beliefscope.inspect.diagnosis.causes.recorded import RECORDED
 from beliefscope.inspect.diagnosis.true_starts import has_true_starts
 from beliefscope.inspect.statistics.reference_images import HAND
 
@@ -53,6 +55,8 @@ def causes_of(task: Task) -> tuple[Cause, ...]:
 def causes_in(checkpoint: Checkpoint) -> tuple[Cause, ...]:
     """All causes of a filter: those of its task, and those of external filters only."""
     causes = causes_of(checkpoint.task)
+    if isinstance(checkpoint, UnavailableFilter):
+        causes = (*causes, *RECORDED)
     if isinstance(checkpoint, ExternalFilter):
         starts = has_true_starts(checkpoint)
         return tuple(in_predictions(cause, starts) for cause in (*causes, *external_causes(checkpoint.task)))

@@ -14,6 +14,7 @@ from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import capitalised
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.case import (
@@ -244,6 +245,8 @@ def command_line(command: Command, checkpoint: Checkpoint) -> str:
 
 
 def _is_trainable(checkpoint: ExternalFilter) -> bool:
+    if isinstance(checkpoint, UnavailableFilter):
+        return False
     return any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)())
 
 
@@ -316,6 +319,8 @@ def search_action(checkpoint: Checkpoint, count: int, reports: bool = True) -> s
     if count == 1:
         return "Diagnose more episodes, such as all held-out ones."
     external = isinstance(checkpoint, ExternalFilter)
+    if isinstance(checkpoint, UnavailableFilter):
+        return "Diagnose the filter itself, as an external filter (docs/own_filter.md), which shows its equations."
     start = f"{capitalised(CONVENTIONS)}, or search" if external else "Search"
     if external and not reports:
         start = f"Return its predictions and innovations, which show faults of its equations, {CONVENTIONS}, or search"

@@ -8,6 +8,7 @@ import numpy as np
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.cause import Cause, Recovery
 from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs
 from beliefscope.inspect.diagnosis.undo import undo
@@ -22,7 +23,12 @@ from beliefscope.inspect.traces.batch import trace_all
 def replay_without(
     cause: Cause, inputs: RunInputs, deviations: Deviations, seed: int, base: Checkpoint | None = None
 ) -> tuple[str, list[Trace]] | None:
-    """The first intervention that can undo a cause, and traces of the episodes without it, in their order; or None."""
+    """The first intervention that can undo a cause, and traces of the episodes without it, in their order; or None.
+
+    None also for a filter that cannot run again.
+    """
+    if isinstance(inputs.checkpoint, UnavailableFilter):
+        return None
     for name in filter(None, cause.undo.split("|")):
         try:
             changed = undo(name, inputs, deviations, base)

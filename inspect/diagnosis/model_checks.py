@@ -18,6 +18,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
@@ -65,6 +66,9 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
         if has_truth:
             near_truth = with_innovations_near_truth(with_particles_near_truth(trace, checkpoint), checkpoint)
         values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
+        if isinstance(checkpoint, UnavailableFilter):  # of others, its causes are examined
+            variance = np.diagonal(trace.estimate_covariance[measures.counted(trace)], axis1=-2, axis2=-1)
+            values["belief variance//all"] = float(np.log(np.maximum(variance, 1e-24)).mean())
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if has_truth:

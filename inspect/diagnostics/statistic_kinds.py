@@ -56,6 +56,7 @@ KINDS = {
     "updates": ("share of steps with an accepted measurement", False, 0.02),
     "absent updates": ("share of steps without a reading that have a measurement", False, 0.02),
     "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
+    "belief variance": ("mean log-variance of the estimate", False, 0.02),
     "fusion variance": ("log-ratio of the used variance to that of the fusion rule", False, 0.02),
     "fusion mean": ("distance of the estimate from the fusion rule", True, 1.0),
     "estimate mean": ("distance of the estimate from the mean of the particles, in standard deviations,", False, 0.02),

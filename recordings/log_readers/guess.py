@@ -182,7 +182,7 @@ def _sections(state: Mapping[str, str], sensors: Mapping[str, str | list[str]]) 
 
 
 def _means(pattern: str, flat: Sequence[str], rows: Columns, others: set[str]) -> list[str]:
-    """Columns of an estimate of which ``others`` are deviations: single numbers, or one array (T, n)."""
+    """Columns of an estimate: single numbers, or one array (T, n). others: its deviations and covariances."""
     arrays = [name for name in _named(pattern, [*rows]) if rows[name].ndim == 2 and name not in others]
     return [name for name in _named(pattern, flat) if name not in others] or arrays[:1]
 

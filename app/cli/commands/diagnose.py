@@ -22,7 +22,7 @@ ALARM_RATE = (
 
 
 def diagnose(
-    runs: opt.Runs,
+    runs: opt.RunsOrRecorded,
     episode: int | None = opt.option(
         "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
     ),
@@ -31,7 +31,10 @@ def diagnose(
     ),
     alarm_rate: float | None = opt.option("P", ALARM_RATE, None),
     profile_from: Path | None = opt.option(
-        "DATA", "Clean data; the healthy record is measured on their held-out episodes.", None
+        "DATA|DIR",
+        "Clean data; the healthy record is measured on their held-out episodes. Of recorded runs: a folder of healthy "
+        "ones.",
+        None,
     ),
     profile_filter: str | None = opt.option(
         "NAME|CHECKPOINT|FILE.py:FUNCTION", "Filter that runs over --profile-from. Default: --filter.", None
@@ -47,7 +50,8 @@ def diagnose(
     Compares statistics of sensors, labels, modules and the filter with the filter's healthy record (the same statistics
     on clean episodes), ranks the causes that explain all deviations, and confirms them by undoing them. --repair finds
     the shortest interval in which to drop sensors, or with --faults to restore them, so that the episode's largest
-    failure disappears. Details: docs/diagnose.md.
+    failure disappears. In place of the task, a recorded run, or a folder of them, is diagnosed as it is; without its
+    filter, no cause is undone. Details: docs/diagnose.md.
 
     \b
     Examples:
@@ -57,6 +61,7 @@ def diagnose(
       beliefscope diagnose push --filter crossmodal-pf --faults image_occluded=14:from=40:to=60 --repair 142
       beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from door.h5
       beliefscope diagnose door --filter new.py:build --profile-from door.h5 --profile-filter old.py:build
+      beliefscope diagnose traces/today --profile-from traces/healthy
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
     from beliefscope.filters.open_filter import open_filter
@@ -68,6 +73,12 @@ def diagnose(
         raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
     if profile_filter is not None and profile_from is None:
         raise BadInput("--profile-filter needs --profile-from, the clean episodes that it runs over")
+    if runs.is_recorded:
+        if runs.faults or base or profile_filter or repair is not None:
+            raise BadInput(
+                "recorded runs are diagnosed as they are, without --faults, --base, --profile-filter, --repair"
+            )
+        return _of_recordings(runs, episode, alarm_rate, profile_from)
     checkpoint, faults = runs.open()
     correct = checkpoint if profile_filter is None else open_filter(checkpoint.task, profile_filter)
     other = None if base is None else open_filter(checkpoint.task, str(base))
@@ -99,6 +110,57 @@ def diagnose(
         document["repair"] = None if smallest is None else smallest.to_json()
         parts.append(f"Episode {repair} has no failure." if smallest is None else smallest.sentence)
     return console.Result(document, "\n\n".join(parts))
+
+
+def _of_recordings(
+    runs: opt.Runs, episode: int | None, alarm_rate: float | None, healthy: Path | None
+) -> console.Result:
+    """The diagnosis of recorded runs, with a healthy record of other ones or of the filter.
+
+    healthy: runs, or clean data over which the filter runs.
+    """
+    from beliefscope.filters.external.unavailable import UnavailableFilter
+    from beliefscope.filters.names import is_run
+    from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
+    from beliefscope.inspect.healthy import overlap_warning, recorded_profile
+    from beliefscope.inspect.traces.provenance import checkpoint_of
+    from beliefscope.recordings.open_trace import of_one_task, recorded_runs
+
+    traces = recorded_runs(Path(runs.task))
+    clean = recorded_runs(healthy) if healthy and is_run(str(healthy)) else []
+    places = [runs.task] * len(traces) + [str(healthy)] * len(clean)
+    every = of_one_task([*traces, *clean], places)
+    first = every[0]
+    checkpoint = checkpoint_of(every, [Path(place) for place in places], runs.filter)
+    checkpoint = checkpoint or UnavailableFilter(first.filter, first.checkpoint_hash, first.task)
+    traces, clean = every[: len(traces)], every[len(traces) :]
+    if episode is not None:
+        traces = [trace for trace in traces if trace.episode_index == episode]
+        if not traces:
+            raise BadInput(f"{runs.task} has no run of episode {episode}")
+    if clean and (warning := overlap_warning((t.episode for t in clean), (t.episode for t in traces))):
+        console.note(f"Warning: {warning}")
+    if clean:
+        with console.progress("Measuring the healthy record") as advance:
+            profile = recorded_profile(checkpoint, clean, str(healthy), advance)
+    elif isinstance(checkpoint, UnavailableFilter):
+        raise BadInput(
+            "recorded runs need a healthy record: give a folder of at least 10 recorded runs without a fault, "
+            "--profile-from DIR, or the filter of the runs, --filter"
+        )
+    else:
+        profile = _profile(checkpoint, healthy, len(traces), alarm_rate, [trace.episode for trace in traces])
+    with console.progress("Diagnosing") as advance:
+        result = diagnose_traces(
+            checkpoint,
+            traces,
+            seed=runs.seed,
+            particles=runs.particles,
+            alarm_rate=alarm_rate,
+            profile=profile,
+            progress=advance,
+        )
+    return console.Result(result.to_json(), "\n\n".join([result.headline, *map(str, result.tables())]))
 
 
 def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:

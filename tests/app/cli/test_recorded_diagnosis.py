@@ -1,0 +1,114 @@
+"""``beliefscope diagnose`` of recorded runs, whose filter is not available."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.slow
+
+Run = Callable[..., tuple[int, str, str]]
+
+MAP = """
+task = "tram"
+dt = 0.1
+episode = "episode"
+control = "speed"
+[state]
+x = "x"
+[sensors]
+odometer = "odometer"
+beacon = "beacon"
+[estimate]
+mean = ["mean"]
+std = ["std"]
+"""
+
+STEPS = 100
+
+
+def logs(
+    count: int, seed: int, bias: float = 0.0, noise: float = 0.1, speed_gain: float = 1.0
+) -> dict[str, np.ndarray]:
+    """A Kalman filter of a tram on a line with an odometer (standard deviation 0.1 m) and a beacon (0.2 m).
+
+    Args:
+        bias: of the beacon, m. noise: of the dynamics that the filter assumes, m. speed_gain: of the filter.
+    """
+    rng = np.random.default_rng(seed)
+    rows: dict[str, list[float]] = {k: [] for k in ("episode", "speed", "x", "odometer", "beacon", "mean", "std")}
+    for episode in range(count):
+        x, mean, variance, phase = 0.0, 0.0, 0.01, rng.uniform(0.0, 6.0)
+        for step in range(STEPS):
+            speed = 5.0 * np.sin(0.1 * step + phase)
+            x += 0.1 * speed + rng.normal(0.0, 0.1)
+            readings = {"odometer": x + rng.normal(0.0, 0.1), "beacon": x + bias + rng.normal(0.0, 0.2)}
+            mean, variance = mean + 0.1 * speed_gain * speed, variance + noise**2
+            for reading, r in zip(readings.values(), (0.1, 0.2), strict=True):
+                gain = variance / (variance + r**2)
+                mean, variance = mean + gain * (reading - mean), (1.0 - gain) * variance
+            values = {"episode": episode, "speed": speed, "x": x, **readings, "mean": mean, "std": np.sqrt(variance)}
+            for name, value in values.items():
+                rows[name].append(value)
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of logs and their map."""
+    folder = tmp_path_factory.mktemp("tram")
+    (folder / "map.toml").write_text(MAP)
+    np.savez(folder / "clean.npz", **logs(30, 1))
+    np.savez(folder / "again.npz", **logs(6, 2))
+    np.savez(folder / "biased.npz", **logs(6, 3, bias=0.5))
+    np.savez(folder / "sure.npz", **logs(6, 4, noise=0.01))
+    np.savez(folder / "wrong.npz", **logs(6, 5, speed_gain=0.5))
+    return folder
+
+
+@pytest.fixture
+def diagnose(run: Run, recordings: Path) -> Callable[[str], str]:
+    """Headline of the diagnosis of a log, with the clean one as healthy record."""
+
+    def headline(name: str) -> str:
+        for log in (name, "clean"):
+            if not (recordings / log).is_dir():
+                path, mapping = recordings / f"{log}.npz", recordings / "map.toml"
+                assert run("import", path, "--map", mapping, "-o", recordings / log)[0] == 0
+        code, output, error = run("diagnose", recordings / name, "--profile-from", recordings / "clean")
+        assert code == 0, error
+        return output.splitlines()[0]
+
+    return headline
+
+
+@pytest.mark.parametrize(
+    ("name", "headline"),
+    [
+        ("again", "Healthy: "),
+        ("biased", "Sensor beacon biased, "),
+        ("sure", "Covariance of the filter too small, "),
+        ("wrong", "Filter changed while its readings are healthy, "),
+    ],
+)
+def test_a_fault_of_recorded_runs_is_named(diagnose: Callable[[str], str], name: str, headline: str) -> None:
+    assert diagnose(name).startswith(headline)
+
+
+def test_recorded_runs_need_healthy_ones(run: Run, diagnose: Callable[[str], str], recordings: Path) -> None:
+    diagnose("again")
+    code, _, error = run("diagnose", recordings / "again")
+    assert code == 2
+    assert "recorded runs need a healthy record: give a folder of at least 10 recorded runs without a fault" in error
+    code, _, error = run("diagnose --repair 0", recordings / "again", "--profile-from", recordings / "clean")
+    assert code == 2
+    assert "recorded runs are diagnosed as they are" in error
+
+
+def test_a_task_needs_a_filter(run: Run) -> None:
+    code, _, error = run("diagnose door")
+    assert code == 2
+    assert error == "error: --filter is missing: the filter that runs over the episodes of task door\n"
