@@ -285,34 +285,6 @@ class Runs:
 
 
 @dataclass(frozen=True)
-class RunsOrRecorded(Runs):
-    """Options of a command that also takes recorded runs, by their path in place of the task."""
-
-    task: Annotated[
-        str,
-        argument(
-            "TASK|RUN.trace|DIR",
-            "Task: a built-in one such as door, or your own as FILE.py:NAME; the name is enough if --data or a "
-            "checkpoint contains the definition. Or a recorded run (.trace, .live or .rrd), or a folder of them.",
-        ),
-    ]
-    filter: str = ""
-
-    def __post_init__(self) -> None:
-        """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
-        if not self.is_recorded:
-            if not self.filter:
-                raise BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
-            super().__post_init__()
-
-    @property
-    def is_recorded(self) -> bool:
-        from beliefscope.filters.names import is_run
-
-        return self.data is None and is_run(self.task)
-
-
-@dataclass(frozen=True)
 class Run(Runs):
     """Options of a command that runs a filter over one episode."""
 

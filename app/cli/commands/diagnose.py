@@ -3,8 +3,9 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
@@ -21,8 +22,36 @@ ALARM_RATE = (
 )
 
 
+@dataclass(frozen=True)
+class RunsOrRecorded(opt.Runs):
+    """Options of a command that also takes recorded runs, by their path in place of the task."""
+
+    task: Annotated[
+        str,
+        opt.argument(
+            "TASK|RUN.trace|DIR",
+            "Task: a built-in one such as door, or your own as FILE.py:NAME; the name is enough if --data or a "
+            "checkpoint contains the definition. Or a recorded run (.trace, .live or .rrd), or a folder of them.",
+        ),
+    ]
+    filter: str = ""
+
+    def __post_init__(self) -> None:
+        """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
+        if not self.is_recorded:
+            if not self.filter:
+                raise BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
+            super().__post_init__()
+
+    @property
+    def is_recorded(self) -> bool:
+        from beliefscope.filters.names import is_run
+
+        return self.data is None and is_run(self.task)
+
+
 def diagnose(
-    runs: opt.RunsOrRecorded,
+    runs: RunsOrRecorded,
     episode: int | None = opt.option(
         "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
     ),
@@ -64,11 +93,6 @@ def diagnose(
       beliefscope diagnose traces/today --profile-from traces/healthy
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
-    from beliefscope.filters.open_filter import open_filter
-    from beliefscope.inspect.diagnosis.diagnose import diagnose as run
-    from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
-    from beliefscope.inspect.trace import trace
-
     if alarm_rate is not None and not 0.0 < alarm_rate < 1.0:
         raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
     if profile_filter is not None and profile_from is None:
@@ -79,6 +103,26 @@ def diagnose(
                 "recorded runs are diagnosed as they are, without --faults, --base, --profile-filter, --repair"
             )
         return _of_recordings(runs, episode, alarm_rate, profile_from)
+    return _of_filter(runs, episode, base, alarm_rate, profile_from, profile_filter, repair, workers, engine)
+
+
+def _of_filter(
+    runs: opt.Runs,
+    episode: int | None,
+    base: Path | None,
+    alarm_rate: float | None,
+    profile_from: Path | None,
+    profile_filter: str | None,
+    repair: int | None,
+    workers: int,
+    engine: opt.Engine,
+) -> console.Result:
+    """The diagnosis of a filter that runs over episodes, with the arguments of ``diagnose``."""
+    from beliefscope.filters.open_filter import open_filter
+    from beliefscope.inspect.diagnosis.diagnose import diagnose as run
+    from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
+    from beliefscope.inspect.trace import trace
+
     checkpoint, faults = runs.open()
     correct = checkpoint if profile_filter is None else open_filter(checkpoint.task, profile_filter)
     other = None if base is None else open_filter(checkpoint.task, str(base))

@@ -23,8 +23,7 @@ def import_(
     ),
     output: Path | None = opt.option(
         "RUN.trace|RUN.live|DATA.h5|DIR",
-        "Output: a trace, a run for the folder live of a workspace, or a data set; or a folder of traces, one for each "
-        "file or episode.",
+        "Output: a trace, a run for the folder live of a workspace, a data set, or a folder of traces by episode.",
         None,
         "-o",
         "--output",
@@ -32,10 +31,7 @@ def import_(
     map: Path | None = opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", None, "--map"),
     guess: bool = opt.flag("Print a first map of a log instead of importing it.", "--guess"),
     episode: int | None = opt.option(
-        "I",
-        "Index of the episode of a log that becomes a trace. Default: all episodes for a folder, else 0.",
-        None,
-        "--episode",
+        "I", "Index of the episode that becomes a trace. Default: all for a folder, else 0.", None, "--episode"
     ),
     split: str | None = opt.option(
         "NAME",
@@ -50,8 +46,7 @@ def import_(
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
     Of a live run that is in progress or was killed, the complete steps are imported. With a folder as output, each file
-    becomes a trace of the same name in it, each of several episodes of a log one with its index after the name; files
-    that cannot be imported are reported, and the others are written.
+    becomes a trace of the same name, or one per episode with its index after the name; files with errors are reported.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
