@@ -29,6 +29,13 @@ ALARM_RATE = 0.02
 SHARED = 0.25
 """Mean deviation of episodes, relative to that of others, from which a fault affects them as well."""
 
+REPEATED = ("frozen/", "stuck/")
+"""Statistics of the share of repeated readings of a sensor in an episode."""
+
+MOST, RARE = 0.5, 0.1
+"""Share of repeated readings in an episode that is a fault by itself, if that of all healthy episodes is at most the
+second: the permutation test cannot distinguish one of six episodes from an unusual one."""
+
 Rows = Sequence[Mapping[str, float]]
 
 
@@ -111,7 +118,16 @@ def compared(
     scattered, grouped = with_scatter(*with_adjusted(profile, rows, sensors))
     comparison = compare(scattered, grouped, task=inputs.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
-    return Case(inputs, traces, rows, sensors, grouped, profile, deviations, comparison.p_value, alarm_rate)
+    p_value = 0.0 if _repeats_readings(profile, rows) else comparison.p_value
+    return Case(inputs, traces, rows, sensors, grouped, profile, deviations, p_value, alarm_rate)
+
+
+def _repeats_readings(profile: HealthyProfile, rows: Rows) -> bool:
+    """Whether a sensor repeats most of its readings in an episode, which no healthy one does."""
+    healthy = {
+        n: np.nanmax(v) for n, v in profile.statistics.items() if n.startswith(REPEATED) and np.isfinite(v).any()
+    }
+    return any(row.get(name, 0.0) >= MOST for name, most in healthy.items() if most <= RARE for row in rows)
 
 
 def focus(case: Case) -> Case:

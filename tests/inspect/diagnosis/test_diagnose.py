@@ -102,6 +102,22 @@ def test_a_healthy_diagnosis_says_if_its_record_is_miscalibrated(nees: float, st
     assert small in healthy(replace(case, traces=case.traces[:1], rows=case.rows[:1])).headline
 
 
+def test_readings_that_most_steps_repeat_are_a_fault_in_a_single_episode() -> None:
+    """One of six episodes among 26 is the most unusual one with a probability of 6 / 26, whatever its size."""
+    name, inputs = "frozen/image/all", RunInputs(checkpoint(), {}, 300, frozenset())
+
+    def alarms(share: float, healthy_share: float = 0.0) -> list[str]:
+        nees = np.linspace(0.8, 1.2, 20)
+        record = HealthyProfile(
+            "test", 20, None, {name: np.append(np.zeros(19), healthy_share), "nees/fused/all": nees}
+        )
+        rows = [{name: 0.0, "nees/fused/all": 1.0}] * 5 + [{name: share, "nees/fused/all": 1.0}]
+        return [alarm.statistic for alarm in compared(inputs, runs()[:1] * 6, rows, rows, record, 0.02).alarms]
+
+    assert alarms(0.9) == [name]
+    assert alarms(0.4) == alarms(0.9, healthy_share=0.3) == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "cause", "steps"),
