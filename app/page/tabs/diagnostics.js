@@ -123,7 +123,9 @@ export class Diagnostics {
       return setPanelState(this.#host, 'empty', text);
     }
     try {
-      this.#entries = await api.diagnostics(trace.selection, this.#loading.signal);
+      const entries = await api.diagnostics(trace.selection, this.#loading.signal);
+      // those that do not apply come last
+      this.#entries = [...entries].sort((a, b) => Number(!!a.why_not) - Number(!!b.why_not));
     } catch (error) {
       if (!isAbort(error)) setPanelState(this.#host, 'error', messageOf(error));
       return;
