@@ -96,8 +96,7 @@ class LandmarkFilter:
         inside of the images, the former also if the height is below ``MIN_MATCH``.
         """
         expected = self.pixels(positions)
-        size = np.array(images.shape[:0:-1])
-        inside = ((expected > 0.0) & (expected < size - 1.0)).all(axis=1)
+        inside = _inside(expected, images.shape)
         if inside.sum() < MIN_FRAMES:
             return np.full(2, np.nan), np.nan
         response = _around(self._response(images[inside]), expected[inside]).mean(axis=0)
@@ -159,9 +158,11 @@ def fit_landmark_filter(images: Array, positions: Array, others: Array | None = 
         near = (np.abs(columns[:1] - x) <= SEARCH) & (np.abs(rows[:, :1] - y) <= SEARCH)
         response = _convolution(spectrum, result.kernel.astype(np.float32), (height, width), shape)
         seen = _peaks(np.where(near, response, -np.inf))
-    if np.median(np.linalg.norm(seen - terms @ camera, axis=1)) > MAX_DISTANCE:
+    expected = terms @ camera
+    inside = _inside(expected, response.shape)
+    if inside.sum() < MIN_FRAMES or np.median(np.linalg.norm(seen - expected, axis=1)) > MAX_DISTANCE:
         return None
-    return replace(result, height=float(_around(response, terms @ camera).mean(axis=0).max()))
+    return replace(result, height=float(_around(response[inside], expected[inside]).mean(axis=0).max()))
 
 
 def _convolution(
@@ -207,8 +208,13 @@ def _robust_fit(terms: Array, values: Array) -> tuple[Array, Array]:
     return fit, weights
 
 
+def _inside(pixels: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """(T,): whether pixels (T, 2), x and y, are inside of images of this shape (T, H, W)."""
+    return np.asarray(((pixels > 0.0) & (pixels < np.array(shape[:0:-1]) - 1.0)).all(axis=1))
+
+
 def _around(response: NDArray[Any], centre: Array) -> Array:
-    """(T, 2 SEARCH + 1, 2 SEARCH + 1): responses (T, H, W) around pixels (T, 2), interpolated linearly, 0 outside."""
+    """(T, 2 SEARCH + 1, 2 SEARCH + 1): responses (T, H, W) around pixels (T, 2) inside, interpolated linearly."""
     margin = SEARCH + 2
     padded = np.pad(response, ((0, 0), (margin, margin), (margin, margin)))
     corner = np.floor(centre).astype(int)
@@ -228,9 +234,10 @@ def _peaks(response: NDArray[np.float64]) -> Array:
     t = np.arange(count)
 
     def vertex(before: Array, peak: Array, after: Array) -> Array:
-        curvature = before - 2.0 * peak + after
-        usable = np.isfinite(curvature) & (curvature < 0.0)
-        return np.where(usable, 0.5 * (before - after) / np.where(usable, curvature, 1.0), 0.0)
+        with np.errstate(invalid="ignore"):  # at the border of the searched pixels, the others are -inf
+            curvature = before - 2.0 * peak + after
+            usable = np.isfinite(curvature) & (curvature < 0.0)
+            return np.where(usable, 0.5 * (before - after) / np.where(usable, curvature, 1.0), 0.0)
 
     rows, columns = i.clip(1, height - 2), j.clip(1, width - 2)
     dy = vertex(*(response[t, rows + k, j] for k in (-1, 0, 1)))

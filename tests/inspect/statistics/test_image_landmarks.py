@@ -16,16 +16,18 @@ CAMERA = np.array([[16.0, 15.0], [40.0, 5.0], [-6.0, 35.0]])
 """x and y pixels of a hand position p in m: ``[1, p] @ CAMERA``."""
 
 
-def scene(seed: int, shift: tuple[int, int] = (0, 0), contrast: float = 120.0) -> tuple[Array, Array]:
+def scene(
+    seed: int, shift: tuple[int, int] = (0, 0), contrast: float = 120.0, reach: float = 0.2
+) -> tuple[Array, Array]:
     """(T, H, W) normalised images of a hand, a distractor and a fixed edge, and (T, 2) hand positions.
 
     Args:
         shift: (x, y) pixels by which the camera moves the images.
-        contrast: gray levels of the hand.
+        contrast: gray levels of the hand. reach: amplitude of its motion, m; those above 0.4 leave the images.
     """
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, 2.0 * np.pi, 40)[:, None]
-    hand = 0.2 * np.sin(time * rng.uniform(0.5, 1.5, 2) + rng.uniform(0.0, 6.0, 2))
+    hand = reach * np.sin(time * rng.uniform(0.5, 1.5, 2) + rng.uniform(0.0, 6.0, 2))
     distractor = rng.uniform(-0.2, 0.2, 2) + 0.3 * (hand - hand[0])
     rows, columns = np.mgrid[:SIZE, :SIZE]
 
@@ -53,6 +55,16 @@ def test_the_map_of_the_camera_is_recovered(hand_filter: LandmarkFilter) -> None
     hand = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 2))
     difference = hand_filter.pixels(hand) - hand @ CAMERA[1:]
     np.testing.assert_allclose(difference, np.broadcast_to(difference.mean(0), (50, 2)), atol=0.4)
+
+
+def test_a_landmark_that_leaves_the_images_is_localised_inside() -> None:
+    scenes = [scene(seed, reach=0.5 if seed % 4 == 0 else 0.2) for seed in range(20)]
+    result = fit_landmark_filter(np.concatenate([s[0] for s in scenes]), np.concatenate([s[1] for s in scenes]))
+    assert result is not None
+    assert max(result.pixels(hand).max() for _, hand in scenes) > SIZE + 1.0
+    offset, match = result.locate(*scene(100, shift=(2, 0), reach=0.5))
+    np.testing.assert_allclose(offset, (2.0, 0.0), atol=0.5)
+    assert match > 0.7
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (1, 0), (-4, 3), (0, 6)])
