@@ -131,8 +131,8 @@ def _is_callable(arguments: ast.arguments) -> bool:
 
 
 def is_path(text: str) -> bool:
-    """Whether the text is the path of a checkpoint rather than a filter name."""
-    return text.endswith(".safetensors") or os.sep in text
+    """Whether the text is the path of a checkpoint, rather than a filter name or a build function."""
+    return not is_code(text) and (text.endswith(".safetensors") or os.sep in text)
 
 
 def is_run(text: str) -> bool:
@@ -143,3 +143,11 @@ def is_run(text: str) -> bool:
 def is_code(text: str) -> bool:
     """Whether the text names a build function: ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION[@WEIGHTS]``."""
     return ":" in text and (not text.endswith(".safetensors") or "@" in text.rpartition(":")[2])
+
+
+def external_name(source: str) -> str:
+    """Name of the external filter that ``FILE.py:FUNCTION[@WEIGHTS]`` or ``MODULE:FUNCTION[@WEIGHTS]`` builds."""
+    place, _, attribute = source.rpartition(":")
+    function, _, weights = attribute.partition("@")
+    names = [Path(place).stem if place.endswith(".py") else place, function, Path(weights).stem]
+    return "-".join(filter(None, names))

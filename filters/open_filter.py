@@ -23,7 +23,7 @@ def open_filter(task: str | Task, text: str) -> Checkpoint:
 
     Raises BadInput if there is none, or if it is for another task.
     """
-    if not is_path(text) or is_code(text):
+    if not is_path(text):
         task = load_task(task)
         return load_external(text, task) if is_code(text) else load_checkpoint(pretrained_path(task, text))
     given = () if isinstance(task, str) and ":" not in task else (load_task(task),)

@@ -9,6 +9,8 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.filters.checkpoint import PRETRAINED
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.names import is_code
 from beliefscope.inspect.maps.map_engine import missing_quantities
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 from beliefscope.recordings.report.pdf import browser
@@ -26,8 +28,10 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         traced = store.request(selection)
         trace, task = traced.trace, traced.checkpoint.task
         settings = store.settings
-        source, data = traced.checkpoint.path, settings.data.get(selection.data)
-        path = "" if source is None or source.parent == PRETRAINED else str(source)
+        filter_, data = traced.checkpoint, settings.data.get(selection.data)
+        path = "" if filter_.path is None or filter_.path.parent == PRETRAINED else str(filter_.path)
+        if isinstance(filter_, ExternalFilter) and is_code(filter_.source):
+            path = filter_.source
         map_option = [] if quantity == "likelihood" else ["--map", quantity]
         quantity = None if quantity in missing_quantities(traced.checkpoint, trace) else quantity
         serve = serve_command(filter(None, [path]), data, settings.seed)

@@ -22,7 +22,7 @@ from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, DeferredCheckpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.external.load import load_external
-from beliefscope.filters.names import is_path
+from beliefscope.filters.names import external_name, is_code, is_path
 
 SAMPLE = "sample"
 """Name of the sample data set of a task."""
@@ -221,10 +221,14 @@ def result_folders(given: Mapping[str, Path], workspace: Path, file: str, reserv
 
 
 def served_names(filters: Sequence[str], data: Path | None) -> tuple[list[str], str]:
-    """Names, as on the page, of filters (files or pretrained ones) and of the data; None: the sample set."""
+    """Names, as on the page, of filters (files, build functions or pretrained ones) and of the data.
+
+    data: None is the sample set.
+    """
     files = short_names(map(Path, filter(is_path, filters)), PRETRAINED)
     paths = {path.resolve(): name for name, path in files.items()}
-    names = [paths[Path(text).resolve()] if is_path(text) else text for text in filters]
+    named = {text: external_name(text) for text in filters if is_code(text)}
+    names = [paths[Path(text).resolve()] if is_path(text) else named.get(text, text) for text in filters]
     return names, SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
 
 

@@ -66,6 +66,7 @@ from beliefscope.filters.external.module_weights import load_weights, pretrained
 from beliefscope.filters.external.step_values import StepValues, with_ancestors
 from beliefscope.filters.external.torchfilter_hooks import Capture
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.names import external_name
 from beliefscope.filters.rollout import START_VARIANCE
 
 
@@ -359,8 +360,7 @@ def load_external(
             raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
     if weights:
         load_weights(result.module if isinstance(result, Adapter) else result, Path(weights), place)
-    names = [Path(place).stem if place.endswith(".py") else place, attribute, Path(weights).stem]
-    return as_external(result, source, task, given, "-".join(filter(None, names)), named)
+    return as_external(result, source, task, given, external_name(source), named)
 
 
 def as_external(

@@ -109,7 +109,7 @@ def _permalinks(
         source = "the sample episodes" if data is None else str(data)
         return lambda index, step: "", f"No permalinks: the dashboard cannot reproduce these runs over {source}."
     files = [filter_] if is_path(filter_) or is_code(filter_) else []
-    (name,), data_name = served_names([filter_ if is_path(filter_) else first.filter], data)
+    (name,), data_name = served_names(files or [first.filter], data)
 
     def link(index: int, step: int) -> str:
         trace = traces[index]

@@ -50,6 +50,15 @@ def test_json_document_with_permalinks(run: Run, line: list[object], base_settin
     assert "--data" in document["serve"]
 
 
+def test_permalinks_of_an_external_filter(run: Run, base_settings: Settings) -> None:
+    code = "examples/04_own_filter.py:build"
+    line = ["failures", "door", "--filter", code, "--data", base_settings.data["mine"], "--top", 1, "--json", "-"]
+    status, out, _ = run(*line)
+    document = json.loads(out)
+    assert (status, parse_qs(document["events"][0]["link"])["filter"]) == (0, ["04_own_filter-build"])
+    assert f"--filter {code}" in document["serve"]
+
+
 def test_tables_and_full_permalinks(run: Run, line: list[object]) -> None:
     code, out, err = run(*line, "--url", "http://127.0.0.1:9000/", "--by", "ess")
     assert code == 0

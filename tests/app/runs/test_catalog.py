@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
-from beliefscope.app.runs.catalog import SAMPLE, short_names, task_catalogs
+from beliefscope.app.cli.commands.serve import Served
+from beliefscope.app.runs.catalog import SAMPLE, served_names, short_names, task_catalogs
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
@@ -28,6 +31,23 @@ def test_names_are_short_and_unique(tmp_path: Path) -> None:
     names = short_names(paths, reserved={"lstm"})
     assert list(names) == ["a-x-pf", "b-x-pf", "ekf", "b-lstm", "lstm.v2"]
     assert names["a-x-pf"] == paths[0]
+
+
+def test_permalinks_name_filters_as_the_server_does(tmp_path: Path, base_settings: Settings) -> None:
+    """Files, and build functions with and without weights."""
+    weights, code = tmp_path / "step-3.safetensors", tmp_path / "own.py"
+    code.write_text(
+        "from torch import nn\n\n\nclass Own(nn.Module):\n    task = 'door'\n\n"
+        "    def __init__(self):\n        super().__init__()\n        self.linear = nn.Linear(1, 1)\n\n"
+        "    def forward(self, *, observations, controls):\n        return controls[..., :3]\n"
+    )
+    save_file({"linear.weight": np.zeros((1, 1), np.float32), "linear.bias": np.zeros(1, np.float32)}, weights)
+    filters = [f"{code}:Own", f"{code}:Own@{weights}", str(base_settings.checkpoints["crossmodal-ekf"])]
+    served = Served(task=None, data=None, filter=filters).settings(tmp_path)
+    names, data = served_names(filters, None)
+    assert names == [*served.checkpoints]
+    assert names[:2] == ["own-Own", "own-Own-step-3"]
+    assert data == SAMPLE
 
 
 def test_user_files_precede_the_included_ones(base_settings: Settings) -> None:
