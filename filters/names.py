@@ -145,9 +145,15 @@ def is_code(text: str) -> bool:
     return ":" in text and (not text.endswith(".safetensors") or "@" in text.rpartition(":")[2])
 
 
-def external_name(source: str) -> str:
-    """Name of the external filter that ``FILE.py:FUNCTION[@WEIGHTS]`` or ``MODULE:FUNCTION[@WEIGHTS]`` builds."""
+def code_parts(source: str) -> tuple[str, str, str]:
+    """File or module, function, and weights or an empty text, of ``FILE.py:FUNCTION[@WEIGHTS]``."""
     place, _, attribute = source.rpartition(":")
     function, _, weights = attribute.partition("@")
+    return place, function, weights
+
+
+def external_name(source: str) -> str:
+    """Name of the external filter that ``FILE.py:FUNCTION[@WEIGHTS]`` or ``MODULE:FUNCTION[@WEIGHTS]`` builds."""
+    place, function, weights = code_parts(source)
     names = [Path(place).stem if place.endswith(".py") else place, function, Path(weights).stem]
     return "-".join(filter(None, names))

@@ -26,7 +26,7 @@ from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import squares
 from beliefscope.filters.external.load import ExternalFilter, load_external
-from beliefscope.filters.names import is_code
+from beliefscope.filters.names import code_parts, external_name, is_code
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -114,8 +114,7 @@ class Inputs:
         for path in self.checkpoints:
             try:
                 provenance_of(path)
-                if not is_code(str(path)):
-                    _checkpoint(path)
+                _filter(path, self.data[0] if self.data else None)
             except BadInput as error:
                 problems.append(str(error))
                 continue
@@ -157,13 +156,16 @@ def _report_unusable(problems: list[str], count: int, skip: Callable[[str], None
 
 
 def provenance_of(path: Path) -> Mapping[str, Any]:
-    """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one, or of code.
+    """Provenance of a checkpoint from the file beside it with the suffix ``.json``; empty without one.
+
+    Of an external filter, it is beside its weights.
 
     It is the configuration of the training, for example, or the address of a tracker's run, as ``read_provenance``
     returns it. Raises BadInput if it is not a JSON object.
     """
-    beside = path.with_suffix(".json")
-    if is_code(str(path)) or not beside.is_file():
+    weights = code_parts(str(path))[2] if is_code(str(path)) else str(path)
+    beside = Path(weights).with_suffix(".json") if weights else None
+    if beside is None or not beside.is_file():
         return {}
     try:
         provenance = read_provenance(beside.read_text())
@@ -191,12 +193,17 @@ def describe_checkpoint(path: Path, data: Path | None = None) -> Row:
     """
     checkpoint = _filter(path, data)
     record, provenance = dict(checkpoint.record), provenance_of(path)
+    name, filter_ = path.stem, checkpoint.name
+    if is_code(str(path)):
+        place, function, weights = code_parts(str(path))
+        filter_ = external_name(f"{place}:{function}")
+        name = Path(weights).stem or filter_
     return {
         "checkpoint": checkpoint.hash,
-        "name": checkpoint.name if is_code(str(path)) else path.stem,
+        "name": name,
         "path": str(path),
         "task": checkpoint.task.name,
-        "filter": checkpoint.name,
+        "filter": filter_,
         "kind": checkpoint.kind,
         "training": _json_text(record),
         "provenance": _json_text(provenance),
@@ -281,24 +288,33 @@ def _probabilities(trace: Trace, n: int) -> dict[str, measures.Array]:
 def find_checkpoints(patterns: Iterable[str]) -> tuple[Path, ...]:
     """Checkpoints that match glob patterns; ``FILE.py:FUNCTION`` and ``MODULE:FUNCTION`` are external filters.
 
+    The weights of an external filter, ``FILE.py:FUNCTION@WEIGHTS``, are a pattern as well.
+
     Raises BadInput for a pattern that none matches.
     """
     checkpoints: dict[Path, None] = {}
     for pattern in patterns:
+        build, files = "", pattern
         if is_code(pattern):
-            checkpoints[location(pattern)] = None
-            continue
-        names = [name for name in sorted(glob(pattern, recursive=True)) if name.endswith(".safetensors")]
+            place, function, files = code_parts(pattern)
+            build = f"{place}:{function}@"
+            if not files:
+                checkpoints[location(pattern)] = None
+                continue
+        names = [name for name in sorted(glob(files, recursive=True)) if name.endswith(".safetensors")]
         if not names:
-            raise BadInput(f"no checkpoint (.safetensors) matches {pattern!r}")
-        checkpoints |= dict.fromkeys(Path(name).resolve() for name in names)
+            raise BadInput(f"no checkpoint (.safetensors) matches {files!r}")
+        checkpoints |= dict.fromkeys(location(f"{build}{name}") for name in names)
     return tuple(checkpoints)
 
 
 def location(source: str) -> Path:
-    """The file or the build function of a filter; absolute unless it is in a module."""
-    in_module = is_code(source) and not Path(source.rpartition(":")[0]).is_file()
-    return Path(source) if in_module else Path(source).resolve()
+    """The file or the build function of a filter with absolute paths, except for the name of a module."""
+    if not is_code(source):
+        return Path(source).resolve()
+    place, function, weights = code_parts(source)
+    file = Path(place).absolute() if Path(place).is_file() else place  # a link has another name
+    return Path(f"{file}:{function}@{Path(weights).resolve()}" if weights else f"{file}:{function}")
 
 
 def source_of(checkpoint: Checkpoint) -> str:
@@ -311,7 +327,7 @@ def source_of(checkpoint: Checkpoint) -> str:
     if not is_code(checkpoint.source):
         raise BadInput(
             f"filter {checkpoint.name!r} was built in Python, and a sweep runs in other processes: give its build "
-            "function, FILE.py:FUNCTION"
+            "function, FILE.py:FUNCTION or FILE.py:FUNCTION@WEIGHTS.safetensors"
         )
     return checkpoint.source
 

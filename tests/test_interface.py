@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from torch import nn
 
 import beliefscope as bs
 from beliefscope.filters.evaluate import evaluate
@@ -197,5 +198,7 @@ def test_sweeps_take_checkpoints_and_build_functions(tmp_path: Path) -> None:
         bs.sweep(tmp_path / "sweep", [mine])
     with pytest.raises(bs.BadInput, match=r"own\.py"):
         bs.sweep(tmp_path / "sweep", ["path/own.py:build"])
-    result = bs.sweep(tmp_path / "sweep", [bs.load_filter("push/haptics-ekf")], ["push"])
-    assert result.overview().num_rows == 1
+    with pytest.raises(bs.BadInput, match=r"filter 'Identity' was built in Python, .*: give its build function"):
+        bs.sweep(tmp_path / "sweep", [bs.Adapter(nn.Identity(), task="push")])
+    result = bs.sweep(tmp_path / "sweep", bs.load_filter("push/haptics-ekf"), "push", faults="blackout=0.5")
+    assert result.overview().column("faults").to_pylist() == ["blackout=0.5"]

@@ -66,7 +66,7 @@ from beliefscope.filters.external.module_weights import load_weights, pretrained
 from beliefscope.filters.external.step_values import StepValues, with_ancestors
 from beliefscope.filters.external.torchfilter_hooks import Capture
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.names import external_name
+from beliefscope.filters.names import code_parts, external_name
 from beliefscope.filters.rollout import START_VARIANCE
 
 
@@ -342,8 +342,7 @@ def load_external(
     Raises:
         BadInput: the name does not exist, the call fails or does not return a filter, or the task differs.
     """
-    place, _, attribute = source.rpartition(":")
-    attribute, _, weights = attribute.partition("@")
+    place, attribute, weights = code_parts(source)
     with user_code.importable(place):
         module = user_code.load_module(place)
         build = getattr(module, attribute, None)

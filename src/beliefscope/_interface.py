@@ -320,10 +320,10 @@ def compare(
 
 def sweep(
     folder: str | Path,
-    filters: Sequence[Filter],
-    data: Sequence[str | Path] = (),
+    filters: Filter | Sequence[Filter],
+    data: str | Path | Sequence[str | Path] = (),
     *,
-    faults: Sequence[str] = ("",),
+    faults: str | Sequence[str] = ("",),
     seeds: int = 1,
     particles: int = 300,
     all_episodes: bool = False,
@@ -333,15 +333,18 @@ def sweep(
 
     Args:
         folder: of the sweep; created if missing.
-        filters: checkpoints or their files, ``TASK/NAME``, or external filters by build function, ``FILE.py:FUNCTION``.
-        data: files of episodes; default: the sample data set of each filter's task.
+        filters: one or more checkpoints or their files, ``TASK/NAME``, or ``FILE.py:FUNCTION[@WEIGHTS]``.
+        data: one or more files of episodes; default: the sample data set of each filter's task.
         faults: each is run; an empty text is clean data. seeds: number of seeds, from 0.
         all_episodes: whether to run over training episodes as well. workers: processes.
     """
-    sets = tuple(store.sample_path(str(d)) if str(d) in TASKS else Path(d).resolve() for d in data)
-    sources = [source_of(f) if isinstance(f, Checkpoint) else str(f) for f in filters]
+    given = [filters] if isinstance(filters, str | Path | Checkpoint) else filters
+    paths = [data] if isinstance(data, str | Path) else data
+    texts = (faults,) if isinstance(faults, str) else tuple(faults)
+    sets = tuple(store.sample_path(str(d)) if str(d) in TASKS else Path(d).resolve() for d in paths)
+    sources = [str(f) if isinstance(f, str | Path) else source_of(load_filter(f)) for f in given]
     files = tuple(location(f) if f.endswith(".safetensors") or is_code(f) else _pretrained_path(f) for f in sources)
-    inputs = Inputs(files, sets, tuple(faults), tuple(range(seeds)), particles, all_episodes)
+    inputs = Inputs(files, sets, texts, tuple(range(seeds)), particles, all_episodes)
     Path(folder).mkdir(exist_ok=True)
     run_sweep(inputs.cells(), Path(folder).resolve(), workers=workers)
     return Experiments([Path(folder)])

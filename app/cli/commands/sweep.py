@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 def sweep(
     checkpoints: list[str] = opt.option(
         "GLOB|FILE.py:FUNCTION",
-        "Checkpoints, such as 'runs/*.safetensors' (quoted), or an external filter, given by its build function. "
-        "Repeatable.",
+        "Checkpoints, such as 'runs/*.safetensors' (quoted), or an external filter, given by its build function, with "
+        "@'runs/*.safetensors' for its weights. Repeatable.",
         ...,
         "--checkpoints",
     ),
@@ -52,6 +52,7 @@ def sweep(
       beliefscope sweep --checkpoints 'runs/*.safetensors' --data door.h5 -o sweep
       beliefscope sweep --checkpoints 'runs/*.safetensors' --faults '' --faults blackout=0.8 --workers 8 -o sweep
       beliefscope sweep --checkpoints own.py:build --checkpoints 'runs/*.safetensors' --data own.h5 -o sweep
+      beliefscope sweep --checkpoints 'own.py:build@runs/*.safetensors' --data own.h5 -o sweep
       beliefscope sweep --checkpoints '/lab/**/*.safetensors' --data /lab/door.h5 --engine ray -o /lab/sweep
     """
     opt.prepare_workers(engine, workers, "beliefscope.recordings.sweep_table")

@@ -8,10 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import pretrained_path
+from beliefscope.recordings.sweep_table import Experiments
 
 
 @pytest.mark.slow
@@ -58,3 +61,47 @@ def test_unusable_checkpoints_are_listed_and_can_be_skipped(run: Callable[..., A
     good.unlink()
     code, _, error = run(*sweep, "-o", tmp_path / "other", "--skip-bad")
     assert (code, "2 of 2 checkpoints are unusable" in error) == (2, True)
+
+
+OWN = """
+import torch
+from torch import nn
+
+
+class Own(nn.Module):
+    task = "push"
+
+    def __init__(self):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(2))
+
+    def forward(self, *, observations, controls):
+        return observations["effector_position"][..., :2] + self.bias
+"""
+
+
+def test_weights_of_an_external_filter_are_a_pattern(
+    run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each has its own row, with the provenance beside it; paths are absolute, since others read the table."""
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+    Path("runs").mkdir()
+    for step in (0, 100):
+        save_file({"bias": np.full(2, 0.001 * step, np.float32)}, f"runs/{step}.safetensors")
+        Path(f"runs/{step}.json").write_text(json.dumps({"step": step}))
+    with open_dataset(sample_path("push")) as data:
+        write_dataset(Path("push.h5"), data.task, [data[9]])
+    sweep = ("sweep", "--checkpoints", "own.py:Own@runs/*.safetensors", "--data", "push.h5", "--json", "-")
+    code, out, _ = run(*sweep, "-o", "sweep")
+    rows = {row["name"]: row for row in json.loads(out)["overview"]}
+    assert (code, [*rows]) == (0, ["100", "0"])
+    assert [row["filter"] for row in rows.values()] == ["own-Own"] * 2
+    assert [json.loads(row["provenance"]) for row in rows.values()] == [{"step": 100}, {"step": 0}]
+    (path,) = Experiments([Path("sweep")]).query("SELECT path FROM checkpoints WHERE name = '0'").column(0).to_pylist()
+    assert path == f"{tmp_path}/own.py:Own@{tmp_path}/runs/0.safetensors"
+    code, _, error = run("sweep", "--checkpoints", "own.py:Own@other/*.safetensors", "-o", "sweep")
+    assert (code, "no checkpoint (.safetensors) matches 'other/*.safetensors'" in error) == (2, True)
+    save_file({"other": np.zeros(2, np.float32)}, "runs/bad.safetensors")
+    code, _, error = run(*sweep, "-o", "sweep", "--skip-bad")
+    assert (code, error.count("skipped: ")) == (0, 1)
