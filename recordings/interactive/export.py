@@ -113,7 +113,8 @@ def _title(trace: Trace) -> str:
 
 
 def _texts(trace: Trace, checkpoint: Checkpoint | None) -> dict[str, Any]:
-    return {"version": __version__, "diagnosis": _diagnosis(trace, checkpoint), "provenance": describe(trace)}
+    provenance = describe(trace) | {"faults": str(trace.faults) or "none"}
+    return {"version": __version__, "diagnosis": _diagnosis(trace, checkpoint), "provenance": provenance}
 
 
 def write_index(files: Sequence[tuple[Path, Trace]], path: Path) -> None:

@@ -447,9 +447,8 @@ export class Viewer {
       const c = context(canvas);
       const pixels = bitmap(columns, rows);
       const image = context(pixels).createImageData(columns, rows);
-      this.html('#maps > div').append(
-        create('figure', {}, canvas, create('figcaption', { textContent: name })),
-      );
+      const caption = create('figcaption', { textContent: name });
+      this.html('#maps > div').append(create('figure', {}, canvas, caption));
       this.painters.push((t) => {
         const index = Math.floor(t / maps.stride);
         const first = (index * maps.layers.length + l) * rows * columns;
@@ -482,6 +481,9 @@ export class Viewer {
             (reach, i) => ((place[i] ?? NaN) - (centre[i] ?? NaN)) / reach,
           );
           const y = isCurve ? 0.5 : 0.5 - 0.5 * dy;
+          if (!plus)
+            caption.textContent =
+              Math.max(Math.abs(dx), Math.abs(dy || 0)) > 1 ? `${name}; estimate outside` : name;
           if (Number.isFinite(dx))
             marker(c, (0.5 + 0.5 * dx) * canvas.width, y * canvas.height, colour, plus);
         };
@@ -564,12 +566,15 @@ export class Viewer {
     for (const { label, unit } of this.run.components) heads.push(`${label} (${unit})`, 'σ');
     const weights = this.run.weights;
     if (weights) heads.push(weights.label);
-    const cells = this.run.layers.map(({ name, label }, l) => {
+    const reported = (/** @type {number} */ l) =>
+      this.run.components.some(({ mean }) => mean[l].some((v) => v !== null));
+    const cells = this.run.layers.flatMap(({ name, label }, l) => {
+      if (!weights && l !== this.fused && !reported(l)) return [];
       const values = [label, digits(this.run.error.values[l][t])];
       for (const { mean, std } of this.run.components)
         values.push(digits(mean[l][t]), digits(std[l][t]));
       if (weights) values.push(digits(weights.values[weights.names.indexOf(name)]?.[t]));
-      return values;
+      return [values];
     });
     const row = (/** @type {string[]} */ texts, /** @type {string} */ tag) =>
       create('tr', {}, ...texts.map((textContent, i) => create(i ? tag : 'th', { textContent })));

@@ -53,12 +53,13 @@ from beliefscope.recordings.report.sections import (
     accuracy,
     event_summary,
     event_table,
+    is_outside,
     worst_events,
 )
 
 MAP_CAPTION = (
-    "{} over offsets from the true position, each relative to its maximum. "
-    "Cross hairs: true position. Rings: estimate of each layer, which also depends on the prediction."
+    "Maps over offsets from the true state, each relative to its maximum. "
+    "Cross hairs: true state. Rings: estimate of each layer, which also depends on the prediction."
 )
 SLICES = ("Slices", "Under which conditions is the error larger?")
 """Title of the section on data slices, and the question that it answers."""
@@ -93,7 +94,7 @@ def compose(
         commands: command lines that reproduce the report.
         quantity: of the maps; by default the first one that the filter has.
     """
-    first = traces[0]
+    first, main = traces[0], traces[0].task.main_error.name
     options = {name: {"quantity": quantity} if "quantity" in e.options else {} for name, e in DIAGNOSTICS.items()}
     diagnosis = report_diagnosis(traces, checkpoint, link, lambda share: progress(0.5 * share))
     results, reasons = run_diagnostics(traces, checkpoint, options, slow, lambda share: progress(0.5 + 0.4 * share))
@@ -115,7 +116,7 @@ def compose(
         titles=titles,
         reasons=reasons,
         events=tuple(replace(event, link=link(event.trace, event.step)) for event in events),
-        events_note="Requested steps." if steps else "Steps with the largest position error, in descending order.",
+        events_note="Requested steps." if steps else f"Steps with the largest {main} error, in descending order.",
         links_note=links_note,
         commands=commands,
         quantity=quantity,
@@ -190,10 +191,11 @@ class Writer:
             f" The {MAX_CHARTS} of {len(traces)} traces with the largest errors." if len(charts) < len(traces) else ""
         )
         shaded = "Shaded: contact; g" if "contact" in traces[0].task.covariates else "G"
+        updates = "single-modality updates of the fused filter's prior, which are not standalone filters, and of the "
         caption = (
-            f"{traces[0].task.main_error.title} error of the single-modality updates of the fused filter's prior, "
-            f"which are not standalone filters, and of the fused estimate. {shaded}ray: image "
-            f"blackout. Dotted: the events below.{omitted}"
+            f"{traces[0].task.main_error.title} error of the "
+            f"{updates if traces[0].modalities_with_posterior else ''}fused estimate. "
+            f"{shaded}ray: image blackout. Dotted: the events below.{omitted}"
         )
         items = [
             self.table("accuracy", accuracy(traces, standalone_runs(traces, self.report.checkpoint))),
@@ -257,6 +259,8 @@ class Writer:
             caption, zoom = f"{map_.title}. {MAP_CAPTION}", zoom_of(map_)
             if zoom > 1:
                 caption += f" Centre of the map, magnified {zoom} times."
+            if is_outside(trace, map_):
+                caption += " The fused estimate is outside of the map."
                 zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:
             caption = f"Estimates as offsets from the true position. No maps: {self.no_maps}."

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import step_text
 from beliefscope.datasets.task import with_unit
@@ -154,6 +155,17 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
     return Table("RMSE and calibration of the covariance", tuple(columns), tuple(rows))
 
 
+def _reach(map_: LikelihoodMap) -> NDArray[Any]:
+    """(2,) largest offset of a map along its axes; 0 along the missing one of a curve."""
+    return np.array([np.abs(offsets).max() for offsets in (map_.offsets_x, map_.offsets_y)])
+
+
+def is_outside(trace: Trace, map_: LikelihoodMap) -> bool:
+    """Whether the fused estimate is outside of a map around the true state; False without one."""
+    error = np.abs(measures.errors(trace)[map_.step, -1, list(map_.components)])
+    return bool((error > _reach(map_)[: len(error)]).any())
+
+
 def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     """Error, weights and map statistics at one step of each layer that has any."""
     task = trace.task
@@ -163,7 +175,7 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     distance = main.factor * measures.main_error(trace)[step]
     statistics = None if map_ is None else measure_maps([map_], trace)
     columns = ["estimate", *(with_unit(f"{c.label} error", u) for c, u in zip(task.components, units, strict=True))]
-    columns += [with_unit(f"{main.name} error", main.unit)]
+    columns += [with_unit(f"{main.name} error", main.unit)] if len(main.indices) > 1 else []
     columns += ["NEES/n"] if trace.has_covariance else []
     for name, weights in (("beta", trace.weights), ("effective weight", trace.effective_weights)):
         if weights is not None:
@@ -179,15 +191,19 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     for i, layer in enumerate(measures.layers(trace)):
         has_estimate = layer == "fused" or layer in trace.modalities_with_posterior
         row: list[Value] = [measures.layer_label(layer)]
-        row += (*map(float, error[i]), float(distance[i])) if has_estimate else [None] * (len(units) + 1)
+        row += map(float, error[i]) if has_estimate else [None] * len(units)
+        row += [float(distance[i]) if has_estimate else None] if len(main.indices) > 1 else []
         row += [float(nees[i]) if np.isfinite(nees[i]) else None] if trace.has_covariance else []
         for weights in (trace.weights, trace.effective_weights):
             if weights is not None:
                 row.append(float(weights[step, i].mean()) if i < weights.shape[1] else None)
         if statistics is not None and layer in statistics.layers:
             at = statistics.layers.index(layer)
-            row += [main.factor * float(np.hypot(*statistics.peak[0, at]))] if same_unit else []
-            row += [factor * float(statistics.area95[0, at])]
+            assert map_ is not None
+            # With the maximum at the border, the peak and a part of the region are outside.
+            cut = bool((np.abs(statistics.peak[0, at]) >= _reach(map_))[: len(where)].any())
+            row += [None if cut else main.factor * float(np.hypot(*statistics.peak[0, at]))] if same_unit else []
+            row += [None if cut else factor * float(statistics.area95[0, at])]
             row += [SHAPES[statistics.shape[0, at]]] if same_unit and len(where) == 2 else []
         row += [None] * (len(columns) - len(row))
         if any(value is not None for value in row[1:]):

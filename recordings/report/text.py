@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
@@ -179,7 +181,8 @@ def _external(trace: Trace) -> Passage:
         f"{trace.filter} is an external filter. The report covers the quantities it reported: estimates"
         f"{', covariance' if trace.has_covariance else ''}"
         f"{', particles' if trace.particles is not None else ''}"
-        f"{', fusion weights' if trace.weights is not None else ''}.",
+        f"{', fusion weights' if trace.weights is not None else ''}"
+        f"{', innovations' if trace.innovation is not None else ''}.",
     )
 
 
@@ -190,11 +193,21 @@ def _run(trace: Trace) -> Passage:
         start = "Runs start at an offset from the true state, with a covariance that matches the distance"
     elif not measures.starts_at_truth(trace):
         start = "Runs start at a first belief that the filter or its user sets"
+    elif trace.kind == "external" and trace.has_covariance:
+        start += f", with the standard deviations {_start_std(trace)}"
     elif trace.has_covariance:
         start += ", with covariance 0.1 $I$ in units of the training set's standard deviations"
     excluded = f"exclude the first {task.warmup} steps of each episode, which depend on the start"
     tables = f"Tables {excluded}; curves show all steps." if task.warmup else "Tables and curves show all steps."
     return Passage("Evaluation", f"{start}. {tables} A step is {trace.episode.dt:g} s.")
+
+
+def _start_std(trace: Trace) -> str:
+    """Standard deviations of the first belief, such as ``x 5 cm, heading 2 deg``."""
+    units, factors = measures.display_units(trace.task)
+    std = factors * np.sqrt(np.diag(trace.start_covariance))
+    named = zip(trace.task.components, std, units, strict=True)
+    return ", ".join(f"{component.label} {value:.3g} {unit}".rstrip() for component, value, unit in named)
 
 
 def definitions(task: Task, trace: Trace) -> list[Passage]:

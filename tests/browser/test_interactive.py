@@ -6,8 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+import beliefscope as bs
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
@@ -46,6 +49,24 @@ def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
     assert abs(float(cells[1]) - estimate) <= 5e-3 * abs(estimate)  # three digits
     assert requests == [f"{address}#step=42"] or requests == [address]
     assert not problems
+    page.close()
+
+
+def far_off(*, observations: dict[str, NDArray[np.float32]], controls: NDArray[np.float32]) -> Any:
+    """50 cm off in x: outside of the map."""
+    mean = observations["effector_position"][..., :2] + np.array([0.5, 0.0], np.float32)
+    return mean, np.broadcast_to(np.eye(2, dtype=np.float32) * 1e-4, (*mean.shape, 2))
+
+
+def test_an_estimate_outside_of_the_map_is_named(context: Any, tmp_path: Path) -> None:
+    """An external filter without updates by modality has one row of values."""
+    checkpoint = bs.load_filter(far_off, "push", name="far")
+    bs.export_page(bs.trace(checkpoint, "push", 29), tmp_path / "run.html", checkpoint)
+    page = context.new_page()
+    page.goto(f"{(tmp_path / 'run.html').as_uri()}#step=42")
+    assert page.locator("#maps figcaption").all_text_contents() == ["fused; estimate outside"]
+    assert page.locator("#values tbody th").all_text_contents() == ["fused"]
+    assert "faults none" in page.text_content("footer")
     page.close()
 
 
