@@ -8,6 +8,8 @@ from concurrent.futures import Future, TimeoutError as FutureTimeout
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from beliefscope.app.protocol.map_format import EncodedMaps, encode_maps
 from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
@@ -75,6 +77,12 @@ class TracedRun:
     def no_maps(self) -> str | None:
         """Reason why the run has no likelihood maps; None if it has."""
         return no_maps(self.checkpoint, self.trace)
+
+    def no_maps_at(self, step: int) -> str | None:
+        """Reason why a step of the run has no likelihood maps; None if it has."""
+        trace, index = self.at(step)
+        finite = self.no_maps or np.isfinite(trace.estimate_mean[index]).all()
+        return self.no_maps if finite else f"No maps: the estimate at step {step} is not a finite number."
 
     @cached_property
     def header(self) -> dict[str, Any]:

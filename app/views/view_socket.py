@@ -123,8 +123,9 @@ class View:
             raise BadInput(f"step {cursor.step} does not exist. Available: 0 to {len(run) - 1}.")
         comparison = self._comparison(selection, cursor.against, len(run))
         maps = None
-        if run.no_maps:
-            await websocket.send_json({"type": "no_maps", "serial": cursor.serial, "step": cursor.step})
+        if reason := await asyncio.to_thread(run.no_maps_at, cursor.step):
+            message = {"type": "no_maps", "serial": cursor.serial, "step": cursor.step, "reason": reason}
+            await websocket.send_json(message)
         else:
             if cursor.comparison_maps and comparison is not None and not comparison.no_maps:
                 other = await self._maps(cursor, comparison)

@@ -102,7 +102,9 @@ def _half_width(trace: Trace, index: int) -> float:
     task = trace.task
     error = np.abs(task.difference(trace.estimate_mean, trace.anchors)[:, index])
     deviation = np.sqrt(np.maximum(trace.estimate_covariance[:, index, index].astype(np.float64), 0.0))
-    reach = MARGIN * float(np.quantile(error + DEVIATIONS * np.nan_to_num(deviation), 0.95))
+    extents = error + DEVIATIONS * np.nan_to_num(deviation)
+    finite = extents[np.isfinite(extents)]  # a filter that runs in a loop of the user may have lost the state
+    reach = MARGIN * float(np.quantile(finite, 0.95)) if len(finite) else 0.0
     if index in task.main_error.indices and not 0.0 < COARSE * reach < task.map_half_width:
         return task.map_half_width
     _, factor = task.components[index].conversion

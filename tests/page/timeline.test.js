@@ -237,6 +237,13 @@ test('a variance that is not positive is named, not a number of deviations', () 
   assert.match(text, /; the predicted variance of hinge x is not positive\./);
 });
 
+test('an estimate that is not finite is named, not judged', () => {
+  const estimate_mean = { shape: [2, 3], values: [NaN, 0, 0, 0, 0, 0] };
+  const { tone, text } = stepSummary(makeTrace({ ...FUSION, estimate_mean }), 0, 0);
+  assert.equal(tone, 'bad');
+  assert.match(text, /^Fused estimate: not a finite number\. /);
+});
+
 test('the summary explains an uninformative dominant modality', () => {
   const dark = makeTrace({ ...FUSION, blackout: { shape: [2], values: [1, 1] } });
   assert.match(stepSummary(dark, 1, 0).text, /although the image is blacked out\.$/);

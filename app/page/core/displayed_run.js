@@ -236,7 +236,8 @@ export class DisplayedRun {
         if (inputTime !== null) addLatency(stats.scrub, performance.now() - inputTime);
         markUseful();
       },
-      noMaps: (step, size) => {
+      noMaps: (step, size, reason) => {
+        setPanelState(html('#heatmaps'), 'empty', reason);
         stats.maps = { step, size };
         markUseful();
       },

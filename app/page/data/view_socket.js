@@ -17,7 +17,7 @@ import { openView } from './api.js';
  * @property {(view: {view: string, scene: string}) => void} view a view was opened
  * @property {(factor: number) => boolean} pace sets the pause of the 3D scene, and returns whether it may render now
  * @property {(maps: Maps, inputTime: number | null) => void} maps
- * @property {(step: number, size: number | undefined) => void} noMaps the filter has no maps
+ * @property {(step: number, size: number | undefined, reason: string) => void} noMaps the filter or step has no maps
  * @property {(step: number, inputTime: number | null) => void} drawn the 3D scene shows the step; inputTime: of the last input, with the first scene of its step
  * @property {(line: string) => void} error
  * @property {(problem: string | null) => void} connection
@@ -238,13 +238,13 @@ export class ViewSocket {
     this.#answered(maps.serial);
   }
 
-  /** @param {{type: string, serial: number, step: number, error: string}} message */
-  #receive({ type, serial, step, error }) {
+  /** @param {{type: string, serial: number, step: number, reason: string, error: string}} message */
+  #receive({ type, serial, step, reason, error }) {
     const cause = this.#sent.get(serial) ?? {};
     if (type !== 'drawn' && serial === this.#requests[0]?.serial)
       this.#requests.shift()?.resolve(null);
     if (type === 'no_maps') {
-      this.#handlers.noMaps(step, cause.size);
+      this.#handlers.noMaps(step, cause.size, reason);
       this.#answered(serial);
     }
     if (type === 'drawn') {

@@ -61,7 +61,10 @@ export const weightScope = (trace, component) =>
  */
 function accuracy(trace, step) {
   const name = trace.fuses ? 'Fused estimate' : 'Estimate';
-  const error = `${name}: error ${withUnit(fixed(trace.error('fused', 'main')?.[step], 2), trace.mainUnit)}`;
+  const value = trace.error('fused', 'main')?.[step];
+  if (value === undefined || !Number.isFinite(value))
+    return { tone: 'bad', text: `${name}: not a finite number.` };
+  const error = `${name}: error ${withUnit(fixed(value, 2), trace.mainUnit)}`;
   const deviation = trace.largestDeviation(step);
   if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
   const { sigmas, component } = deviation;

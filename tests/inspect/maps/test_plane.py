@@ -167,6 +167,13 @@ def test_extent_of_a_map_whose_cells_are_larger_than_the_beliefs_is_that_of_the_
     assert plane_of(still).half_widths == (1000.0, 1000.0)
 
 
+def test_extents_are_those_of_the_steps_with_finite_estimates() -> None:
+    run = make_trace()
+    mean = np.insert(run.estimate_mean[:-1], 3, np.nan, axis=0)
+    assert np.isfinite(plane_of(replace(run, estimate_mean=mean), ("x", "vy")).half_widths).all()
+    assert plane_of(replace(run, estimate_mean=np.full_like(mean, np.nan))).half_widths == (2.0, 2.0)
+
+
 def test_invalid_choices_are_rejected() -> None:
     maps = engine(make_trace())
     with pytest.raises(BadInput, match="component 'vz' of task 'vehicle' does not exist"):
