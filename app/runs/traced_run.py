@@ -130,11 +130,12 @@ class TracedRun:
             return self._results[name]
 
     def missing_maps(self, step: int, count: int, options: MapOptions) -> list[int]:
-        """Of the ``count`` steps nearest to ``step``, those whose coarse map is not cached; the nearest first."""
+        """Of the ``count`` steps nearest to ``step``, those with maps whose coarse one is not cached; nearest first."""
         near = range(max(0, step - count), min(len(self), step + count + 1))
         nearest = sorted(near, key=lambda index: abs(index - step))[:count]
         with self._cache_lock:
-            return [index for index in nearest if (index, COARSE, options) not in self._cache]
+            missing = [index for index in nearest if (index, COARSE, options) not in self._cache]
+        return [index for index in missing if not self.no_maps_at(index)]
 
     @property
     def nbytes(self) -> int:
