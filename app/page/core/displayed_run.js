@@ -39,8 +39,6 @@ export class DisplayedRun {
   /** @type {Trace | null} */
   trace = null;
   failure = ''; // why the last trace could not be loaded
-  /** Task of the last trace. */
-  #task = '';
 
   /**
    * @param {Page} page
@@ -133,14 +131,11 @@ export class DisplayedRun {
   }
 
   /**
-   * Opens another tab than the scene if a new task has none.
+   * Opens another tab than the scene if the task of a new run has none.
    * @param {Trace} trace
    */
   #leaveEmptyScene(trace) {
-    const { task, tab } = this.#store.state;
-    const isNew = task !== this.#task;
-    this.#task = task;
-    if (isNew && tab === 'scene' && trace.header.scene?.length === 0)
+    if (this.#store.state.tab === 'scene' && trace.header.scene?.length === 0)
       this.#store.set({ tab: 'diagnosis' });
   }
 
