@@ -22,6 +22,7 @@ from beliefscope.inspect.diagnosis.causes import (
     own_sensors,
     particles,
 )
+from beliefscope.inspect.diagnosis.causes.consequences import model_of
 from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
 from beliefscope.inspect.diagnosis.causes.recorded import RECORDED
 from beliefscope.inspect.diagnosis.true_starts import has_true_starts
@@ -71,5 +72,5 @@ def _of_modality(cause: Cause, modalities: Mapping[str, str]) -> Cause:
     if modality == written:
         return cause
     undo = "|".join(f"drop {modality}" if name == f"drop {written}" else name for name in cause.undo.split("|"))
-    consequences = cause.consequences.replace(f"module */*{written}*", f"module */*{modality}*")
+    consequences = cause.consequences.replace(model_of(written), model_of(modality))
     return replace(cause, undo=undo, consequences=consequences)

@@ -11,7 +11,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import axis_name
 from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
-from beliefscope.inspect.statistics.innovations import prediction
+from beliefscope.inspect.statistics.innovations import channel_names, prediction
 from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_features import Indices
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
@@ -212,14 +212,32 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
 
 
 def _offsets(trace: Trace) -> dict[str, float]:
-    """``likelihood offset/MODALITY COMPONENT/all``, of particles around the true states.
+    """``KIND/SUBJECT/all`` -> value, of steps from true states.
 
-    Mean distance by which the likelihood of a modality alone moves the mean of the particles, in their standard
-    deviations: 0 in a filter whose measurement function is right, whatever its noise.
+    ``innovation offset/MODALITY CHANNEL``: mean of the innovations, in their standard deviations.
+
+    ``likelihood offset/MODALITY COMPONENT``, of particles: mean distance by which the likelihood of a modality alone
+    moves their mean, in their standard deviations: 0 in a filter whose measurement function is right, whatever its
+    noise.
+
+    ``likelihood width/MODALITY``, of particles: inverse root of the mean of s / v, with the standard deviation s of the
+    log-likelihoods of the particles of a step and their mean variance v, in units of that of the true states: of a
+    Gaussian likelihood proportional to its standard deviation, whatever the spread of the particles.
     """
+    values: dict[str, float] = {}
+    if trace.innovation is not None:
+        names = channel_names(trace, trace.innovation)
+        for k, modality in enumerate(trace.modalities):
+            at = np.isfinite(trace.innovation[:, k]).any(-1) & ~absent(trace, modality)
+            if at.sum() < MIN_STEPS:
+                continue
+            nu = trace.innovation[at, k].astype(np.float64)
+            for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
+                spread = max(float(nu[:, i].std()), 1e-12)
+                values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
     if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
-        return {}
-    values = {}
+        return values
+    unit = np.maximum(trace.episode.states.astype(np.float64).std(0), 1e-9)
     for k, modality in enumerate(trace.modalities):
         at = np.isfinite(trace.log_likelihood[:, k]).all(-1) & ~absent(trace, modality)
         if at.sum() < MIN_STEPS:
@@ -229,6 +247,9 @@ def _offsets(trace: Trace) -> dict[str, float]:
         weights /= weights.sum(-1, keepdims=True)
         around = trace.task.difference(particles, particles[:, :1])  # angles have no mean
         std = around.std(1)
+        power = float((likelihood.std(-1) / np.maximum(np.square(std / unit).mean(-1), 1e-12)).mean())
+        if power > 0.0:
+            values[f"likelihood width/{modality}/all"] = 1.0 / np.sqrt(power)
         moved = np.einsum("tp,tpn->tn", weights, around) - around.mean(1)
         for i, component in enumerate(trace.task.components):
             if (known := std[:, i] > 0.0).sum() >= MIN_STEPS:

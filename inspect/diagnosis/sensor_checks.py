@@ -35,7 +35,7 @@ from beliefscope.inspect.diagnosis.window_checks import (
 )
 from beliefscope.inspect.diagnostics.statistic_kinds import sensor_of
 from beliefscope.inspect.statistics.reading_model import ReadingModel
-from beliefscope.inspect.statistics.reference_images import Reference, image_keys
+from beliefscope.inspect.statistics.reference_images import Reference, image_keys, with_gray_images
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
 
 CONTRAST = {"level": 0.3, "noise": 0.7, "position noise": 0.7, "brightness": 0.5}
@@ -46,7 +46,7 @@ def sensor_statistics(
     episode: Episode, reference: Reference | None, readings: Sequence[ReadingModel] = ()
 ) -> dict[str, float]:
     """All statistics of sensors and controls; some of images only with a reference, of others only with a model."""
-    episode = with_continuous_angles(episode)
+    episode = with_gray_images(with_continuous_angles(episode))
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
@@ -79,7 +79,7 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
     key, axis = sensor_of(subject, episode.observations)
     if key not in episode.observations:
         return None
-    episode = with_continuous_angles(episode)
+    episode = with_gray_images(with_continuous_angles(episode))
     marked = _marked_steps(kind, key, axis, episode)
     if marked is not None:
         steps = np.flatnonzero(marked)

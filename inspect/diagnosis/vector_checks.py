@@ -345,7 +345,8 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
     values: dict[str, float] = {}
     for key in _vector_keys(episode):
         values |= axis_statistics(episode, key)
-        values |= own_size_statistics(episode, key) if key not in (FORCE, TORQUE) else {}
+        is_known = HAND in episode.observations and key in (FORCE, TORQUE)
+        values |= {} if is_known else own_size_statistics(episode, key)
     if HAND in episode.observations:
         hand, present = episode.observations[HAND], episode.present(HAND)
         noise = noise_level(hand.astype(np.float64), present)

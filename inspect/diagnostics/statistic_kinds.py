@@ -65,6 +65,8 @@ KINDS = {
     "particles": ("number of particles", True, 0.02),
     "likelihood share": ("power of the likelihood{of} in the particle weights", False, 0.02),
     "likelihood offset": ("offset of the particles by the likelihood, in their standard deviations,", False, 0.05),
+    "likelihood width": ("width of the likelihood{of} at true states", True, 0.05),
+    "innovation offset": ("mean of the innovations at true states, in their standard deviations,", False, 0.05),
     "ancestors": ("share of particles with offspring", False, 0.01),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),

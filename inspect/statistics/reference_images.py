@@ -7,7 +7,7 @@ A healthy profile stores it, so that the images of later episodes can be compare
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,9 @@ CONTACT = "contact"
 
 LEVELS = 127
 """Largest integer of stored expected images."""
+
+LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue."""
 
 TAIL = 0.002
 """Share of the images below and above the range of a pixel."""
@@ -130,6 +133,15 @@ def image_keys(episode: Episode) -> list[str]:
     return [key for key, array in episode.observations.items() if array.ndim == 3 and array.dtype == np.uint8]
 
 
+def with_gray_images(episode: Episode) -> Episode:
+    """The episode with images of colours (T, H, W, 3) as the gray ones (T, H, W) of their luminance (Rec. 601)."""
+    keys = [key for key, array in episode.observations.items() if array.ndim == 4 and array.dtype == np.uint8]
+    if not keys:
+        return episode
+    gray = {key: np.rint(episode.observations[key] @ LUMINANCE).astype(np.uint8) for key in keys}
+    return replace(episode, observations={**episode.observations, **gray})
+
+
 def median_image(images: Gray) -> Array:
     """(H, W) median over the steps with an image; NaN without any."""
     seen = images[~lost_images(images)]
@@ -138,6 +150,7 @@ def median_image(images: Gray) -> Array:
 
 def measure_reference(episodes: Sequence[Episode]) -> Reference | None:
     """The reference of clean episodes; None for tasks without an image."""
+    episodes = [with_gray_images(episode) for episode in episodes]
     if not episodes or not (keys := image_keys(episodes[0])):
         return None
     key = keys[0]

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 FILTER = (
     "error/*|angle error/*|component error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*"
-    "|ancestors/*|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*|likelihood offset/*"
+    "|ancestors/*|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*"
 )
 """Belief of the filter, and the use of its modules."""
 
 WEIGHTS = f"beta logit/*|beta spread/*|beta contact/*|{FILTER}"
 """Fusion weights."""
 
-DYNAMICS = f"dynamics */*|{FILTER}"
+MODEL_KINDS = ("likelihood offset", "likelihood width", "innovation offset")
+"""Kinds of statistics of the measurement models of external filters, at true states."""
+
+DYNAMICS = f"dynamics */*|{'|'.join(f'{kind}/*' for kind in MODEL_KINDS)}|{FILTER}"
 """The dynamics model."""
 
 LABELS = "lag/labels*|offset/labels*"
@@ -20,11 +23,17 @@ LABELS = "lag/labels*|offset/labels*"
 CONTACT_DISTANCE = "contact distance*/*"
 """Hand against the labelled object in contact, which no image and no module changes."""
 
-IMAGE = f"module */*image*|{LABELS}|{WEIGHTS}"
+
+def model_of(modality: str) -> str:
+    """Statistics of the measurement model of a modality."""
+    return "|".join(f"{kind}/*{modality}*" for kind in ("module *", *MODEL_KINDS))
+
+
+IMAGE = f"{model_of('image')}|{LABELS}|{WEIGHTS}"
 """Modules that use the image."""
 
 IMPEDANCE = "offset/control*|compliance/force*|following/control*"
 """How the measured hand follows its set point under the measured force."""
 
-HAPTICS = f"module */*haptics*|{LABELS}|{WEIGHTS}"
+HAPTICS = f"{model_of('haptics')}|{LABELS}|{WEIGHTS}"
 """Modules that use haptics."""

@@ -8,7 +8,8 @@ from typing import Literal
 
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, model_of
+from beliefscope.inspect.diagnosis.causes.own_sensors import offset_of
 
 
 def _dynamics(*kinds: str) -> str:
@@ -200,14 +201,14 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             f"Measurement noise of {name} too {size}",
             (
                 Symptom(
-                    f"measurement noise/{modality}/*",
+                    f"measurement noise/{modality}/*|likelihood width/{modality}/*",
                     direction,
                     otherwise=(Symptom(f"innovation share/{modality}/*", direction),),
                 ),
                 Symptom("measurement noise//*", direction, optional=True),
             ),
             FILTER,
-            f"Compare R of {name} with the variance of its readings.",
+            f"Compare R of {name}, or the width of its likelihood, with the variance of its readings.",
         )
         for size, direction in sizes
     )
@@ -217,14 +218,15 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
             f"measurement.{modality}.function",
             f"Measurement function of {name} wrong",
             (Symptom("|".join(f"measurement function/{key}/*|measurement function/{key} */*" for key in keys)),),
-            f"measurement noise/{modality}/*|{FILTER}",  # a likelihood of a wrong scale has another width
+            # A likelihood of a wrong scale has another width.
+            f"measurement noise/{modality}/*|{model_of(modality)}|{FILTER}",
             f"Compare h of {name} at the true states with its readings: positions of landmarks, units, signs.",
         ),
         Cause(
             f"measurement.{modality}.bias",
             f"Measurement function of {name} biased",
-            (Symptom(f"innovation bias/{modality} *|likelihood offset/{modality} *", 0),),
-            FILTER,
+            (replace(offset_of(modality), unmeasured=(Symptom(f"innovation bias/{modality} *", 0),), optional=False),),
+            f"likelihood width/{modality}/*|{FILTER}",
             f"Compare h of {name} at the true states with its readings: offsets, positions of landmarks.",
             prior=-0.6,
         ),

@@ -8,7 +8,7 @@ from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import data, fusion, model
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
-from beliefscope.inspect.diagnosis.causes.own_sensors import KNOWN
+from beliefscope.inspect.diagnosis.causes.own_sensors import KNOWN, offset_of
 from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
 from beliefscope.inspect.diagnosis.vector_checks import commands_hand
 from beliefscope.inspect.statistics.reference_images import HAND
@@ -35,7 +35,8 @@ def _models(task: Task) -> tuple[Cause, ...]:
 
 
 def _labels(task: Task) -> tuple[Cause, ...]:
-    """Delayed labels of tasks without a measured hand: behind all modalities and, if these cause changes, the controls.
+    """Labels of tasks without a measured hand: delayed behind all modalities and, if these cause changes, the controls;
+    or with an offset from all of them.
 
     A faulty sensor can make a single modality appear early, so each of them counts.
     """
@@ -46,7 +47,13 @@ def _labels(task: Task) -> tuple[Cause, ...]:
     lag = Symptom("lag/labels/*|lag/dynamics/*", 1, 2.0, otherwise=(Symptom("reading lag/*", -1),))
     controls = Symptom("reading lag/control/*", -1, optional=True)
     sensors = [Symptom(f"reading lag/{key}/*", -1, optional=True) for key in modelled_sensors(task)]
-    return (replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls, *sensors)),)
+    (offset,) = (cause for cause in data.CAUSES if cause.name == "labels.offset")
+    objects, *_, common = offset.symptoms
+    biases = [offset_of(modality, 0.3) for modality in task.modalities]
+    return (
+        replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls, *sensors)),
+        replace(offset, symptoms=(objects, replace(common, optional=True), *biases)),
+    )
 
 
 def _controls(task: Task) -> tuple[Cause, ...]:

@@ -8,7 +8,7 @@ from functools import partial
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import image
-from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS, model_of
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
 from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
 from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, has_labels_only
@@ -56,10 +56,14 @@ VIEW = {
 }
 """Mechanisms of causes in the image that other cameras have as well -> title."""
 
+PREFERRED = -0.1
+"""Prior of an occlusion: a camera that has moved shows other parts of the scene as well, and moves the object."""
+
 
 def sensor_causes(task: Task) -> tuple[Cause, ...]:
     """Causes in the sensors of a task that have none in the catalog."""
-    keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in KNOWN}
+    known = KNOWN if HAND in task.observations else ("image", "contact")  # the physics of force and torque
+    keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in known}
     result = []
     for key, modality in keys.items():
         changed = f"{_patterns(key, '*')}|lag/*|{_downstream(modality)}"
@@ -144,6 +148,7 @@ def _changed_views(key: str, modality: str) -> list[Cause]:
             consequences=renamed(cause.consequences) + (f"|sharpness/{key}/*" if mechanism == "occlusion" else ""),
             lowers=renamed(cause.lowers),
             undo=f"drop {modality}",
+            prior=PREFERRED if mechanism == "occlusion" else 0.0,
         )
         for cause in image.CAUSES
         if (mechanism := cause.name.partition(".")[2]) in VIEW
@@ -152,7 +157,12 @@ def _changed_views(key: str, modality: str) -> list[Cause]:
 
 def _downstream(modality: str) -> str:
     """Statistics that a fault in a sensor of a modality changes downstream."""
-    return f"module */*{modality}*|likelihood share/*|{LABELS}|{WEIGHTS}"
+    return f"{model_of(modality)}|likelihood share/*|{LABELS}|{WEIGHTS}"
+
+
+def offset_of(modality: str, weight: float = 1.0) -> Symptom:
+    """Offset of the measurement model of a modality at the true states."""
+    return Symptom(f"innovation offset/{modality} *|likelihood offset/{modality} *", 0, weight, optional=True)
 
 
 def _moved_cameras(task: Task) -> tuple[Cause, ...]:
@@ -164,11 +174,11 @@ def _moved_cameras(task: Task) -> tuple[Cause, ...]:
     for modality, keys in task.modalities.items() if HAND not in task.observations else ():
         for key in (key for key in keys if key in task.images):
             changed = f"object match/*|occlusion/{key}/*|brightness/{key}/*|sharpness/{key}/*|{_downstream(modality)}"
-            title = "Camera moved" if key == "image" else f"Camera {display_name(key)} moved"
+            title = "Camera moved" if key in ("image", "camera") else f"Camera {display_name(key)} moved"
             symptoms = (
                 Symptom(OBJECT, 0),
-                Symptom(f"module bias/*{modality}*", 0, 0.5),
-                Symptom("module bias/*", 0, 0.3, "alone"),
+                Symptom(f"module bias/*{modality}*", 0, 0.5, unmeasured=(offset_of(modality),), optional=True),
+                Symptom("module bias/*", 0, 0.3, "alone", optional=True),
             )
             undo = f"realign image|drop {modality}" if key == "image" else f"drop {modality}"
             result.append(Cause(f"{key}.shift", title, symptoms, changed, "Calibrate the camera pose again.", undo))
