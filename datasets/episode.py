@@ -66,7 +66,8 @@ class Episode:
     def __post_init__(self) -> None:
         """Fill in the defaults, and convert floating-point arrays to float32."""
         steps = len(self.states)
-        absent = {"contact": np.zeros(steps, bool), "controls": np.zeros((steps, 0)), "qpos": np.zeros((steps, 0))}
+        contact = np.asarray(self.covariates.get("contact", np.zeros(steps)), np.float64) > 0.5
+        absent = {"contact": contact, "controls": np.zeros((steps, 0)), "qpos": np.zeros((steps, 0))}
         values: dict[str, Any] = {name: array for name, array in absent.items() if getattr(self, name) is _MISSING}
         values |= {} if self.dt else {"dt": self.task.dt}
         values["states"] = self.task.states(self.states)

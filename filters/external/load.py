@@ -15,6 +15,7 @@ The contract (examples in ``docs/own_filter.md``):
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,6 +70,11 @@ from beliefscope.filters.filter import Filter
 from beliefscope.filters.names import code_parts, external_name
 from beliefscope.filters.rollout import START_VARIANCE
 
+IN_TRAINING = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
+"""Modules that are others in training mode."""
+
+EVALUATION = "without dropout, and with the stored statistics of batch normalisation (eval())"
+
 
 class ExternalFilter(Checkpoint):
     """An external filter as a checkpoint: it can be traced, evaluated and displayed, but not stepped by the caller.
@@ -93,6 +99,8 @@ class ExternalFilter(Checkpoint):
         for key, value in values.items():
             object.__setattr__(self, key, value)  # a checkpoint is frozen
         if isinstance(adapter.module, nn.Module):
+            if adapter.module.training and any(isinstance(part, IN_TRAINING) for part in adapter.module.modules()):
+                warnings.warn(f"{name} is in training mode; it runs in evaluation mode: {EVALUATION}", stacklevel=2)
             adapter.module.eval()
 
     adapter: Adapter

@@ -219,8 +219,8 @@ class Diagnosis:
 
     @property
     def listed(self) -> tuple[Candidate, ...]:
-        """The causes with a probability of at least ``SHOWN``."""
-        return tuple(cause for cause in self.causes if cause.probability >= SHOWN)
+        """The causes with evidence and a probability of at least ``SHOWN``."""
+        return tuple(cause for cause in self.causes if cause.probability >= SHOWN and cause.evidence)
 
     def _repr_html_(self) -> str:
         """Headline and tables in a notebook."""

@@ -192,6 +192,13 @@ def test_hash_covers_no_state_of_the_process() -> None:
     assert first == as_external(module, "logging", "door").hash
 
 
+def test_a_module_in_training_mode_runs_in_evaluation_mode_with_a_warning() -> None:
+    noisy = nn.Sequential(nn.Linear(1, 1), nn.Dropout(0.5))
+    with pytest.warns(UserWarning, match="noisy is in training mode; it runs in evaluation mode: without dropout"):
+        ExternalFilter(Adapter(noisy), DOOR, "noisy")
+    assert not noisy[1].training
+
+
 def test_hash_covers_code_without_a_file() -> None:
     """Classes and functions of notebooks: their modules have no file."""
 

@@ -53,8 +53,9 @@ class Particles:
         variance: float = 1.0,
         keeps_weights: bool = True,
         offset: float = 0.0,
+        width: float = 1.0,
     ) -> None:
-        self.keeps_weights, self.offset = keeps_weights, offset
+        self.keeps_weights, self.offset, self.width = keeps_weights, offset, width
         self.count, self.powers, self.resample, self.best_only = count, powers or {}, resample, best_only
         self.weighted, self.variance = weighted, variance
 
@@ -68,7 +69,8 @@ class Particles:
         prior = self.log_weights if self.keeps_weights else np.full(self.count, -np.log(self.count))
         offsets = {"near": self.offset, "far": 0.0}
         errors = {k: observations[k] - self.x[:, 0] - offsets[k] for k in STD}
-        likelihood = np.stack([-0.5 * (errors[k] / s) ** 2 for k, s in STD.items()])
+        widths = {"near": self.width, "far": 1.0}
+        likelihood = np.stack([-0.5 * (errors[k] / s / widths[k]) ** 2 for k, s in STD.items()])
         posterior = prior + sum(self.powers.get(k, 1.0) * row for k, row in zip(STD, likelihood, strict=True))
         posterior -= np.logaddexp.reduce(posterior)
         values = {"particles": self.x, "log_weights": posterior, "prior_log_weights": prior}
@@ -164,6 +166,18 @@ def test_a_likelihood_with_an_offset_moves_the_particles_around_true_states(offs
     # Five runs of 40 steps with noise of the readings: 0.1 is four standard deviations of their mean.
     assert near == pytest.approx(-offset * std / (std**2 + STD["near"] ** 2), abs=0.1)
     assert far == pytest.approx(0.0, abs=0.1)
+
+
+def test_the_width_of_a_likelihood_is_proportional_to_its_standard_deviation() -> None:
+    """Whatever the spread of the particles at the true states; without a model of the readings."""
+    values = []
+    for module in (Particles(), Particles(width=3.0)):
+        filter_ = filter_of(module)
+        values.append(model_statistics(bs.trace(filter_, [ride(0)], 0), filter_))
+    (near, wide), (far, other) = ([v[f"likelihood width/{key}/all"] for v in values] for key in STD)
+    assert wide / near == pytest.approx(3.0, rel=0.05)  # the spread at the start is that of the run's estimates
+    assert other / far == pytest.approx(1.0, rel=0.05)
+    assert far / near == pytest.approx(STD["far"] / STD["near"], rel=0.2)  # in the mean over the readings
 
 
 def test_moments_of_angles_are_those_of_their_differences() -> None:

@@ -52,6 +52,27 @@ def test_a_second_sensor_separates_a_moved_camera_from_labels_with_an_offset() -
     assert labels["labels.offset"] > 0.8 > 0.25 > labels["image.shift"]
 
 
+def test_colour_images_have_the_statistics_of_their_luminance() -> None:
+    rng, steps = np.random.default_rng(0), 30
+    task = replace(TASK, observations={"image": (8, 8, 3), "gps": (2,)})
+
+    def episodes(*axes: int) -> list[Episode]:
+        result = []
+        for _ in range(3):
+            gray = rng.integers(0, 255, (steps, 8, 8)).astype(np.uint8)
+            image = np.repeat(gray[..., None], 3, -1) if axes else gray
+            states, gps = rng.normal(size=(steps, 2)), rng.normal(size=(steps, 2))
+            result.append(Episode(task if axes else TASK, states, observations={"image": image, "gps": gps}))
+        return result
+
+    gray = sensor_record(episodes())
+    rng = np.random.default_rng(0)
+    colour = sensor_record(episodes(3))
+    for row, same in zip(colour.rows, gray.rows, strict=True):
+        assert dict(row) == pytest.approx(dict(same), nan_ok=True)
+    assert "brightness/image/all" in colour.rows[0]
+
+
 @pytest.mark.parametrize(("noise", "explained"), [(8.0, True), (-8.0, False)])
 def test_a_bias_of_a_part_of_an_episode_adds_to_the_noise(noise: float, explained: bool) -> None:
     """Around the mean error, which does not become smaller."""
