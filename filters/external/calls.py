@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -27,6 +28,9 @@ DT = "dt"
 """Key under which a filter receives the durations of irregular steps."""
 
 
+IN_TRAINING = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
+"""Modules that do something else in training mode."""
+
 PRESENT = ".present"
 """End of the keys under which a filter receives the masks of sensors."""
 
@@ -49,6 +53,17 @@ def has_own_start(filter_: Any) -> bool:
 def takes_start(filter_: Any) -> bool:
     """Whether the filter is called step by step from a belief that it is given."""
     return is_stepwise(filter_) and not has_own_start(filter_)
+
+
+def evaluation_mode(module: nn.Module, name: str) -> None:
+    """Set a module to evaluation mode. Warns if its training mode has other results."""
+    if module.training and any(isinstance(part, IN_TRAINING) for part in module.modules()):
+        warnings.warn(
+            f"{name} is in training mode; it runs in evaluation mode: without dropout, and with the stored statistics "
+            "of batch normalisation",
+            stacklevel=3,
+        )
+    module.eval()
 
 
 @contextmanager

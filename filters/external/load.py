@@ -15,7 +15,6 @@ The contract (examples in ``docs/own_filter.md``):
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,6 +50,7 @@ from beliefscope.filters.external.calls import (
     described,
     device_of,
     dtype_of,
+    evaluation_mode,
     has_own_start,
     initialize,
     inputs_of,
@@ -69,11 +69,6 @@ from beliefscope.filters.external.torchfilter_hooks import Capture
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.names import code_parts, external_name
 from beliefscope.filters.rollout import START_VARIANCE
-
-IN_TRAINING = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
-"""Modules that are others in training mode."""
-
-EVALUATION = "without dropout, and with the stored statistics of batch normalisation (eval())"
 
 
 class ExternalFilter(Checkpoint):
@@ -99,9 +94,7 @@ class ExternalFilter(Checkpoint):
         for key, value in values.items():
             object.__setattr__(self, key, value)  # a checkpoint is frozen
         if isinstance(adapter.module, nn.Module):
-            if adapter.module.training and any(isinstance(part, IN_TRAINING) for part in adapter.module.modules()):
-                warnings.warn(f"{name} is in training mode; it runs in evaluation mode: {EVALUATION}", stacklevel=2)
-            adapter.module.eval()
+            evaluation_mode(adapter.module, name)
 
     adapter: Adapter
     source: str

@@ -124,7 +124,7 @@ export class Diagnostics {
     }
     try {
       const entries = await api.diagnostics(trace.selection, this.#loading.signal);
-      // those that do not apply come last
+      // Diagnostics that do not apply come last.
       this.#entries = [...entries].sort((a, b) => Number(!!a.why_not) - Number(!!b.why_not));
     } catch (error) {
       if (!isAbort(error)) setPanelState(this.#host, 'error', messageOf(error));

@@ -1,4 +1,4 @@
-"""Causes in a filter of which only recorded runs exist: they show in its estimates, while the readings are healthy."""
+"""Causes in a filter known by recorded runs only: they show in its estimates, while the readings are healthy."""
 
 from __future__ import annotations
 
