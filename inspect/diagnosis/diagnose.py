@@ -39,7 +39,7 @@ from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
 from beliefscope.inspect.diagnosis.undo import brings_back
 from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
-from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, no_diagnosis
+from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -249,10 +249,7 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
     """The healthy profile of a filter. Raises BadInput without one."""
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None and isinstance(checkpoint, UnavailableFilter):
-        raise BadInput(
-            f"{no_diagnosis(checkpoint)}; compare this recorded run with at least {MIN_HEALTHY} healthy ones: "
-            "beliefscope diagnose RUN --profile-from DIR"
-        )
+        raise BadInput(no_diagnosis(checkpoint) or "")
     if profile is None:
         source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
         raise BadInput(

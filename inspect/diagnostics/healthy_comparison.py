@@ -18,6 +18,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile, profile_document
 from beliefscope.inspect.diagnostics.statistic_kinds import (
     KINDS,
@@ -58,6 +59,9 @@ SMALLEST_REST = 0.005
 
 MIN_HEALTHY = 10
 """Minimum number of healthy episodes with a value of a statistic."""
+
+COMPARE_RUNS = "beliefscope diagnose DIR --profile-from HEALTHY_DIR"
+"""Diagnosis of a filter that is not available."""
 
 COUNTED = ("steps", "gray levels")
 """Units with a singular."""
@@ -344,4 +348,6 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
         if not isinstance(count, int) or count >= MIN_HEALTHY:  # a malformed record is reported by the diagnosis
             return None
         lacking = f"a healthy record of {plural(count, 'episode')}, fewer than the {MIN_HEALTHY} needed"
+    if isinstance(checkpoint, UnavailableFilter):
+        lacking += f"; compare its recorded runs with at least {MIN_HEALTHY} healthy ones: {COMPARE_RUNS}"
     return f"this filter has {lacking}"
