@@ -174,10 +174,11 @@ def _of_recordings(
     clean = recorded_runs(healthy) if healthy and is_run(str(healthy)) else []
     places = [runs.task] * len(traces) + [str(healthy)] * len(clean)
     every = of_one_task([*traces, *clean], places)
-    first = every[0]
-    checkpoint = checkpoint_of(every, [Path(place) for place in places], runs.filter)
-    checkpoint = checkpoint or UnavailableFilter(first.filter, first.checkpoint_hash, first.task)
     traces, clean = every[: len(traces)], every[len(traces) :]
+    first, version = traces[0], traces[0].checkpoint_hash
+    checkpoint = checkpoint_of(traces, [Path(runs.task)] * len(traces), runs.filter)
+    if checkpoint is None or (clean and clean[0].checkpoint_hash != version):  # the runs of another version
+        checkpoint = UnavailableFilter(first.filter, version, first.task)
     if episode is not None:
         traces = [trace for trace in traces if trace.episode_index == episode]
         if not traces:
