@@ -178,8 +178,15 @@ def fault_slice(faults: Faults) -> Slice:
 
 
 def parse_slices(texts: Iterable[str], fault_sets: Iterable[str], task: Task) -> list[Slice]:
-    """Slices from their text, and slices of all steps with faults, given as text or file."""
+    """Slices from their text, and slices of all steps with faults, given as text or file. Raises BadInput."""
     named = (*standard_slices(task), *fault_slices(task, tuple(task.modalities)))
+    texts = list(texts)
+    groups = {group for name, covariate in task.covariates.items() for group in covariate.group_names(name)}
+    if other := sorted(groups.intersection(texts) - {slice_.name for slice_ in named}):
+        raise BadInput(
+            f"slices select steps by contact only, not by {other[0]!r}; a sweep has the errors in its steps, as a "
+            "phase (docs/sweep.md)"
+        )
     slices = [Slice.parse(text, named) for text in texts]
     for text in fault_sets:
         faults = read_faults(text, task)

@@ -162,18 +162,16 @@ class CheckpointComparison(Diagnostic):
             "frozen",
             "SHA-256",
         )
-        rows = (
-            _module_row(m)
-            for m in self.modules
-            if m.name in self.frozen or (not m.unchanged and m.name.count(".") < DEPTH)
-        )
+        names = {m.name for m in self.modules if not m.unchanged and m.name.count(".") < DEPTH} | {*self.frozen}
+        rows = (_module_row(m) for m in self.modules if m.name in names)
         return Table("Modules", columns, tuple(rows))
 
     def event_table(self) -> Table:
         """One row per regressed event."""
         timed = any(m.time is not None for m in self.events)
         time = ("time (s)",) if timed else ()
-        columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", "contact")
+        contact = ("contact",) if any(size.slice.contact is not None for size in self.slices) else ()
+        columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", *contact)
         unit, factor = self.conversion
         columns += tuple(with_unit(name, unit) for name in ("before", "after", "increase"))
         rows = tuple(
@@ -184,7 +182,7 @@ class CheckpointComparison(Diagnostic):
                 *((m.time,) if timed else ()),
                 m.first,
                 m.last,
-                "yes" if m.contact else "no",
+                *(("yes" if m.contact else "no",) if contact else ()),
                 factor * m.before,
                 factor * m.after,
                 factor * (m.after - m.before),

@@ -2,6 +2,7 @@ from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.text import plural
 from beliefscope.recordings.report.command_lines import serve_command
 
 
@@ -46,6 +47,7 @@ def change(
     from beliefscope.filters.open_filter import open_filters
     from beliefscope.inspect.compare.checkpoints import compare_checkpoints, write_comparison
     from beliefscope.inspect.diagnostics.views import as_json
+    from beliefscope.inspect.standalone import removal_note
 
     if output is not None and (output.exists() or not output.parent.is_dir()):
         raise BadInput(f"output {str(output)!r} exists, or its parent folder does not; give the name of a new folder")
@@ -78,6 +80,9 @@ def change(
         "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
         "serve": serve_command([text for text in (before, after) if is_path(text) or is_code(text)], data, seed),
     }
+    heading = f"Before: {report.filters[0]}; after: {report.filters[1]}; {plural(len(report.episodes), 'episode')}"
+    notes = dict.fromkeys(filter(None, map(removal_note, checkpoints)))
+    text = "\n\n".join([heading, report.text, *notes])
     if output is not None:
-        write_comparison(output, document, report.text, report.plot())
-    return console.Result(document, report.text)
+        write_comparison(output, document, text, report.plot())
+    return console.Result(document, text)
