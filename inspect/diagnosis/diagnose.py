@@ -19,6 +19,7 @@ from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
 from beliefscope.filters.external.adapter import MIN_STEPS, FailedStep
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.filters.names import is_code
 from beliefscope.inspect.diagnosis.case import (
     Case,
     affected_episodes,
@@ -251,7 +252,9 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
     if profile is None and isinstance(checkpoint, UnavailableFilter):
         raise BadInput(no_diagnosis(checkpoint) or "")
     if profile is None:
-        source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
+        source = str(checkpoint.path or checkpoint.name)
+        if isinstance(checkpoint, ExternalFilter):  # its name is no command line's, such as that of a live run
+            source = checkpoint.source if is_code(checkpoint.source) else "FILE.py:FUNCTION"
         raise BadInput(
             f"{no_diagnosis(checkpoint)}; compare it with clean episodes: beliefscope diagnose "
             f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
+import beliefscope as bs
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.inspect.diagnosis.diagnose import required_profile
 from beliefscope.inspect.healthy import overlap_warning
 
 
@@ -12,3 +20,15 @@ def test_diagnosed_episodes_in_the_healthy_record_are_counted() -> None:
     diagnosed = episodes[2:]
     assert overlap_warning(episodes[:2], diagnosed) is None
     assert "contains 1 of the 2 diagnosed episodes" in str(overlap_warning(episodes[:3], diagnosed))
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "source"),
+    [
+        (UnavailableFilter("live", "", DOOR), "FILE.py:FUNCTION"),
+        (bs.load_filter("examples/04_own_filter.py:build"), "examples/04_own_filter.py:build"),
+    ],
+)
+def test_the_command_for_a_healthy_record_names_a_filter_that_it_can_open(checkpoint: Checkpoint, source: str) -> None:
+    with pytest.raises(BadInput, match=f"beliefscope diagnose door --filter {source} --data DATA"):
+        required_profile(checkpoint)
