@@ -228,18 +228,17 @@ def weights_figure(trace: Trace) -> Figure:
     """Estimates of the map components, and the weights below, over steps with shaded contact.
 
     Component-wise weights are drawn for the map components. Raises BadInput for a trace without weights; the network's
-    output beta suffices.
+    output beta, or effective weights without updates by modality, suffice.
     """
-    effective, beta = trace.effective_weights, trace.weights
-    if (why := weight_audit.why_not(trace)) and (effective is not None or beta is None):
-        raise BadInput(f"no weights to draw: {why}")
-    weights = effective if effective is not None else beta
-    assert weights is not None
+    weights = trace.weights if trace.effective_weights is None else trace.effective_weights
+    if weights is None:
+        raise BadInput(f"no weights to draw: {weight_audit.why_not(trace)}")
     task = trace.task
     component_wise = weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)
     with rc_context(STYLE):
-        legends = 2.0 * legend_height([*map(measures.layer_label, measures.layers(trace)), "truth"])
+        drawn = [*trace.modalities_with_posterior, "fused"]
+        legends = 2.0 * legend_height([*map(measures.layer_label, drawn), "truth"])
         height = 1.35 * (len(task.map_indices) + len(columns)) + 0.4 + legends
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         FigureCanvasAgg(figure)
@@ -270,7 +269,9 @@ def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
         steps, fused, label="fused", color=COLOURS["fused"], lw=2.4
     )  # wide, so that a dominant modality on top leaves it visible
     for modality, values in zip(trace.modalities, unimodal, strict=True):
-        axes.plot(steps, values, label=measures.layer_label(modality), color=colour(modality, trace.modalities), lw=0.9)
+        if modality in trace.modalities_with_posterior:
+            label = measures.layer_label(modality)
+            axes.plot(steps, values, label=label, color=colour(modality, trace.modalities), lw=0.9)
     truth = factor * trace.episode.states[:, component].astype(np.float64)
     axes.plot(steps, truth, label="truth", color=COLOURS["truth"], lw=1.4, ls="--")
 

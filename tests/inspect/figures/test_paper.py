@@ -199,3 +199,11 @@ def test_weights_without_effective_ones_are_the_output_of_the_network() -> None:
     _, traced = run("crossmodal-ekf")
     axes = paper.weights_figure(replace(traced, effective_weights=None)).axes[-1]
     assert {line.get_label() for line in axes.lines} == {"image beta", "haptics beta"}
+
+
+def test_effective_weights_are_drawn_without_updates_by_modality() -> None:
+    _, traced = run("crossmodal-ekf")
+    unknown = np.full_like(traced.modality_mean, np.nan)
+    x, *_, weight = paper.weights_figure(replace(traced, weights=None, modality_mean=unknown)).axes
+    assert {*lines_of(x)} == {"fused", "truth"}
+    assert {*lines_of(weight)} == {"image effective", "haptics effective"}
