@@ -47,6 +47,9 @@ def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
     cells = page.locator("#values tbody tr").last.locator("td").all_text_contents()
     estimate = 100.0 * run.estimate_mean[moment, 0]
     assert abs(float(cells[1]) - estimate) <= 5e-3 * abs(estimate)  # three digits
+    page.set_viewport_size({"width": 800, "height": 768})
+    values = page.locator("#values")
+    assert values.evaluate("({ scrollWidth, clientWidth }) => scrollWidth <= clientWidth"), "columns are cut"
     assert requests == [f"{address}#step=42"] or requests == [address]
     assert not problems
     page.close()
