@@ -193,8 +193,9 @@ def _run(trace: Trace) -> Passage:
         start = "Runs start at an offset from the true state, with a covariance that matches the distance"
     elif not measures.starts_at_truth(trace):
         start = "Runs start at a first belief that the filter or its user sets"
-    elif trace.kind == "external" and trace.has_covariance:
-        start += f", with the standard deviations {_start_std(trace)}"
+    elif trace.kind == "external":
+        known = trace.has_covariance and np.isfinite(trace.start_covariance).all()
+        start += f", with the standard deviations {_start_std(trace)}" if known else ""
     elif trace.has_covariance:
         start += ", with covariance 0.1 $I$ in units of the training set's standard deviations"
     excluded = f"exclude the first {task.warmup} steps of each episode, which depend on the start"
