@@ -70,6 +70,13 @@ def plane_of(trace: Trace, components: tuple[str, ...] = ()) -> Plane:
     return Plane(indices, tuple(widths))
 
 
+def is_outside(trace: Trace, step: int) -> bool:
+    """Whether the fused estimate of a step is outside of the task's map around the true state."""
+    plane = plane_of(trace)
+    error = trace.task.difference(trace.estimate_mean[step], trace.anchors[step])[list(plane.components)]
+    return bool((np.abs(error) > plane.half_widths).any())
+
+
 def axis_titles(task: Task, components: Sequence[int]) -> list[tuple[str, float]]:
     """Title of each axis of a map, such as ``hinge x offset (cm)``, and the factor of its values."""
     parts = [task.components[i] for i in components]

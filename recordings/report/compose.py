@@ -35,6 +35,7 @@ from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.figures.top_view import draw_step, draws_force, scene_footprints
 from beliefscope.inspect.maps.map_engine import FINE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.plane import is_outside
 from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
@@ -53,7 +54,6 @@ from beliefscope.recordings.report.sections import (
     accuracy,
     event_summary,
     event_table,
-    is_outside,
     worst_events,
 )
 
@@ -259,7 +259,7 @@ class Writer:
             caption, zoom = f"{map_.title}. {MAP_CAPTION}", zoom_of(map_)
             if zoom > 1:
                 caption += f" Centre of the map, magnified {zoom} times."
-            if is_outside(trace, map_):
+            if is_outside(trace, step):
                 caption += " The fused estimate is outside of the map."
                 zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:

@@ -160,12 +160,6 @@ def _reach(map_: LikelihoodMap) -> NDArray[Any]:
     return np.array([np.abs(offsets).max() for offsets in (map_.offsets_x, map_.offsets_y)])
 
 
-def is_outside(trace: Trace, map_: LikelihoodMap) -> bool:
-    """Whether the fused estimate is outside of a map around the true state; False without one."""
-    error = np.abs(measures.errors(trace)[map_.step, -1, list(map_.components)])
-    return bool((error > _reach(map_)[: len(error)]).any())
-
-
 def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     """Error, weights and map statistics at one step of each layer that has any."""
     task = trace.task

@@ -36,6 +36,7 @@ def figure(
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.figures import paper
     from beliefscope.inspect.maps.map_engine import no_maps
+    from beliefscope.inspect.maps.plane import is_outside
 
     figure_format(output)
     if kind == "weights" and steps:
@@ -53,6 +54,9 @@ def figure(
         with_contact = "contact" in trace.task.covariates
         if with_contact and False not in selection:
             console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")
+        for step in selection.values():
+            if is_outside(trace, step):
+                console.note(f"Warning: at step {step}, the fused estimate is outside of the map")
         write_figure(paper.maps_figure(checkpoint, trace, selection, quantity=quantity), output)
         extra["map_steps"] = {paper.STATES[state] if with_contact else "all": step for state, step in selection.items()}
     else:

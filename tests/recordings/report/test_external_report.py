@@ -10,9 +10,10 @@ import pytest
 
 import beliefscope as bs
 from beliefscope.inspect.maps.map_engine import MapEngine
+from beliefscope.inspect.maps.plane import is_outside
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.report.compose import compose, write_report
-from beliefscope.recordings.report.sections import event_table, is_outside
+from beliefscope.recordings.report.sections import event_table
 
 STEPS = 12
 TASK = bs.Task(
@@ -60,7 +61,7 @@ def test_numbers_of_maps_that_do_not_contain_the_belief_are_omitted(
     run: Trace, filter_: bs.Checkpoint, step: int, outside: bool
 ) -> None:
     map_ = MapEngine(filter_, run).map(step)
-    assert is_outside(run, map_) == outside
+    assert is_outside(run, step) == outside
     table = event_table(run, step, map_)
     assert table.columns.count("cart error (mm)") == 1
     row = dict(zip(table.columns, table.rows[-1], strict=True))
