@@ -13,7 +13,7 @@ import { numberIn, provenanceOf } from './experiment_provenance.js';
 export const NUMBERS = {
   error: {
     title: 'RMSE',
-    help: 'Root mean square position error, pooled over the steps',
+    help: 'Root mean square error of the position, or of the first map component, pooled over the steps',
     hasUnit: true,
     format: (value) => fixed(value, 2),
   },
@@ -31,7 +31,7 @@ export const NUMBERS = {
   },
   worst: {
     title: 'worst',
-    help: 'Largest position error of all steps',
+    help: 'Largest error of the position, or of the first map component, of all steps',
     hasUnit: true,
     format: (value) => fixed(value, 2),
   },
