@@ -41,6 +41,9 @@ MOST_LATE = 3
 SAME, OTHER = 0.3, 0.8
 """Largest error of h(x) with the reading that the filter uses, and smallest one with another, relative to its noise."""
 
+FLAT = 10.0
+"""Largest width of a likelihood, in standard deviations of the true states of the episode: it has no information."""
+
 MIN_PARTICLES = 3
 """Smallest number of particles on either side of the angle at which readings jump by a turn."""
 
@@ -69,7 +72,9 @@ def measurement_model_statistics(
     if near_truth is not trace and not is_late:
         near = _functions(near_truth, models)
         functions |= {name: near[name] for name in near if name.startswith("measurement function/")}
-    return functions | values | turns | offsets
+    # The noise of modalities whose readings have a model is more exact than the width of their likelihood.
+    widths = {f"likelihood width/{m}/all" for m in trace.modalities if f"measurement noise/{m}/all" in values}
+    return functions | values | turns | {name: value for name, value in offsets.items() if name not in widths}
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
@@ -220,9 +225,7 @@ def _offsets(trace: Trace) -> dict[str, float]:
     moves their mean, in their standard deviations: 0 in a filter whose measurement function is right, whatever its
     noise.
 
-    ``likelihood width/MODALITY``, of particles: inverse root of the mean of s / v, with the standard deviation s of the
-    log-likelihoods of the particles of a step and their mean variance v, in units of that of the true states: of a
-    Gaussian likelihood proportional to its standard deviation, whatever the spread of the particles.
+    ``likelihood width/MODALITY``, of particles: standard deviation of a Gaussian of the same curvature (``_width``).
     """
     values: dict[str, float] = {}
     if trace.innovation is not None:
@@ -247,15 +250,29 @@ def _offsets(trace: Trace) -> dict[str, float]:
         weights /= weights.sum(-1, keepdims=True)
         around = trace.task.difference(particles, particles[:, :1])  # angles have no mean
         std = around.std(1)
-        power = float((likelihood.std(-1) / np.maximum(np.square(std / unit).mean(-1), 1e-12)).mean())
-        if power > 0.0:
-            values[f"likelihood width/{modality}/all"] = 1.0 / np.sqrt(power)
+        values[f"likelihood width/{modality}/all"] = _width(around / unit, likelihood)
         moved = np.einsum("tp,tpn->tn", weights, around) - around.mean(1)
         for i, component in enumerate(trace.task.components):
             if (known := std[:, i] > 0.0).sum() >= MIN_STEPS:
                 mean = float((moved[known, i] / std[known, i]).mean())
                 values[f"likelihood offset/{modality} {component.name}/all"] = mean
     return values
+
+
+def _width(x: Array, likelihood: Array) -> float:
+    """Width of log-likelihoods (S, P) of particles (S, P, n), in their units.
+
+    The log-likelihood over the particles of a step is ``c + sum_i (g_i x_i - s_i x_i^2 / 2)``, whatever their spread.
+    The width is the inverse root of the mean of the sum of s, up to ``FLAT``.
+    """
+    every = np.s_[:, :: 1 + x.shape[1] // PARTICLES]
+    x, y = x[every] - x[every].mean(1, keepdims=True), likelihood[every][..., None]
+    columns = np.concatenate([x, -0.5 * np.square(x)], axis=-1)
+    columns, y = (v - v.mean(1, keepdims=True) for v in (columns, y))
+    scale = np.maximum(np.abs(columns).max(1, keepdims=True), 1e-12)
+    fit = (np.linalg.pinv(columns / scale, rcond=1e-6) @ y / scale.mT)[..., 0]
+    power = float(fit[:, x.shape[-1] :].sum(1).mean())
+    return 1.0 / math.sqrt(max(power, FLAT**-2))
 
 
 def _are_separate(errors: Array) -> bool:
