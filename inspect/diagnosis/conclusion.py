@@ -148,8 +148,11 @@ def _likelihoods(case: Case) -> list[str]:
     trace, checkpoint = case.traces[0], case.inputs.checkpoint
     if trace.log_likelihood is None or not isinstance(checkpoint, ExternalFilter):
         return []
-    names = (name for name in trace.modalities if f"measurement noise/{name}/all" not in case.by_statistic)
-    return [f"measurement noise and measurement function of {display_name(name)}" for name in names]
+    known, result = case.by_statistic, []
+    for name in (name for name in trace.modalities if f"measurement noise/{name}/all" not in known):
+        noise = "" if f"likelihood width/{name}/all" in known else "measurement noise and "
+        result.append(f"{noise}measurement function of {display_name(name)}")
+    return result
 
 
 def _other_lengths(case: Case) -> list[str]:
