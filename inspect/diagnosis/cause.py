@@ -236,15 +236,14 @@ class Diagnosis:
     def tables(self) -> list[Table]:
         """The ranked causes, the evidence and next action of each, and what was not measured.
 
-        The largest deviations take the place of causes if none is listed, and of evidence if there is none.
+        The largest deviations take the place of causes if none is listed.
         """
         causes = self.listed
         unmeasured = tuple((text,) for text in self.provenance.get("unmeasured", ()))
         missing = [Table("Not measured in these episodes", ("sensor or statistic",), unmeasured)] if unmeasured else []
-        largest = [((), deviation) for deviation in self.deviations]
-        largest_table = [_evidence_table("Largest deviations", (), largest)] if largest else []
         if not causes:
-            return [*largest_table, *missing]
+            largest = [((), deviation) for deviation in self.deviations]
+            return [*([_evidence_table("Largest deviations", (), largest)] if largest else []), *missing]
         ranked = tuple(
             (c.cause.name, probability_text(c.probability), _share(c.recovered), index_ranges(c.episodes))
             for c in causes
@@ -253,7 +252,7 @@ class Diagnosis:
         rows = [((c.cause.name,), e) for c in causes for e in c.evidence]
         return [
             Table("Causes", ("cause", "probability", "error removed by undoing it", "episodes"), ranked),
-            *([_evidence_table("Evidence", ("cause",), rows)] if rows else largest_table),
+            _evidence_table("Evidence", ("cause",), rows),
             Table("Next", ("cause", "action"), actions),
             *missing,
         ]

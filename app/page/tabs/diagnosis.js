@@ -25,7 +25,7 @@ const OVER = [
   ['episode', 'this episode'],
   ['held-out', 'held-out episodes'],
 ];
-const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN}.`;
+const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN} or no evidence.`;
 const WITHIN =
   'The largest deviations of all statistics; healthy episodes also have some outside these ranges.';
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
@@ -241,7 +241,9 @@ export class Diagnosis {
     this.#drawMeasured(result);
     if (result === this.#listed) return;
     this.#listed = result;
-    const causes = (result?.causes ?? []).filter(({ probability }) => probability >= SHOWN);
+    const causes = (result?.causes ?? []).filter(
+      ({ probability, evidence }) => probability >= SHOWN && evidence.length > 0,
+    );
     const rows = causes.map((cause, i) => {
       const canTrain = this.#canStart && !i && isTrainable(cause);
       const open = (/** @type {number} */ e, /** @type {number | null} */ s) =>

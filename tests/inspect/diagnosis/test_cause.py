@@ -6,7 +6,7 @@ from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Diagnosis, Evidence
 
 
-def test_largest_deviations_take_the_place_of_evidence_if_there_is_none() -> None:
+def test_largest_deviations_take_the_place_of_causes_without_evidence() -> None:
     deviation = Evidence("NEES/n is 9, healthy 1 (0.5 to 2)", 9.0, 0.5, 2.0)
     cause = next(iter(CAUSES))
     alone = Candidate(cause, 0.06, (0,), None, (), None, "Diagnose more episodes.")
@@ -15,5 +15,5 @@ def test_largest_deviations_take_the_place_of_evidence_if_there_is_none() -> Non
     def titles(candidate: Candidate) -> list[str]:
         return [table.title for table in Diagnosis("unsure", False, "", (candidate,), (deviation,)).tables()]
 
-    assert titles(alone) == ["Causes", "Largest deviations", "Next"]
+    assert titles(alone) == ["Largest deviations"]
     assert titles(supported) == ["Causes", "Evidence", "Next"]
