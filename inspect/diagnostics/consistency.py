@@ -157,7 +157,7 @@ class Consistency(Diagnostic):
         error_rows: list[tuple[Value, ...]] = []
         for entry in self.by_layer:
             low, high = entry.interval
-            limits = f"at least {low:.2f}" if math.isinf(high) else f"{low:.2f} to {high:.2f}"
+            limits = f"at least {_bound(low)}" if math.isinf(high) else f"{_bound(low)} to {_bound(high)}"
             interval = "" if math.isnan(low) else limits
             nis = None if math.isnan(entry.nis) else entry.nis
             head = (measures.layer_label(entry.layer), entry.phase)
@@ -382,3 +382,8 @@ ENTRY = Entry(
     why_not=why_not,
     statistics=trajectory_statistics,
 )
+
+
+def _bound(value: float) -> str:
+    """A bound of NEES / n, that of a filter that diverges with an exponent."""
+    return f"{value:.2f}" if value < 1e6 else f"{value:.3g}"
