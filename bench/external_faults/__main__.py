@@ -1,13 +1,14 @@
-"""Diagnose planted faults of nine external filters and of their data, and count the correct first causes.
+"""Diagnose planted faults of eleven external filters and of their data, and count the correct first causes.
 
     python bench/external_faults
     python bench/external_faults kiln lid --cases healthy0 dt_short
     python bench/external_faults mower shuttle
 
-Each task has a simulator, a correct filter and 12 or 8 faults. Shunter, lid and shuttle are particle filters; kiln,
-turbine and mower extended Kalman filters; rover is an unscented, river an ensemble and skiff an error-state Kalman
-filter. The faults of mower and shuttle are mistakes reported in public, 2 of the data and 10 of the filter; those of
-the first four tasks are 5 of the data and 7 of the filter, of the last three 3 and 5. The healthy record is 60 clean
+Each task has a simulator, a correct filter and 12, 10 or 8 faults. Shunter, lid, shuttle and slot are particle filters;
+kiln, turbine, mower and tray extended Kalman filters; rover is an unscented, river an ensemble and skiff an error-state
+Kalman filter. Tray and slot have a camera and trained networks (``train.py``). The faults of mower and shuttle are
+mistakes reported in public, 2 of the data and 10 of the filter; those of shunter, kiln, turbine and lid are 5 of the
+data and 7 of the filter, of rover, river and skiff 3 and 5, of tray and slot 5 and 5. The healthy record is 60 clean
 episodes; a case has 10 other ones. A diagnosis is correct if its first cause is one of those accepted for the fault. A
 healthy sample with any other state than healthy is a false alarm. A task takes 1 to 6 min.
 """
@@ -34,7 +35,7 @@ import beliefscope as bs
 from beliefscope.datasets.errors import BadInput
 from external_faults.fault import Fault
 
-TASKS = ("shunter", "kiln", "turbine", "lid", "mower", "shuttle", "rover", "river", "skiff")
+TASKS = ("shunter", "kiln", "turbine", "lid", "mower", "shuttle", "rover", "river", "skiff", "tray", "slot")
 HEALTHY = [f"healthy{k}" for k in range(5)]
 
 

@@ -1,10 +1,13 @@
-"""What the tasks share: the description of a fault, angles, a delay, and episodes with a masked sensor."""
+"""What the tasks share: the description of a fault, angles, a delay, episodes with a masked sensor, and weights."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from safetensors.torch import load_file
+from torch import Tensor
 
 import beliefscope as bs
 
@@ -56,3 +59,8 @@ def masked_episode(
 def delay(values: Values, steps: int) -> Values:
     """Readings (T, C) that arrive ``steps`` later; the first one fills the start."""
     return np.concatenate([np.repeat(values[:1], steps, 0), values[:-steps]])
+
+
+def stored(path: Path) -> dict[str, Tensor]:
+    """Trained weights in 32 bits; the large ones are stored in 16 bits."""
+    return {key: value.float() for key, value in load_file(path).items()}
