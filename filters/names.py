@@ -136,8 +136,10 @@ def is_path(text: str) -> bool:
 
 
 def is_run(text: str) -> bool:
-    """Whether the text is the path of a recorded run, or of a folder of them, rather than a name."""
-    return text.endswith(RUNS) or (Path(text).is_dir() and text not in TASKS)
+    """Whether the text is the path of a recorded run, or of a folder with some, rather than a name."""
+    if text.endswith(RUNS):
+        return True
+    return text not in TASKS and Path(text).is_dir() and any(file.suffix in RUNS for file in Path(text).iterdir())
 
 
 def is_code(text: str) -> bool:

@@ -40,11 +40,9 @@ def open_traces(paths: Sequence[Path], filter_: str, task: str = "") -> tuple[li
 def recorded_runs(path: Path) -> list[Trace]:
     """The runs of a file or folder, by their episodes; in the order of the files if these have the same index.
 
-    Raises BadInput as ``open_trace``, for a folder without runs, and for runs of different filters or tasks.
+    Raises BadInput as ``open_trace``, and for runs of different filters or tasks.
     """
     files = sorted(file for file in path.iterdir() if file.suffix in RUNS) if path.is_dir() else [path]
-    if not files:
-        raise BadInput(f"{path} has no recorded runs, files that end in {', '.join(RUNS)}")
     traces = [open_trace(file) for file in files]
     checkpoint_of(traces, files)
     traces = of_one_task(traces, [str(file) for file in files])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.names import RUNS, is_run
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
@@ -39,14 +40,14 @@ class RunsOrRecorded(opt.Runs):
     def __post_init__(self) -> None:
         """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
         if not self.is_recorded:
+            if not self.filter and Path(self.task).is_dir():
+                raise BadInput(f"{self.task} has no recorded runs, files that end in {', '.join(RUNS)}")
             if not self.filter:
                 raise BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
             super().__post_init__()
 
     @property
     def is_recorded(self) -> bool:
-        from beliefscope.filters.names import is_run
-
         return self.data is None and is_run(self.task)
 
 
@@ -164,7 +165,6 @@ def _of_recordings(
     healthy: runs, or clean data over which the filter runs.
     """
     from beliefscope.filters.external.unavailable import UnavailableFilter
-    from beliefscope.filters.names import is_run
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
     from beliefscope.inspect.healthy import overlap_warning, recorded_profile
     from beliefscope.inspect.traces.provenance import checkpoint_of
