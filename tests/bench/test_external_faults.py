@@ -23,7 +23,7 @@ from beliefscope.inspect.statistics.measures import nees
 
 STEPS = 80
 REPORTED = ("mower", "shuttle")  # mistakes with a public report
-TRAINED = ("tray", "slot")
+TRAINED = ("tray", "slot")  # by simulated episodes, hence not exactly consistent
 COUNTS = (
     dict.fromkeys(REPORTED, (2, 10))
     | dict.fromkeys(("rover", "river", "skiff"), (3, 5))
@@ -32,6 +32,8 @@ COUNTS = (
 """Numbers of faults of the data and of the filter; 5 and 7 of other tasks."""
 UNDONE = ("dropout_on",)
 """Faults of the filter that evaluation mode undoes."""
+REDRAWN = {"camera_noise": "tip"}
+"""Fault of the data -> sensor whose noise is drawn after that of the fault."""
 
 
 @pytest.fixture(params=TASKS)
@@ -55,7 +57,7 @@ def test_filter_is_consistent_and_each_fault_of_it_changes_its_estimates(task: M
         return bs.trace(bs.load_filter(task.make(fault)), [episode])
 
     right = run("")
-    assert 0.4 < nees(right)[10:, -1].mean() < 2
+    assert 0.4 < nees(right)[10:, -1].mean() < (2.5 if task.TASK.name in TRAINED else 2)
     faults = [name for name, fault in task.FAULTS.items() if fault.where == "filter"]
     assert len(faults) == COUNTS.get(task.TASK.name, (5, 7))[1]
     for name in faults:
@@ -70,8 +72,8 @@ def test_each_fault_of_the_data_changes_the_episode(task: ModuleType) -> None:
     for name in faults:
         faulty = task.simulate(2, name, steps=STEPS)
         before, after = ({**inputs(episode), "labels": episode.states} for episode in (clean, faulty))
-        changed = [key for key, values in before.items() if not np.array_equal(after[key], values)]
-        assert len(changed) == 1, name
+        changed = {key for key, values in before.items() if not np.array_equal(after[key], values)}
+        assert len(changed - {REDRAWN.get(name)}) == 1, name
         assert ("labels" in changed) == name.startswith("labels")
 
 
