@@ -62,5 +62,5 @@ def delay(values: Values, steps: int) -> Values:
 
 
 def stored(path: Path) -> dict[str, Tensor]:
-    """Trained weights in 32 bits; the large ones are stored in 16 bits."""
+    """Trained weights in 32 bits; some are stored in 16 bits."""
     return {key: value.float() for key, value in load_file(path).items()}
