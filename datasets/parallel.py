@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
@@ -17,6 +18,9 @@ from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+ATTEMPTS, PAUSE = 20, 0.02
+"""Number of attempts to start a process, and s between them."""
 
 LOSSES = 3
 """Number of lost processes in a row, without a finished item between them, after which the run fails."""
@@ -83,7 +87,14 @@ def _start(context: Any, function: Callable[[Item], object], processes: dict[Con
     ours: Connection
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs,))
-    process.start()
+    for attempt in range(ATTEMPTS):
+        try:
+            process.start()
+            break
+        except ConnectionError:  # the server of forks has ended with an interrupted start; it starts again
+            if attempt == ATTEMPTS - 1:
+                raise
+            time.sleep(PAUSE)
     processes[ours] = process
     theirs.close()
     with suppress(OSError):  # of a lost process

@@ -23,12 +23,15 @@ def test_diagnosed_episodes_in_the_healthy_record_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("checkpoint", "source"),
+    ("checkpoint", "command"),
     [
-        (UnavailableFilter("live", "", DOOR), "FILE.py:FUNCTION"),
-        (bs.load_filter("examples/04_own_filter.py:build"), "examples/04_own_filter.py:build"),
+        (UnavailableFilter("live", "", DOOR), "diagnose DIR --profile-from HEALTHY_DIR"),
+        (
+            bs.load_filter("examples/04_own_filter.py:build"),
+            "diagnose door --filter examples/04_own_filter.py:build --data DATA",
+        ),
     ],
 )
-def test_the_command_for_a_healthy_record_names_a_filter_that_it_can_open(checkpoint: Checkpoint, source: str) -> None:
-    with pytest.raises(BadInput, match=f"beliefscope diagnose door --filter {source} --data DATA"):
+def test_the_command_for_a_healthy_record_names_a_filter_that_it_can_open(checkpoint: Checkpoint, command: str) -> None:
+    with pytest.raises(BadInput, match=f"beliefscope {command}"):
         required_profile(checkpoint)

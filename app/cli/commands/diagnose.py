@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.names import RUNS, is_run
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
@@ -40,6 +39,8 @@ class RunsOrRecorded(opt.Runs):
     def __post_init__(self) -> None:
         """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
         if not self.is_recorded:
+            from beliefscope.filters.names import RUNS
+
             if not self.filter and Path(self.task).is_dir():
                 raise BadInput(f"{self.task} has no recorded runs, files that end in {', '.join(RUNS)}")
             if not self.filter:
@@ -48,6 +49,8 @@ class RunsOrRecorded(opt.Runs):
 
     @property
     def is_recorded(self) -> bool:
+        from beliefscope.filters.names import is_run  # imports NumPy
+
         return self.data is None and is_run(self.task)
 
 
@@ -165,6 +168,7 @@ def _of_recordings(
     healthy: runs, or clean data over which the filter runs.
     """
     from beliefscope.filters.external.unavailable import UnavailableFilter
+    from beliefscope.filters.names import is_run
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
     from beliefscope.inspect.healthy import overlap_warning, recorded_profile
     from beliefscope.inspect.traces.provenance import checkpoint_of
