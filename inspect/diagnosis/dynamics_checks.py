@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task, axis_name
@@ -33,6 +34,9 @@ MIN_PATH = 0.3
 
 MIN_STEPS = 10
 """Minimum number of steps of a statistic."""
+
+NEAR_ANGLE = 0.2
+"""Largest error of an angle, rad, from which a prediction of the run shows the dynamics."""
 
 ROUNDING = 1e-12
 """Largest variance that a prediction adds by rounding, relative to that of the states; smallest process noise."""
@@ -104,7 +108,9 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     change = task.difference(states[steps], states[steps - 1])
     predicted = task.difference(belief.mean[steps], trace.estimate_mean[steps - 1].astype(np.float64))
     values = _lag(change, predicted, states.std(0))
-    values |= _by_component(task, {"dynamics offset": measures.wrapped(task, predicted - change).mean(0)})
+    values |= _by_component(
+        task, {"dynamics offset": _offset(trace, steps, measures.wrapped(task, predicted - change))}
+    )
     if has_true_starts(checkpoint):
         is_used = uses_start(trace, checkpoint)
         values["ignored start//all"] = float(not is_used)
@@ -128,6 +134,17 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
         squared = np.maximum(np.square(residual).mean(0), smallest)
         more = {"dynamics nis": squared / variance, "process noise": np.sqrt(variance)}
     return values | _of_changes(task, residual, change, more, states.std(0))
+
+
+def _offset(trace: Trace, steps: NDArray[np.intp], residual: Array) -> Array:
+    """(n,) mean of the residuals (S, n) of a run's predictions that start with nearly true angles; NaN without any.
+
+    With another heading, right dynamics predict another change of the position.
+    """
+    angles = list(trace.task.angles)
+    error = np.abs(measures.errors(trace)[steps - 1, -1][:, angles])
+    near = np.ones(len(steps), bool) if not angles else (error < NEAR_ANGLE).all(1)
+    return residual[near].mean(0) if near.sum() >= MIN_STEPS else np.full(residual.shape[1], np.nan)
 
 
 def _lag(change: Array, predicted: Array, std: Array) -> dict[str, float]:

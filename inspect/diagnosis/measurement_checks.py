@@ -41,6 +41,9 @@ MOST_LATE = 3
 SAME, OTHER = 0.3, 0.8
 """Largest error of h(x) with the reading that the filter uses, and smallest one with another, relative to its noise."""
 
+SEPARATE_TURN = 5.0
+"""Smallest full turn relative to the root mean square of the other innovations of an angle."""
+
 FLAT = 10.0
 """Largest width of a likelihood, in standard deviations of the true states of the episode: it has no information."""
 
@@ -219,7 +222,8 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
 def _offsets(trace: Trace) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of steps from true states.
 
-    ``innovation offset/MODALITY CHANNEL``: mean of the innovations, in their standard deviations.
+    ``innovation offset/MODALITY CHANNEL``: mean of the innovations, in their standard deviations. ``innovation turns``,
+    by modality: share of steps with an innovation of about a full turn in a channel, of sensors and of networks.
 
     ``likelihood offset/MODALITY COMPONENT``, of particles: mean distance by which the likelihood of a modality alone
     moves their mean, in their standard deviations: 0 in a filter whose measurement function is right, whatever its
@@ -238,6 +242,7 @@ def _offsets(trace: Trace) -> dict[str, float]:
             for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
                 spread = max(float(nu[:, i].std()), 1e-12)
                 values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
+            values[f"innovation turns/{modality}/all"] = max(map(_turned, nu.T))
     if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
         return values
     unit = np.maximum(trace.episode.states.astype(np.float64).std(0), 1e-9)
@@ -257,6 +262,14 @@ def _offsets(trace: Trace) -> dict[str, float]:
                 mean = float((moved[known, i] / std[known, i]).mean())
                 values[f"likelihood offset/{modality} {component.name}/all"] = mean
     return values
+
+
+def _turned(nu: Array) -> float:
+    """Share of innovations (S,) at true states of about a full turn, in a channel whose other ones are far smaller."""
+    turned = np.abs(np.abs(nu) - TURN) < NEAR_TURN
+    others = nu[~turned & np.isfinite(nu)]
+    is_angle = len(others) >= MIN_STEPS and SEPARATE_TURN * float(np.sqrt(np.square(others).mean())) < TURN
+    return float(turned.mean()) if is_angle else 0.0
 
 
 def _width(x: Array, likelihood: Array) -> float:

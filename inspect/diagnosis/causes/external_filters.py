@@ -268,7 +268,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"innovation.{modality}.turns",
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
-            FILTER,
+            f"innovation offset/{modality} *|{FILTER}",
             "Wrap differences of angles to half a turn on either side of 0.",
         ),
         Cause(
