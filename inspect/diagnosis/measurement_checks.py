@@ -222,7 +222,8 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
 def _offsets(trace: Trace) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of steps from true states.
 
-    ``innovation offset/MODALITY CHANNEL``: mean of the innovations, in their standard deviations. ``innovation turns``,
+    ``innovation offset/MODALITY CHANNEL``: mean of the innovations, in their standard deviations, which are the
+    ``innovation spread``. ``innovation turns``,
     by modality: share of steps with an innovation of about a full turn in a channel, of sensors and of networks.
 
     ``likelihood offset/MODALITY COMPONENT``, of particles: mean distance by which the likelihood of a modality alone
@@ -242,6 +243,7 @@ def _offsets(trace: Trace) -> dict[str, float]:
             for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
                 spread = max(float(nu[:, i].std()), 1e-12)
                 values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
+                values[f"innovation spread/{modality} {names[k][i]}/all"] = spread
             values[f"innovation turns/{modality}/all"] = max(map(_turned, nu.T))
     if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
         return values

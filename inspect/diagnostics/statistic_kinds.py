@@ -66,6 +66,7 @@ KINDS = {
     "likelihood share": ("power of the likelihood{of} in the particle weights", False, 0.02),
     "likelihood offset": ("offset of the particles by the likelihood, in their standard deviations,", False, 0.05),
     "likelihood width": ("width of the likelihood{of} at true states", True, 0.05),
+    "innovation spread": ("standard deviation of the innovations at true states", True, 0.02),
     "innovation offset": ("mean of the innovations at true states, in their standard deviations,", False, 0.05),
     "ancestors": ("share of particles with offspring", False, 0.01),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),

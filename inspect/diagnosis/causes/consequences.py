@@ -11,10 +11,12 @@ FILTER = (
 WEIGHTS = f"beta logit/*|beta spread/*|beta contact/*|{FILTER}"
 """Fusion weights."""
 
-MODEL_KINDS = ("likelihood offset", "likelihood width", "innovation offset")
+MODEL_KINDS = ("likelihood offset", "likelihood width", "innovation offset", "innovation spread")
 """Kinds of statistics of the measurement models of external filters, at true states."""
 
-DYNAMICS = f"dynamics */*|{'|'.join(f'{kind}/*' for kind in MODEL_KINDS)}|{FILTER}"
+MODELS = "|".join(f"{kind}/*" for kind in MODEL_KINDS)
+
+DYNAMICS = f"dynamics */*|{MODELS}|{FILTER}"
 """The dynamics model."""
 
 LABELS = "lag/labels*|offset/labels*"

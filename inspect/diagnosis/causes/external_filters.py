@@ -8,7 +8,7 @@ from typing import Literal
 
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, model_of
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, MODELS, model_of
 from beliefscope.inspect.diagnosis.causes.own_sensors import offset_of
 
 
@@ -80,7 +80,7 @@ LATE = Cause(
     "updates.late",
     "Updates use earlier readings",
     (Symptom("late readings/*", 1),),
-    f"{JACOBIANS}|{DYNAMICS}|lag/dynamics/*|measurement noise/*|measurement function/*|{FILTER}",
+    f"{JACOBIANS}|{DYNAMICS}|lag/dynamics/*|measurement noise/*|measurement function/*|{MODELS}",
     "Check which reading the filter uses: a buffer or a queue may return the one before.",
 )
 
@@ -217,17 +217,24 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
         Cause(
             f"measurement.{modality}.function",
             f"Measurement function of {name} wrong",
-            (Symptom("|".join(f"measurement function/{key}/*|measurement function/{key} */*" for key in keys)),),
+            (
+                Symptom(
+                    "|".join(f"measurement function/{key}/*|measurement function/{key} */*" for key in keys),
+                    unmeasured=(Symptom(f"innovation spread/{modality} *"),),  # of learned sensors
+                ),
+            ),
             # A likelihood of a wrong scale has another width.
             f"measurement noise/{modality}/*|{model_of(modality)}|{FILTER}",
-            f"Compare h of {name} at the true states with its readings: positions of landmarks, units, signs.",
+            f"Compare h of {name} at the true states with its readings: positions of landmarks, units, signs; or check "
+            "the inputs and weights of its network.",
         ),
         Cause(
             f"measurement.{modality}.bias",
             f"Measurement function of {name} biased",
             (replace(offset_of(modality), unmeasured=(Symptom(f"innovation bias/{modality} *", 0),), optional=False),),
-            f"likelihood width/{modality}/*|{FILTER}",
-            f"Compare h of {name} at the true states with its readings: offsets, positions of landmarks.",
+            f"likelihood width/{modality}/*|innovation spread/{modality} *|{FILTER}",
+            f"Compare h of {name} at the true states with its readings: offsets, positions of landmarks; or check the "
+            "inputs and weights of its network.",
             prior=-0.6,
         ),
         Cause(
@@ -268,7 +275,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"innovation.{modality}.turns",
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
-            f"innovation offset/{modality} *|{FILTER}",
+            f"{model_of(modality)}|{FILTER}",
             "Wrap differences of angles to half a turn on either side of 0.",
         ),
         Cause(

@@ -16,6 +16,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnosis.dynamics_checks import external_dynamics_statistics
 from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
+from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
 from beliefscope.inspect.diagnosis.vector_checks import stuck
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
@@ -233,6 +234,24 @@ def test_predictions_before_each_update_have_the_statistics_of_those_before_all(
     of_dynamics = external_dynamics_statistics(shared, loaded(Boat()))
     of_separate = external_dynamics_statistics(separate, loaded(Boat(separate=True)))
     assert of_separate == pytest.approx(of_dynamics, nan_ok=True)
+
+
+def test_innovations_at_true_states_show_offsets_and_differences_that_are_not_wrapped() -> None:
+    trace, rng = run(Boat()), np.random.default_rng(0)
+    assert trace.innovation is not None
+    nu = np.where(np.isfinite(trace.innovation), rng.normal(0.05, 0.1, trace.innovation.shape), np.nan)
+    compass = trace.modalities.index("compass")
+    far = np.flatnonzero(np.isfinite(nu[:, compass, 0]))[::10]
+    nu[far, compass, 0] -= 2.0 * np.pi
+    values = measurement_model_statistics(trace, [], replace(trace, innovation=nu.astype(np.float32)))
+    own = nu[:, trace.modalities.index("radar"), 0]
+    expected = np.nanmean(own) / np.nanstd(own)
+    assert values["innovation offset/radar radar x/all"] == pytest.approx(expected, rel=1e-5)
+    assert values["innovation spread/radar radar x/all"] == pytest.approx(np.nanstd(own), rel=1e-5)
+    assert values["innovation turns/radar/all"] == 0.0
+    assert values["innovation turns/compass/all"] == pytest.approx(0.1, abs=0.01)
+    wide = replace(trace, innovation=(30.0 * nu).astype(np.float32))  # no angle
+    assert measurement_model_statistics(trace, [], wide)["innovation turns/radar/all"] == 0.0
 
 
 def test_filters_that_report_no_innovations_have_no_statistics_of_them() -> None:
