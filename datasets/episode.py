@@ -66,8 +66,9 @@ class Episode:
     def __post_init__(self) -> None:
         """Fill in the defaults, and convert floating-point arrays to float32."""
         steps = len(self.states)
-        contact = np.asarray(self.covariates.get("contact", np.zeros(steps)), np.float64) > 0.5
-        absent = {"contact": contact, "controls": np.zeros((steps, 0)), "qpos": np.zeros((steps, 0))}
+        contact = self.covariates.get("contact")
+        in_contact = np.zeros(steps, bool) if contact is None else np.asarray(contact, np.float64) > 0.5
+        absent = {"contact": in_contact, "controls": np.zeros((steps, 0)), "qpos": np.zeros((steps, 0))}
         values: dict[str, Any] = {name: array for name, array in absent.items() if getattr(self, name) is _MISSING}
         values |= {} if self.dt else {"dt": self.task.dt}
         values["states"] = self.task.states(self.states)

@@ -135,6 +135,11 @@ def is_path(text: str) -> bool:
     return not is_code(text) and (text.endswith(".safetensors") or os.sep in text)
 
 
+def is_source(text: str) -> bool:
+    """Whether the text is the path of a checkpoint or names a build function, rather than a built-in filter."""
+    return is_path(text) or is_code(text)
+
+
 def is_run(text: str) -> bool:
     """Whether the text is the path of a recorded run, or of a folder with some, rather than a name."""
     if text.endswith(RUNS):

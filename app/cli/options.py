@@ -249,10 +249,10 @@ class Runs:
     def __post_init__(self) -> None:
         """Raises BadInput for an unknown name of a task or pretrained filter, before a command imports PyTorch."""
         from beliefscope.datasets.catalog import TASKS
-        from beliefscope.filters.names import is_code, is_path, pretrained_path
+        from beliefscope.filters.names import is_source, pretrained_path
 
         has_definition = self.task not in TASKS and (":" in self.task or self.data is not None)
-        if not (has_definition or is_path(self.filter) or is_code(self.filter)):
+        if not (has_definition or is_source(self.filter)):
             pretrained_path(self.task, self.filter)
 
     def open(self) -> tuple[Checkpoint, Faults]:

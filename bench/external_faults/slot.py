@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 import beliefscope as bs
 from external_faults.fault import Fault, Values, stored
-from external_faults.tray import windows
+from external_faults.tray import convolutions, windows
 
 DT = 0.1  # s
 PARTICLES = 300
@@ -175,18 +175,7 @@ class Vision(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(1, 12, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(12, 24, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(24, 24, 3, 2, 1),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(1176, 96),
-            nn.ReLU(),
-            nn.Linear(96, 32),
-        )
+        self.features = nn.Sequential(*convolutions(1), nn.Linear(1176, 96), nn.ReLU(), nn.Linear(96, 32))
         self.score = mlp(35, 96, 96, 1)
 
     def forward(self, image: Tensor, particles: Tensor) -> Tensor:

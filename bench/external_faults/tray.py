@@ -171,20 +171,25 @@ def simulate(seed: int, fault: str = "", steps: int = 100) -> bs.Episode:
     )
 
 
+def convolutions(channels: int) -> list[nn.Module]:
+    """Layers from images (N, channels, H, W) to features (N, 24 H W / 16)."""
+    return [
+        nn.Conv2d(channels, 12, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(12, 24, 3, 2, 1),
+        nn.ReLU(),
+        nn.Conv2d(24, 24, 3, 2, 1),
+        nn.ReLU(),
+        nn.Flatten(),
+    ]
+
+
 class Vision(nn.Module):
     """Image (N, SIZE, SIZE, 3) in 0 to 1 -> position (N, 2) in m and its log variance (N, 2)."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(3, 12, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(12, 24, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(24, 24, 3, 2, 1),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
+        self.features = nn.Sequential(*convolutions(3))
         self.head = nn.Sequential(nn.Dropout(0.15), nn.Linear(864, 96), nn.ReLU(), nn.Dropout(0.15), nn.Linear(96, 4))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

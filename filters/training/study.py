@@ -30,7 +30,7 @@ from beliefscope.filters.engine import Engine, run_all
 from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Architecture, Filter
-from beliefscope.filters.names import is_code, is_path
+from beliefscope.filters.names import is_code, is_source
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.filters.start_offset import STUDY_OFFSET
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report, evaluated_blackouts
@@ -140,7 +140,7 @@ def study_cells(
         raise unknown_name("preset", preset, PLANS)
     sources = list(dict.fromkeys(tasks or [*(name for name in TASKS if name in files or _trains(name)), *files]))
     available = {name for source in sources for name in filters_of(load_task(source))}
-    given = [text for text in filters if is_code(text) or is_path(text)]
+    given = [text for text in filters if is_source(text)]
     for name in filters:
         if name not in available and name not in given:
             raise unknown_name("filter", name, sorted(available))

@@ -67,7 +67,7 @@ def measurement_model_statistics(
     """
     models = [model.with_weak_channels() for model in models]
     near_truth = near_truth or trace
-    offsets = {} if near_truth is trace else _offsets(near_truth)
+    at_truth = {} if near_truth is trace else _innovations_at_truth(near_truth) | _likelihoods_at_truth(near_truth)
     values, turns = _likelihoods(near_truth, models), _turns(trace, models)
     turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
     functions = _functions(trace, models)
@@ -77,7 +77,7 @@ def measurement_model_statistics(
         functions |= {name: near[name] for name in near if name.startswith("measurement function/")}
     # The noise of modalities whose readings have a model is more exact than the width of their likelihood.
     widths = {f"likelihood width/{m}/all" for m in trace.modalities if f"measurement noise/{m}/all" in values}
-    return functions | values | turns | {name: value for name, value in offsets.items() if name not in widths}
+    return functions | values | turns | {name: value for name, value in at_truth.items() if name not in widths}
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
@@ -219,34 +219,41 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
     return values
 
 
-def _offsets(trace: Trace) -> dict[str, float]:
-    """``KIND/SUBJECT/all`` -> value, of steps from true states.
+def _innovations_at_truth(trace: Trace) -> dict[str, float]:
+    """``KIND/SUBJECT/all`` -> value, of the innovations of steps from true states.
 
-    ``innovation offset/MODALITY CHANNEL``: mean of the innovations, in their standard deviations, which are the
-    ``innovation spread``. ``innovation turns``,
-    by modality: share of steps with an innovation of about a full turn in a channel, of sensors and of networks.
+    ``innovation spread``, by channel: their standard deviation. ``innovation offset``, by channel: their mean relative
+    to it. ``innovation turns``, by modality: share of steps with about a full turn in a channel, also of networks.
+    """
+    if trace.innovation is None:
+        return {}
+    values: dict[str, float] = {}
+    names = channel_names(trace, trace.innovation)
+    for k, modality in enumerate(trace.modalities):
+        at = np.isfinite(trace.innovation[:, k]).any(-1) & ~absent(trace, modality)
+        if at.sum() < MIN_STEPS:
+            continue
+        nu = trace.innovation[at, k].astype(np.float64)
+        for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
+            spread = max(float(nu[:, i].std()), 1e-12)
+            values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
+            values[f"innovation spread/{modality} {names[k][i]}/all"] = spread
+        values[f"innovation turns/{modality}/all"] = max(map(_turned, nu.T))
+    return values
 
-    ``likelihood offset/MODALITY COMPONENT``, of particles: mean distance by which the likelihood of a modality alone
-    moves their mean, in their standard deviations: 0 in a filter whose measurement function is right, whatever its
+
+def _likelihoods_at_truth(trace: Trace) -> dict[str, float]:
+    """``KIND/SUBJECT/all`` -> value, of the likelihoods of particles around true states.
+
+    ``likelihood offset/MODALITY COMPONENT``: mean distance by which the likelihood of a modality alone moves the mean
+    of the particles, in their standard deviations: 0 in a filter whose measurement function is right, whatever its
     noise.
 
-    ``likelihood width/MODALITY``, of particles: standard deviation of a Gaussian of the same curvature (``_width``).
+    ``likelihood width/MODALITY``: standard deviation of a Gaussian of the same curvature (``_width``).
     """
-    values: dict[str, float] = {}
-    if trace.innovation is not None:
-        names = channel_names(trace, trace.innovation)
-        for k, modality in enumerate(trace.modalities):
-            at = np.isfinite(trace.innovation[:, k]).any(-1) & ~absent(trace, modality)
-            if at.sum() < MIN_STEPS:
-                continue
-            nu = trace.innovation[at, k].astype(np.float64)
-            for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
-                spread = max(float(nu[:, i].std()), 1e-12)
-                values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
-                values[f"innovation spread/{modality} {names[k][i]}/all"] = spread
-            values[f"innovation turns/{modality}/all"] = max(map(_turned, nu.T))
     if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
-        return values
+        return {}
+    values: dict[str, float] = {}
     unit = np.maximum(trace.episode.states.astype(np.float64).std(0), 1e-9)
     for k, modality in enumerate(trace.modalities):
         at = np.isfinite(trace.log_likelihood[:, k]).all(-1) & ~absent(trace, modality)

@@ -79,7 +79,8 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
     key, axis = sensor_of(subject, episode.observations)
     if key not in episode.observations:
         return None
-    episode = with_gray_images(with_continuous_angles(episode))
+    episode = with_continuous_angles(episode)
+    episode = with_gray_images(episode) if key in episode.task.images else episode
     marked = _marked_steps(kind, key, axis, episode)
     if marked is not None:
         steps = np.flatnonzero(marked)

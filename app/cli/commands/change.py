@@ -43,7 +43,7 @@ def change(
     from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
     from beliefscope.app.runs.catalog import served_names
     from beliefscope.filters.finetuning.slices import parse_slices
-    from beliefscope.filters.names import is_code, is_path
+    from beliefscope.filters.names import is_source
     from beliefscope.filters.open_filter import open_filters
     from beliefscope.inspect.compare.checkpoints import compare_checkpoints, write_comparison
     from beliefscope.inspect.diagnostics.views import as_json
@@ -78,7 +78,7 @@ def change(
         "improved": as_json(report.improvements()),
         "regressed": as_json(report.regressions()),
         "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
-        "serve": serve_command([text for text in (before, after) if is_path(text) or is_code(text)], data, seed),
+        "serve": serve_command([*filter(is_source, (before, after))], data, seed),
     }
     heading = f"Before: {report.filters[0]}; after: {report.filters[1]}; {plural(len(report.episodes), 'episode')}"
     notes = dict.fromkeys(filter(None, map(removal_note, checkpoints)))

@@ -31,7 +31,7 @@ def failures(
     opt.prepare_workers(engine, workers, "beliefscope.inspect.failures.survey")
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
-    from beliefscope.filters.names import is_code, is_path
+    from beliefscope.filters.names import is_source
     from beliefscope.inspect.diagnostics.views import as_json
     from beliefscope.inspect.failures.events import find_failures
     from beliefscope.inspect.failures.step_scores import phases_of
@@ -59,9 +59,7 @@ def failures(
     links = [base + permalink(checkpoint.task, name, data_name, e.episode, e.step, str(faults), by) for e in events]
     document = report.to_dict() | {
         "events": [as_json(event) | {"link": link} for event, link in zip(events, links, strict=True)],
-        "serve": serve_command(
-            [runs.filter] if is_path(runs.filter) or is_code(runs.filter) else [], runs.data, runs.seed
-        ),
+        "serve": serve_command([runs.filter] if is_source(runs.filter) else [], runs.data, runs.seed),
     }
     text = "\n\n".join([report.verdict, str(report.phase_table()), str(report.event_table(events))])
     if url is not None:

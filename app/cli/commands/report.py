@@ -98,7 +98,7 @@ def _permalinks(
     """(index of a trace, step) -> permalink or empty text; and a note on how to open permalinks, or why none exist."""
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
-    from beliefscope.filters.names import is_code, is_path
+    from beliefscope.filters.names import is_source
     from beliefscope.inspect.traces.provenance import reproducible
 
     first, task = traces[0], traces[0].task
@@ -108,7 +108,7 @@ def _permalinks(
     if not linked:
         source = "the sample episodes" if data is None else str(data)
         return lambda index, step: "", f"No permalinks: the dashboard cannot reproduce these runs over {source}."
-    files = [filter_] if is_path(filter_) or is_code(filter_) else []
+    files = [filter_] if is_source(filter_) else []
     (name,), data_name = served_names(files or [first.filter], data)
 
     def link(index: int, step: int) -> str:
