@@ -67,7 +67,9 @@ def measurement_model_statistics(
     """
     models = [model.with_weak_channels() for model in models]
     near_truth = near_truth or trace
-    at_truth = {} if near_truth is trace else _innovations_at_truth(near_truth) | _likelihoods_at_truth(near_truth)
+    # A filter may report both, and only one of them may be known at true states.
+    at_truth = {} if near_truth.innovation is trace.innovation else _innovations_at_truth(near_truth)
+    at_truth |= {} if near_truth.log_likelihood is trace.log_likelihood else _likelihoods_at_truth(near_truth)
     values, turns = _likelihoods(near_truth, models), _turns(trace, models)
     turns |= {name: max(values[name], share) for name, share in turns.items() if name in values}
     functions = _functions(trace, models)

@@ -250,6 +250,8 @@ def test_innovations_at_true_states_show_offsets_and_differences_that_are_not_wr
     assert values["innovation spread/radar radar x/all"] == pytest.approx(np.nanstd(own), rel=1e-5)
     assert values["innovation turns/radar/all"] == 0.0
     assert values["innovation turns/compass/all"] == pytest.approx(0.1, abs=0.01)
+    other = measurement_model_statistics(trace, [], replace(trace))  # the innovations of the run, not at true states
+    assert not any(name.startswith(("innovation offset/", "innovation spread/")) for name in other)
     wide = replace(trace, innovation=(30.0 * nu).astype(np.float32))  # no angle
     assert measurement_model_statistics(trace, [], wide)["innovation turns/radar/all"] == 0.0
 
