@@ -71,9 +71,9 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
             values["belief variance//all"] = float(np.log(np.maximum(variance, 1e-24)).mean())
     else:
         values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
+    values |= error_statistics(trace)
     if has_truth:
-        values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
-        values |= dynamics_statistics(trace, checkpoint)
+        values |= measurement_statistics(trace, checkpoint) | dynamics_statistics(trace, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 

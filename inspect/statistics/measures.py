@@ -149,8 +149,13 @@ def faulty(trace: Trace) -> Mask:
 
 
 def counted(trace: Trace) -> Mask:
-    """(T,): steps used by metrics; all but those of the task's warm-up."""
-    return np.arange(len(trace)) >= trace.task.first_counted(len(trace))
+    """(T,): steps used by metrics: all but those of the task's warm-up and gaps in the true states.
+
+    Components that no step knows are no gaps.
+    """
+    known = np.isfinite(trace.episode.states)
+    after_warmup = np.arange(len(trace)) >= trace.task.first_counted(len(trace))
+    return np.asarray(after_warmup & known[:, known.any(0)].all(1))
 
 
 def absent(trace: Trace, modality: str) -> Mask:
