@@ -16,6 +16,7 @@ from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnosis.model_checks import reports_estimates_only
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
@@ -79,6 +80,11 @@ class Case:
     deviations: Sequence[Deviation]
     p_value: float
     alarm_rate: float
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """All causes of the filter."""
+        return causes_in(self.inputs.checkpoint, all(map(reports_estimates_only, self.traces)))
 
     @property
     def by_statistic(self) -> dict[str, Deviation]:
@@ -149,7 +155,7 @@ def focus(case: Case) -> Case:
 
 def explain_all(case: Case) -> dict[str, Explanation]:
     """How well each cause that can be observed explains all deviations, by name."""
-    causes = applicable(causes_in(case.inputs.checkpoint), case.by_statistic)
+    causes = applicable(case.causes, case.by_statistic)
     return {cause.name: explain(cause, case.deviations) for cause in causes}
 
 

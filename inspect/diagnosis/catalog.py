@@ -24,7 +24,7 @@ from beliefscope.inspect.diagnosis.causes import (
 )
 from beliefscope.inspect.diagnosis.causes.consequences import model_of
 from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
-from beliefscope.inspect.diagnosis.causes.recorded import RECORDED
+from beliefscope.inspect.diagnosis.causes.recorded import OF_ESTIMATES, RECORDED
 from beliefscope.inspect.diagnosis.true_starts import has_true_starts
 from beliefscope.inspect.statistics.reference_images import HAND
 
@@ -53,11 +53,16 @@ def causes_of(task: Task) -> tuple[Cause, ...]:
     return (*(_of_modality(cause, modalities) for cause in CAUSES if cause.name not in names), *own)
 
 
-def causes_in(checkpoint: Checkpoint) -> tuple[Cause, ...]:
-    """All causes of a filter: those of its task, and those of external filters only."""
+def causes_in(checkpoint: Checkpoint, estimates_only: bool = False) -> tuple[Cause, ...]:
+    """All causes of a filter: those of its task, and those of external filters only.
+
+    estimates_only: whether an external filter reports nothing else, so that its equations are unknown.
+    """
     causes = causes_of(checkpoint.task)
     if isinstance(checkpoint, UnavailableFilter):
         causes = (*causes, *RECORDED)
+    elif estimates_only:
+        causes = (*causes, *OF_ESTIMATES)
     if isinstance(checkpoint, ExternalFilter):
         starts = has_true_starts(checkpoint)
         return tuple(in_predictions(cause, starts) for cause in (*causes, *external_causes(checkpoint.task)))

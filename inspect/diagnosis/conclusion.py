@@ -25,7 +25,6 @@ from beliefscope.inspect.diagnosis.case import (
     checked_alarm_rate,
     symptoms_of,
 )
-from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import (
     SHOWN,
     Candidate,
@@ -192,7 +191,7 @@ def conclude(
         effects: of undone causes, by name. None before any cause is undone: whether the filter is affected is unknown
             unless it does not use the sensor.
     """
-    by_name = {cause.name: cause for cause in causes_in(case.inputs.checkpoint)}
+    by_name = {cause.name: cause for cause in case.causes}
     ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE

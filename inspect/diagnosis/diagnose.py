@@ -32,7 +32,6 @@ from beliefscope.inspect.diagnosis.case import (
     observe,
     symptoms_of,
 )
-from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
@@ -292,7 +291,7 @@ def confirm(
 
 def _undone(everything: Case, case: Case, seed: int, base: Checkpoint | None, name: str) -> Effect | None:
     """Effect of undoing a cause; None if it cannot be undone."""
-    cause = next(cause for cause in causes_in(case.inputs.checkpoint) if cause.name == name)
+    cause = next(cause for cause in case.causes if cause.name == name)
     alarms = symptoms_of(cause, case.alarms)
     hit = affected_episodes(case, alarms)
     steps = affected_steps(case, alarms[0], hit) if alarms else None

@@ -103,18 +103,20 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     belief = prediction(trace)
     states, task = trace.episode.states.astype(np.float64), trace.task
     steps = 1 + np.flatnonzero(measures.counted(trace)[1:])
-    if belief is None or task.rotations or len(steps) < MIN_STEPS:
+    if len(steps) < MIN_STEPS:
         return {}
+    ignored = {"ignored start//all": float(not uses_start(trace, checkpoint))} if has_true_starts(checkpoint) else {}
+    if belief is None or task.rotations:
+        return ignored
     change = task.difference(states[steps], states[steps - 1])
     predicted = task.difference(belief.mean[steps], trace.estimate_mean[steps - 1].astype(np.float64))
     values = _lag(change, predicted, states.std(0))
     values |= _by_component(
         task, {"dynamics offset": _offset(trace, steps, measures.wrapped(task, predicted - change))}
     )
-    if has_true_starts(checkpoint):
-        is_used = uses_start(trace, checkpoint)
-        values["ignored start//all"] = float(not is_used)
-        if not is_used:
+    values |= ignored
+    if ignored:
+        if any(ignored.values()):
             return values
         steps = some_steps(trace, checkpoint)
         started = predictions_from_truth(trace, checkpoint, steps)

@@ -21,6 +21,9 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, 
 BLACK = 8
 """Gray level up to which a pixel carries no information about the exposure."""
 
+SATURATED = 254.5
+"""Gray level from which a pixel is saturated; levels of colours are rounded."""
+
 DARK, BRIGHT = 30.0, 225.0
 """Gray levels between which noise is not clipped."""
 
@@ -36,10 +39,15 @@ def frozen_images(images: Gray, held: int = 0) -> Mask:
     return repeats(images, held) & ~lost_images(images)
 
 
-def image_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
+def image_statistics(
+    episode: Episode, key: str, reference: Reference | None, gain: float | None = None
+) -> dict[str, float]:
     """Statistics of one image sensor in an episode or a window; some only with a reference of the same sensor and size.
 
     Steps without an image do not count.
+
+    Args:
+        gain: by which the noise of brighter images is divided. Default: their exposure.
     """
     images, present = episode.observations[key], episode.present(key)
     if not present.any():
@@ -49,12 +57,14 @@ def image_statistics(episode: Episode, key: str, reference: Reference | None) ->
     middle = median_image(images[present])
     comparable = reference if usable.any() and _is_comparable(reference, key, images) else None
     brightness = 1.0 if comparable is None else float(brightness_of(middle, comparable))
+    noise = _noise(images[usable & ~frozen_images(images)], brightness)
     values = {
         f"black/{key}/all": float(dark.mean()),
         f"losses/{key}/all": float((np.diff(dark, prepend=False) & dark).mean()),
         f"frozen/{key}/all": float(frozen[present].mean()),
-        f"noise/{key}/all": _noise(images[usable & ~frozen_images(images)], brightness),
+        f"noise/{key}/all": noise / max(1.0, brightness if gain is None else gain),
         f"sharpness/{key}/all": _sharpness(middle),
+        f"clipped/{key}/all": float((images[usable] >= SATURATED).mean()) if usable.any() else np.nan,
     }
     if comparable is None:
         return values

@@ -11,6 +11,7 @@ from beliefscope.datasets.text import capitalised
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import Case
 from beliefscope.inspect.diagnosis.cause import index_ranges
+from beliefscope.inspect.diagnosis.measurement_checks import is_of_readings
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.diagnostics.statistic_kinds import label_of
@@ -100,6 +101,10 @@ def _broken_law(case: Case) -> str:
             median = float(np.median(known))
             distance = abs(median - law.expected)
             if law.kind == "dynamics effect" and _may_be_noise(case, name, median):
+                continue
+            if law.kind == "measurement function" and not is_of_readings(
+                case.traces[0], case.inputs.checkpoint, case.profile.readings, name.split("/")[1]
+            ):
                 continue
             if distance > max(law.tolerance, PRECISION * float(known.std()) / np.sqrt(len(known))):
                 broken[name] = distance, median

@@ -10,7 +10,9 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import axis_name
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
+from beliefscope.inspect.diagnosis.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
 from beliefscope.inspect.statistics.innovations import channel_names, prediction
 from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_features import Indices
@@ -40,6 +42,9 @@ MOST_LATE = 3
 
 SAME, OTHER = 0.3, 0.8
 """Largest error of h(x) with the reading that the filter uses, and smallest one with another, relative to its noise."""
+
+OWN_GAIN, CONSTANT = 0.3, 0.02
+"""Largest distance from 1 of the gain from a reading to its innovation, and largest relative spread of another one."""
 
 SEPARATE_TURN = 5.0
 """Smallest full turn relative to the root mean square of the other innovations of an angle."""
@@ -133,6 +138,35 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
         if lateness:
             values[f"late readings/{trace.modalities[k]}/all"] = float(max(lateness))
     return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def is_of_readings(trace: Trace, checkpoint: ExternalFilter, models: Sequence[ReadingModel], axis: str) -> bool:
+    """Whether the innovation of a channel can be that of its readings, z - h(x), or of readings in another unit.
+
+    It then changes by a constant factor with a reading. Those of virtual sensors, whose networks have outputs of their
+    own, do not; nor can they be compared with the readings. True if single steps do not show it.
+    """
+    if not has_true_starts(checkpoint):
+        return True
+    for k in range(len(trace.modalities)):
+        for model, columns in _sensors(trace, k, models):
+            names = [axis_name(model.key, i, readings_of(trace.episode, model.key).shape[1]) for i in model.channels]
+            if axis not in names or model.key not in trace.episode.observations:
+                continue
+            i = names.index(axis)
+            readings = trace.episode.observations[model.key].copy()
+            readings[:, model.channels[i]] += model.noise[i]
+            episode = replace(trace.episode, observations={**trace.episode.observations, model.key: readings})
+            steps, std = some_steps(trace, checkpoint), smallest_std(trace)
+            runs = [run_from_truth(run, checkpoint, steps, std) for run in (trace, replace(trace, episode=episode))]
+            before, after = (None if run is None else run.get("innovation") for run in runs)
+            if before is None or after is None:
+                return True
+            gains = (after - before)[:, k, columns[i]] / model.noise[i]
+            middle = float(np.nanmedian(gains)) if np.isfinite(gains).any() else 1.0
+            spread = float(np.nanmedian(np.abs(gains - middle)))
+            return abs(middle - 1.0) < OWN_GAIN or spread < CONSTANT * abs(middle)
+    return True
 
 
 def _earlier(readings: Array, present: Mask, late: int) -> Array:

@@ -66,7 +66,7 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
         if has_truth:
             near_truth = with_innovations_near_truth(with_particles_near_truth(trace, checkpoint), checkpoint)
         values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
-        if isinstance(checkpoint, UnavailableFilter):  # of others, its causes are examined
+        if isinstance(checkpoint, UnavailableFilter) or reports_estimates_only(trace):  # of others, its causes
             variance = np.diagonal(trace.estimate_covariance[measures.counted(trace)], axis1=-2, axis2=-1)
             values["belief variance//all"] = float(np.log(np.maximum(variance, 1e-24)).mean())
     else:
@@ -75,6 +75,12 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
     if has_truth:
         values |= measurement_statistics(trace, checkpoint) | dynamics_statistics(trace, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def reports_estimates_only(trace: Trace) -> bool:
+    """Whether an external filter reports nothing but estimates and weights, as a recurrent network does."""
+    others = (trace.predicted_mean, trace.innovation, trace.observation_mean, trace.particles)
+    return all(values is None for values in others)
 
 
 def component_errors(task: Task) -> dict[str, int]:

@@ -79,10 +79,10 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
 
 
 def stuck(episode: Episode, key: str, axis: int) -> Mask:
-    """(T,): whether an axis repeats its reading while the hand moves."""
+    """(T,): whether an axis repeats its reading while the hand moves, other than its largest one (``saturated``)."""
     present = episode.present(key)
-    same = np.zeros(len(episode), dtype=bool)
-    same[present] = repeats(episode.observations[key][present, axis], episode.task.held_steps(key))
+    same, readings = np.zeros(len(episode), dtype=bool), episode.observations[key][present, axis]
+    same[present] = repeats(readings, episode.task.held_steps(key)) & ~saturated(readings)
     return same & _moving(episode) if key != HAND else same
 
 
@@ -378,7 +378,7 @@ def saturated(values: Array) -> Mask:
     A single stretch of equal readings is a stuck axis.
     """
     size = np.abs(values)
-    at = size == size.max()
+    at = size == size.max(initial=0.0)
     return at if np.diff(at, prepend=False).sum() > 2 else np.zeros(len(values), dtype=bool)
 
 

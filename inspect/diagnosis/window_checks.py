@@ -40,6 +40,7 @@ SUMMARIES: dict[str, tuple[str, Callable[[Array], float]]] = {
     "opposition": (EXTREME, np.max),
     "roughness": (EXTREME, np.max),
     "sharpness": (EXTREME, np.min),
+    "clipped": (EXTREME, np.max),
     "brightness": (RANGE, _ratio),
     "shift": (RANGE, _difference),
     "hand offset": (RANGE, _difference),
@@ -61,11 +62,20 @@ def window_statistics(episode: Episode, reference: Reference | None) -> dict[str
 
 
 def window_values(episode: Episode, reference: Reference | None) -> dict[str, Array]:
-    """Statistic of a window -> its values (W,); NaN where it is not defined."""
+    """Statistic of a window -> its values (W,); NaN where it is not defined.
+
+    The noise of images is relative to the largest exposure of the episode's windows, if above 1: an image that is dark
+    for another reason has the noise of the camera's gain.
+    """
     starts = window_starts(len(episode))
     rows = [_statistics(_part(episode, first), reference) for first in starts]
     names = dict.fromkeys(name for row in rows for name in row)
-    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+    values = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+    for key in image_keys(episode):
+        exposure = values.get(f"brightness/{key}/all", np.ones(1))
+        if f"noise/{key}/all" in values and np.isfinite(exposure).any():
+            values[f"noise/{key}/all"] /= max(1.0, float(np.nanmax(exposure)))
+    return values
 
 
 def window_starts(steps: int) -> range:
@@ -107,6 +117,6 @@ def _statistics(part: Episode, reference: Reference | None) -> dict[str, float]:
     values = vector_statistics(part)
     for key in image_keys(part):
         if is_usable(part.observations[key], part.present(key), part.task.held_steps(key)):
-            values |= image_statistics(part, key, reference)
+            values |= image_statistics(part, key, reference, gain=1.0)
             values |= occluded_share(part.observations[key], key, reference)
     return values

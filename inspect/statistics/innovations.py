@@ -19,6 +19,9 @@ from beliefscope.inspect.traces.data import Trace
 
 AnyArray = NDArray[np.floating[Any]]
 
+SAME_SIZE = 0.2
+"""Largest difference of the log-determinants of covariances of about the same belief."""
+
 
 @dataclass(frozen=True)
 class Whiteness:
@@ -121,8 +124,14 @@ def prediction_of(
 
 
 def least_certain(covariance: Array) -> NDArray[np.intp]:
-    """(T,) index of the belief before all updates, from covariances (T, K, n, n) before each of them."""
-    return np.asarray(np.linalg.slogdet(covariance)[1].argmax(-1))
+    """(T,) index of the belief before all updates, from covariances (T, K, n, n) before each of them.
+
+    The same at all steps but for those where another one is clearly less certain: updates by weak measurements change
+    the sample covariance of an ensemble by less than chance does.
+    """
+    sizes = np.linalg.slogdet(covariance)[1]
+    usual = int(np.nanmean(sizes, axis=0).argmax())
+    return np.where(sizes.max(-1) - sizes[:, usual] < SAME_SIZE, usual, sizes.argmax(-1))
 
 
 def _particle_moments(task: Task, particles: AnyArray, log_weights: AnyArray) -> Moments:

@@ -11,6 +11,8 @@ HAND = "hand offset/image*"
 OBJECT = "object offset/*"
 """Position of the object in the image against the labelled one."""
 
+EXPOSURE = "brightness/image/*|clipped/image/*"
+
 LANDMARKS = f"{HAND}|{OBJECT}|hand match/image*|object match/*"
 """Everything about landmarks in the image."""
 
@@ -29,8 +31,8 @@ CAUSES = (
         "image.frozen",
         "Image frozen",
         (Symptom("frozen/image/*"),),
-        f"lag/image/*|black/image/*|losses/image/*|noise/image/*|occlusion/image/*|shift/image*|sharpness/image/*|brightness/image/*"
-        f"|{LANDMARKS}|{IMAGE}",
+        f"lag/image/*|black/image/*|losses/image/*|noise/image/*|occlusion/image/*|shift/image*|sharpness/image/*"
+        f"|{EXPOSURE}|{LANDMARKS}|{IMAGE}",
         CHECK,
         "drop image",
     ),
@@ -50,7 +52,7 @@ CAUSES = (
             Symptom("shift/image*|module bias/*image*", 0, 0.5),
             Symptom(OBJECT, 0, 0.3, optional=True),
         ),
-        f"{LANDMARKS}|occlusion/image/*|brightness/image/*|sharpness/image/*|{IMAGE}",
+        f"{LANDMARKS}|occlusion/image/*|{EXPOSURE}|sharpness/image/*|{IMAGE}",
         "Calibrate the camera pose again.",
         "realign image",
     ),
@@ -58,7 +60,7 @@ CAUSES = (
         "image.noise",
         "Image noisy",
         (Symptom("noise/image/*"),),
-        f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{LANDMARKS}|{IMAGE}",
+        f"sharpness/image/*|shift/image*|occlusion/image/*|{EXPOSURE}|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Reduce the camera's gain, or train with noisy images",
         "drop image",
         command=Command("finetune", "--faults image_noise=40"),
@@ -76,7 +78,7 @@ CAUSES = (
     Cause(
         "image.exposure",
         "Image exposure changed",
-        (Symptom("brightness/image/*", 0),),
+        (Symptom("brightness/image/*", 0, otherwise=(Symptom("clipped/image/*"),)),),
         f"sharpness/image/*|occlusion/image/*|shift/image*|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Restore the camera's exposure or the lighting.",
         "expose image",
@@ -86,7 +88,7 @@ CAUSES = (
         "image.occlusion",
         "Image occluded",
         (Symptom("occlusion/image/*"),),
-        f"shift/image*|brightness/image/*|lag/image/*|{LANDMARKS}|{IMAGE}",
+        f"shift/image*|{EXPOSURE}|lag/image/*|{LANDMARKS}|{IMAGE}",
         "Clear the camera's view.",
         "drop image",
         lowers="noise/image/*|sharpness/image/*",

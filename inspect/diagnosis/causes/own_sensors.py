@@ -45,11 +45,11 @@ VECTOR = (
 IMAGE = (
     ("black|losses", "blackout", "blacked out", "Check the camera and its driver."),
     ("frozen", "frozen", "frozen", "Check the camera and its driver."),
-    ("noise", "noise", "noisy", "Light the scene better, or correct the exposure and gain of the camera."),
 )
 """As ``VECTOR``, of images."""
 
 VIEW = {
+    "noise": "Image of {} noisy",
     "blur": "Image of {} blurred",
     "exposure": "Image exposure of {} changed",
     "occlusion": "Image of {} occluded",
@@ -139,14 +139,20 @@ def _changed_views(key: str, modality: str) -> list[Cause]:
     def renamed(patterns: str) -> str:
         return patterns.replace("/image", f"/{key}").replace("*image*", f"*{modality}*")
 
+    def of_sensor(symptom: Symptom) -> Symptom:
+        otherwise = tuple(map(of_sensor, symptom.otherwise))
+        return replace(symptom, statistics=renamed(symptom.statistics), otherwise=otherwise)
+
     return [
         replace(
             cause,
             name=f"{key}.{mechanism}",
             title=VIEW[mechanism].format(display_name(key)),
-            symptoms=tuple(replace(symptom, statistics=renamed(symptom.statistics)) for symptom in cause.symptoms),
+            symptoms=tuple(map(of_sensor, cause.symptoms)),
             consequences=renamed(cause.consequences) + (f"|sharpness/{key}/*" if mechanism == "occlusion" else ""),
             lowers=renamed(cause.lowers),
+            next=cause.by_hand or cause.next,
+            command=None,
             undo=f"drop {modality}",
             prior=PREFERRED if mechanism == "occlusion" else 0.0,
         )

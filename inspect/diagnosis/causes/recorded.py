@@ -1,6 +1,8 @@
-"""Causes in a filter known by recorded runs only: they show in its estimates, while the readings are healthy."""
+"""Causes in a filter known by its estimates only: they deviate while the readings are healthy."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER
@@ -33,3 +35,20 @@ RECORDED = (
         prior=-0.1,  # wrong noises change the errors as well
     ),
 )
+"""Of recorded runs."""
+
+OUTPUT = (
+    "Compare the output for the covariance with the version of the healthy record: variance or standard deviation, its "
+    "logarithm, its scale."
+)
+
+NEXT = {
+    "filter.overconfident": OUTPUT,
+    "filter.underconfident": OUTPUT,
+    "filter.changed": "Compare the code and weights with the version of the healthy record: the normalisation, units "
+    "and order of the inputs, and the state that it keeps between steps.",
+}
+"""Next actions of an external filter that reports estimates only, such as a recurrent network."""
+
+OF_ESTIMATES = tuple(replace(cause, next=NEXT[cause.name]) for cause in RECORDED)
+"""Of such a filter."""
