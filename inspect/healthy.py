@@ -147,12 +147,12 @@ def _profile_of_runs(
 def overlap_warning(record: Iterable[Episode], diagnosed: Iterable[Episode]) -> str | None:
     """One line about episodes of a healthy record that are themselves diagnosed, or None."""
     digests = {episode.digest() for episode in diagnosed}
-    shared = sum(episode.digest() in digests for episode in record)
+    shared = digests.intersection(episode.digest() for episode in record)
     if not shared:
         return None
     return (
-        f"the healthy record contains {shared} of the {len(digests)} diagnosed episodes, so that a fault in them "
-        "does not show; measure it from other episodes, which are known to be clean"
+        f"the healthy record contains {len(shared)} of the {len(digests)} diagnosed episodes, whose faults it hides; "
+        "measure it from other episodes, which are known to be clean"
     )
 
 

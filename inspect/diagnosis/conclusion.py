@@ -165,7 +165,7 @@ def _other_lengths(case: Case) -> list[str]:
     own, healthy = (
         f"{a} steps" if a == b else f"{a} to {b} steps" for a, b in ((min(lengths), max(lengths)), (low, high))
     )
-    return [f"what the length changes: episodes have {own}, those of the healthy record {healthy}"]
+    return [f"statistics that depend on the length: episodes have {own}, those of the healthy record {healthy}"]
 
 
 def missing_statistics(case: Case) -> int:

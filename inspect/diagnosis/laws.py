@@ -1,4 +1,4 @@
-"""Laws that every right external filter obeys: one that never did does not deviate from its own healthy record."""
+"""Laws that every correct external filter obeys: one that never did does not deviate from its own healthy record."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.diagnostics.statistic_kinds import label_of
 
 NOISE_SLOPE, LARGEST_NIS = 0.3, 2.0
-"""Smallest slope of the effect of a control that is noise only, below 0, and the largest NIS of right dynamics."""
+"""Smallest slope of the effect of a control that is noise only, below 0, and the largest NIS of correct dynamics."""
 
 PRECISION = 3.0
 """Smallest distance from the expected value in standard errors of the record's mean."""
 
 
 class Law(NamedTuple):
-    """Value of a kind of statistic in a right filter, and the largest deviation from it that is not mentioned."""
+    """Value of a kind of statistic in a correct filter, and the largest deviation from it that is not mentioned."""
 
     kind: str
     expected: float
@@ -44,7 +44,8 @@ LAWS = (
     Law("measurement function", 0.0, 2.0),
     Law("likelihood offset", 0.0, 0.3),
 )
-"""The first ones are the causes of the later ones. Those of updates are of filters without fusion weights."""
+"""Earlier laws come first, because breaking one of them also breaks later ones. Those of updates need filters without
+fusion weights."""
 
 OF_UPDATES = ("likelihood share", "covariance update", "correction slope")
 
@@ -111,5 +112,5 @@ def _broken_law(case: Case) -> str:
         if broken:
             name, (_, median) = max(broken.items(), key=lambda item: item[1][0])
             label = label_of(name, case.inputs.checkpoint.task).rstrip(",")
-            return f"{capitalised(label)} is {median:.2g}, in a right filter {law.expected:.0f}"
+            return f"{capitalised(label)} is {median:.2g}, in a correct filter {law.expected:.0f}"
     return ""

@@ -102,10 +102,7 @@ class Shapley(Diagnostic):
         phases = [by_name[phase] for phase in PHASE_NAMES if phase in by_name] or [self.phases[0]]
         sentences = []
         for values in phases:
-            changes = [
-                f"{display_name(name)} {'lowers' if value < 0 else 'raises'} {{}} by {main.text(abs(value))}"
-                for name, value in zip(self.modalities, values.shapley[:, 0], strict=True)
-            ]
+            changes = [self._change(*pair) for pair in zip(self.modalities, values.shapley[:, 0], strict=True)]
             parts = changes[0].format(f"the {main.name} RMSE"), *(change.format("it") for change in changes[1:])
             empty, complete = main.text(values.rmse[0, 0]), main.text(values.rmse[-1, 0])
             sentences.append(
@@ -124,6 +121,13 @@ class Shapley(Diagnostic):
         if why := too_few(self.trajectories):
             sentences.append(f"No intervals: {why}.")
         return " ".join(sentences + [self.note] * bool(self.note))
+
+    def _change(self, modality: str, value: float) -> str:
+        """What a modality does to the RMSE, which is named in place of ``{}``. value: its Shapley value, m or rad."""
+        name, size = display_name(modality), self.task.main_error.text(abs(value))
+        if size == self.task.main_error.text(0.0):
+            return f"{name} hardly changes {{}}"
+        return f"{name} {'lowers' if value < 0 else 'raises'} {{}} by {size}"
 
     @property
     def baseline(self) -> str:

@@ -20,6 +20,7 @@ def test_diagnosed_episodes_in_the_healthy_record_are_counted() -> None:
     diagnosed = episodes[2:]
     assert overlap_warning(episodes[:2], diagnosed) is None
     assert "contains 1 of the 2 diagnosed episodes" in str(overlap_warning(episodes[:3], diagnosed))
+    assert "contains 1 of the 1 diagnosed episodes" in str(overlap_warning(2 * episodes[:1], 2 * episodes[:1]))
 
 
 @pytest.mark.parametrize(

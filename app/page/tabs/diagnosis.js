@@ -325,7 +325,7 @@ export class Diagnosis {
     const { data } = trace.selection;
     const source = isOld
       ? 'The healthy record lacks some statistics of this version.'
-      : 'The record was measured in this workspace; a fault in its own episodes does not show.';
+      : 'The record was measured in this workspace; it hides faults that its own episodes contain.';
     const about = `${source} Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
     html('.verdict', host).textContent = stateOf(entry) || (isInUse || isOld ? about : '');
     this.#drawHealthyFilter(host, trace, entry);

@@ -64,16 +64,16 @@ COVARIANCE = Cause(
     "Covariance of the updates wrong",
     (Symptom("covariance update/*", 0),),
     f"measurement noise/*|{FILTER}",
-    "Compare the covariance after an update with P - K H P: its signs, and the P, H and K in it.",
+    "Compare the covariance after an update with P - K H P: the signs, and the P, H and K that it uses.",
 )
-"""An update of the mean that is right, but not that of its covariance."""
+"""The update of the mean is correct, that of the covariance is not."""
 
 WEIGHTS = Cause(
     "weights.lost",
     "Particle weights not kept without resampling",
     (Symptom("lost weights/*", 1),),
     f"ancestors/*|offspring/*|prior ess/*|likelihood share/*|{FILTER}",
-    "Multiply the likelihood by the weights of the step before; make them equal only after a resampling.",
+    "Multiply the likelihood by the weights of the previous step; make them equal only after resampling.",
 )
 
 LATE = Cause(
@@ -89,7 +89,8 @@ START = Cause(
     "Filter ignores the belief that it starts at",
     (Symptom("ignored start/*", 1),),
     f"{JACOBIANS}|{DYNAMICS}|lag/dynamics/*|process noise/*|measurement noise/*|measurement function/*|{FILTER}",
-    "Use the mean and covariance that initialize_beliefs receives, or give it no parameters if its start is its own.",
+    "Use the mean and covariance that initialize_beliefs receives, or omit its parameters if the filter has its own "
+    "start.",
 )
 
 ESTIMATE = Cause(
@@ -276,7 +277,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
             f"{model_of(modality)}|{FILTER}",
-            "Wrap differences of angles to half a turn on either side of 0.",
+            "Wrap differences of angles to -180 to 180 degrees.",
         ),
         Cause(
             f"updates.{modality}.missing",

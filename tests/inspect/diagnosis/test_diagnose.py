@@ -201,7 +201,7 @@ def test_episodes_of_another_length_than_those_of_the_record_are_mentioned() -> 
     ):
         result = healthy(compared(inputs, runs(), rows, rows, replace(record, steps=steps), 0.05))
         first = result.to_json()["unmeasured"][0]
-        assert first == (f"what the length changes: episodes have {text}" if text else "image"), steps
+        assert first == (f"statistics that depend on the length: episodes have {text}" if text else "image"), steps
 
 
 def test_reading_models_of_an_earlier_version_are_measured_again() -> None:

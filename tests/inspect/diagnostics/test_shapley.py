@@ -293,6 +293,8 @@ def test_views_match_the_fields() -> None:
         assert row[3] + row[4] + row[5] == pytest.approx(row[6])
     value = 100 * next(first for first in result.phases if first.phase == "contact").shapley[1, 0]
     assert f"haptics {'lowers' if value < 0 else 'raises'} it by {abs(value):.2f} cm" in result.verdict
+    nothing = replace(result, phases=tuple(replace(p, shapley=0.0 * p.shapley) for p in result.phases))
+    assert "image hardly changes the position RMSE, haptics hardly changes it (" in nothing.verdict
 
 
 def test_too_many_modalities_are_refused() -> None:
