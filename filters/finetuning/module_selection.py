@@ -172,7 +172,7 @@ def _docstring(part: nn.Module) -> str:
     """The first line of the class's docstring; for torch's own modules their sizes."""
     if type(part).__module__.startswith("torch."):
         return part.extra_repr()
-    return ((type(part).__doc__ or "").strip().splitlines() or [""])[0].replace("``", "")
+    return ((type(part).__doc__ or "").strip().splitlines() or [""])[0].replace("``", "").removesuffix(".")
 
 
 def presets(module: nn.Module) -> dict[str, tuple[str, ...]]:

@@ -65,8 +65,8 @@ def diagnose(
     alarm_rate: float | None = opt.option("P", ALARM_RATE, None),
     profile_from: Path | None = opt.option(
         "DATA|DIR",
-        "Clean data; the healthy record is measured on their held-out episodes. Of recorded runs: a folder of healthy "
-        "ones.",
+        "Clean data; the healthy record is measured on their held-out episodes. For recorded runs: a folder of healthy "
+        "runs.",
         None,
     ),
     profile_filter: str | None = opt.option(

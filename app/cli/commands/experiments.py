@@ -7,7 +7,7 @@ from beliefscope.datasets.text import plural
 
 
 def experiments(
-    sweeps: list[Path] = opt.argument("DIR...", "Folders of sweeps; their tables are joined."),
+    sweeps: list[Path] = opt.argument("DIR...", "Folders of sweeps; their tables are combined."),
     phase: str = opt.option("NAME", "Steps to compare: all, a group such as contact, or blackout.", "all"),
     sort: str = opt.option("COLUMN", "Column of the overview that ranks the checkpoints, worst first.", "error"),
     top: int = opt.option("N", "Number of rows.", 20, parser=opt.integer(1)),

@@ -63,7 +63,7 @@ class Learning:
     seed: int = 0
     success: str | None = opt.option(
         "SLICE[:by=10%:others=5%]",
-        "Success criterion: the error falls by at least this share in the slice and rises by at most that in others.",
+        "Success criterion: the error falls by at least 'by' in the slice and rises by at most 'others' elsewhere.",
         None,
     )
 

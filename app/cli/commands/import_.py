@@ -45,7 +45,7 @@ def import_(
     """Import recordings and logs as traces or data sets.
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
-    Of a live run that is in progress or was killed, the complete steps are imported. With a folder as output, each file
+    If a live run is in progress or was killed, its complete steps are imported. With a folder as output, each file
     becomes a trace of the same name, or one per episode with its index after the name; files with errors are reported.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
