@@ -187,7 +187,10 @@ def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
 
 
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
-    """First step that shows a deviation and the first step after it, over the affected episodes; None if unknown."""
+    """First step that shows a deviation and the first step after it, over the affected episodes; None if unknown.
+
+    affected: (N,) bool, whether each episode of the case is affected.
+    """
     episodes = [trace.episode for trace, hit in zip(case.traces, affected, strict=True) if hit]
     localisations = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]
     intervals = [steps for steps in localisations if steps is not None]

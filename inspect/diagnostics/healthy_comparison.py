@@ -241,6 +241,8 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_
     Distributions of t-values differ between statistics; those of rare events have heavy tails. The critical value of a
     statistic is proportional to its own high quantile, so that a share of healthy samples, ``CRITICAL``, exceeds any.
     With a larger ``alarm_rate``, alarms begin at lower ratios.
+
+    Raises BadInput if the profile has no statistic of the compared episodes.
     """
     names = [deviation.statistic for deviation in comparison.deviations]
     if not names:

@@ -278,7 +278,7 @@ def weights_of(covariance: Array) -> Array:
 def relative(difference: Array, expected: Array, axes: tuple[int, ...], smallest: Array | float = 0.0) -> Array:
     """Roots of the sum of squares over axes, relative to those of the expected values, which are at least the smallest.
 
-    NaN where nothing is expected.
+    NaN where nothing is expected. difference, expected: of one shape; the result lacks the axes.
     """
     error = np.sqrt(np.square(difference).sum(axes))
     size = np.maximum(np.sqrt(np.square(expected).sum(axes)), smallest)
@@ -286,6 +286,6 @@ def relative(difference: Array, expected: Array, axes: tuple[int, ...], smallest
 
 
 def known_median(values: Array) -> Array:
-    """Median over the first axis of the known values; NaN where there are none."""
+    """(...): median of the known values (N, ...) over the first axis; NaN where there are none."""
     unknown = np.isnan(values).all(0)
     return np.where(unknown, np.nan, np.nanmedian(np.where(unknown, 0.0, values), axis=0))

@@ -138,6 +138,11 @@ def excess_error(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]
 
 
 def weight_correlations(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]]) -> list[Correlation]:
+    """Correlations of each weight with contact, image blackout and the oracle's weight, over the counted steps.
+
+    Args:
+        step_values: of each trace: ``beta``, ``effective_weights`` and ``oracle``, (T, K, W), those that it has.
+    """
     names = [name for name in ("beta", "effective_weights", "oracle") if name in step_values[0]]
     task, modalities = traces[0].task, traces[0].modalities
     width = step_values[0]["oracle"].shape[-1]

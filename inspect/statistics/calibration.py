@@ -21,7 +21,7 @@ LAGS = 10
 def gaussian_level(squared: Array, n: int) -> Array:
     """Level of the ellipsoid through the true state: chi-square probability of ``e^T S^-1 e`` with n components.
 
-    Uniform between 0 and 1 for a calibrated Gaussian.
+    Uniform between 0 and 1 for a calibrated Gaussian. squared: (...); the result has its shape.
     """
     return chdtr(n, squared)
 

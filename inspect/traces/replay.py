@@ -259,7 +259,10 @@ class Replay:
         return assemble_trace(self.checkpoint, episode, self.start, arrays, **provenance)
 
     def apply_weights(self, evidence: Evidence, intervention: Intervention) -> Evidence:
-        """Replace beta in the evidence by the weights of an intervention."""
+        """Replace beta in the evidence by the weights of an intervention.
+
+        Raises BadInput for weights that the filter does not have, and for a standalone run, which has none.
+        """
         if not intervention.weights:
             return evidence
         intervention.check_weights(self.checkpoint)

@@ -200,7 +200,10 @@ def run_parts(
     particles_kept: int,
     progress: Callable[[float], None] | None,
 ) -> Iterator[dict[str, Tensor]]:
-    """Yields the arrays of consecutive steps. Arguments as for ``run_arrays``."""
+    """Yields the arrays (T, ...) of consecutive blocks of steps. Arguments as for ``run_arrays``.
+
+    Raises BadInput for ``particles_kept`` below 1.
+    """
     if particles_kept < 1:
         raise BadInput(f"particles kept must be at least 1, not {particles_kept}")
     filter_ = checkpoint.filter
@@ -226,7 +229,7 @@ BY_PARTICLE = {"particles": -2, "prior_log_weights": -1, "log_weights": -1, "log
 
 
 def with_fewer_particles(arrays: dict[str, Tensor], count: int) -> dict[str, Tensor]:
-    """Arrays of a trace with at most ``count`` particles at equal distances, and the effective sample size of all.
+    """Arrays (T, ...) with at most ``count`` particles at equal distances, and the effective sample size of all.
 
     Resampled particles are in the order of their ancestors, so those at equal distances are a stratified sample of the
     prior. Weights are normalised again. Ancestors are left out: most of them are not kept.

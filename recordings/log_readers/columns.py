@@ -164,7 +164,10 @@ def column(columns: Columns, reference: str, purpose: str) -> NDArray[np.float64
 
 
 def joined(columns: Columns, references: str | list[str], purpose: str) -> NDArray[np.float64]:
-    """(T, d): several columns side by side; a single one may have d elements."""
+    """(T, d): several columns side by side; a single one may have d elements.
+
+    Raises BadInput for an unknown column, and for columns of different lengths. purpose: their use, for messages.
+    """
     names = [references] if isinstance(references, str) else references
     parts = [column(columns, name, purpose) for name in names]
     rows = {len(part) for part in parts}

@@ -25,7 +25,10 @@ Array = NDArray[np.float64]
 
 
 def estimate_values(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
-    """(T, ...) values of the recorded estimate by the names of a trace, SI units."""
+    """(T, ...) values of the recorded estimate by the names of a trace, SI units.
+
+    Raises BadInput for columns that the log lacks, or whose number does not fit the state.
+    """
     estimate, factors, n = mapping.estimate, mapping.factors, len(mapping.components)
     values: dict[str, Array] = {}
     if "mean" in estimate:
@@ -105,7 +108,10 @@ def _particles(columns: Columns, references: References, n: int) -> Array:
 
 
 def scalar(columns: Columns, references: References, unit: str, purpose: str) -> Array:
-    """(T, d) values of columns; of a quaternion of any norm, its angle about z (T, 1) or its vector (T, 3), rad."""
+    """(T, d) values of columns; of a quaternion of any norm, its angle about z (T, 1) or its vector (T, 3), rad.
+
+    Raises BadInput as ``joined``, and for a quaternion of norm 0 or without four columns.
+    """
     values = joined(columns, references, purpose)
     if unit in ROTATIONS:
         if values.shape[1] != 4:

@@ -134,7 +134,11 @@ class _Videos:
         self.path, self.camera, self.fps = path, camera, fps
 
     def frames(self, columns: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        """(T, H, W, 3) frames at the timestamps of the rows."""
+        """(T, H, W, 3) frames at the timestamps of the rows. shape: that of the result.
+
+        Raises BadInput for invalid indices of files, invalid timestamps, a missing file or frame, more bytes than
+        ``MAX_BYTES``, and without the package av.
+        """
         check_size(self.camera, shape, np.uint8)
         frames = np.zeros(shape, np.uint8)
         episodes, times = columns["episode_index"], columns["timestamp"]

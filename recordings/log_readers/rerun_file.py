@@ -38,6 +38,8 @@ def open_log(path: Path, timeline: str | None) -> Iterator[RerunLog]:
     """The first recording of a file. A separate process reads the file first, because Rerun may crash.
 
     timeline: its name; if empty, the only one besides ``AUTOMATIC``, else ``log_time``; None takes the first.
+
+    Raises BadInput for a damaged file, one without a recording, and a timeline that is unknown or ambiguous.
     """
     info = RecordingProbe()(path)
     if info.problem and not info.application:
@@ -76,7 +78,7 @@ class RerunLog:
 
     @classmethod
     def from_batches(cls, batches: Sequence[pa.RecordBatch], timeline: str | None) -> RerunLog:
-        """The components in the chunks of a recording."""
+        """The components in the chunks of a recording. timeline, errors: as for ``open_log``."""
         indices = {f.name: f.type for batch in batches for f in _fields(batch, b"index")}
         own = sorted(indices.keys() - {*AUTOMATIC}, key=lambda name: (pa.types.is_int64(indices[name]), name))
         if not timeline:

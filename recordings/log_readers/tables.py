@@ -23,7 +23,10 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
-    """All columns of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays."""
+    """All columns (T, ...) of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays.
+
+    Raises BadInput for a file that is no archive of NumPy, as ``check_csv``, and for names that occur twice.
+    """
     if path.suffix.lower() == ".npz":
         if not is_zipfile(path):  # NumPy would suggest to load the file as a pickle
             raise BadInput(f"{path.name} is not a complete NumPy archive, as written by np.savez")
