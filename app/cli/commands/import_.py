@@ -187,7 +187,8 @@ def _values(episodes: list[Episode]) -> tuple[dict[str, Any], str]:
     from beliefscope.datasets.episode import durations_text
 
     dt, ranges = episodes[0].dt, component_ranges(episodes)
-    parts = [f"{name} {r['min']:.4g} to {r['max']:.4g} {r['unit']}".rstrip() for name, r in ranges.items()]
+    units = {name: "" if r["unit"] == "1" else f" {r['unit']}" for name, r in ranges.items()}
+    parts = [f"{name} {r['min']:.4g} to {r['max']:.4g}{units[name]}".rstrip() for name, r in ranges.items()]
     return {"dt": dt, "ranges": ranges}, "; ".join([durations_text(episodes), *parts])
 
 
