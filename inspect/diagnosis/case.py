@@ -189,7 +189,7 @@ def affected_episodes(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
 def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
     """First step that shows a deviation and the first step after it, over the affected episodes; None if unknown.
 
-    affected: (N,) bool, whether each episode of the case is affected.
+    affected: (E,) mask of the episodes of the case.
     """
     episodes = [trace.episode for trace, hit in zip(case.traces, affected, strict=True) if hit]
     localisations = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]

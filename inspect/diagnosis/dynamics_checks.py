@@ -141,7 +141,7 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
 def _offset(trace: Trace, steps: NDArray[np.intp], residual: Array) -> Array:
     """(n,) mean of the residuals (S, n) of a run's predictions that start with nearly true angles; NaN without any.
 
-    With another heading, right dynamics predict another change of the position.
+    With another heading, correct dynamics predict another change of the position.
     """
     angles = list(trace.task.angles)
     error = np.abs(measures.errors(trace)[steps - 1, -1][:, angles])

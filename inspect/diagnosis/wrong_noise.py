@@ -1,6 +1,6 @@
 """Process and measurement noise of an external filter that contradict its errors, also in its healthy record.
 
-The comparison with the record shows nothing if the filter has always been overconfident. Right noise needs no record:
+The comparison with the record shows nothing if the filter has always been overconfident. Correct noise needs no record:
 squared errors of the predictions are about Q, and squared innovations about S.
 """
 
