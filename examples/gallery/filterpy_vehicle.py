@@ -1,5 +1,6 @@
 """Filters of filterpy on the vehicle, with an adapter of the package.
 
+beliefscope trace vehicle --data vehicle.h5 --filter examples/gallery/filterpy_vehicle.py:kalman -o kalman.trace
 beliefscope inspect kalman.trace
 """
 

@@ -1,4 +1,4 @@
-"""Data of the gallery: a vehicle with GPS, which has gaps and outliers, and a wheel speed sensor.
+"""Data of the gallery: a vehicle with GPS, which has outages and outliers, and a wheel speed sensor.
 
 python examples/gallery/vehicle.py vehicle.h5
 """
