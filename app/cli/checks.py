@@ -24,6 +24,7 @@ from packaging.specifiers import SpecifierSet
 from beliefscope import __version__
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.checksums import changed_files, read_sums
+from beliefscope.datasets.text import plural
 
 DISK_WARNING, DISK_FAILURE = 2e9, 2e8  # bytes of free disk space
 EXTRAS = {
@@ -88,7 +89,7 @@ def torch(_: Place) -> Finding:
         return Finding(f"PyTorch {library.__version__} computes wrong results", "failed", "reinstall torch")
     names = [library.cuda.get_device_name(i) for i in range(library.cuda.device_count())]
     devices = f"CUDA {library.version.cuda}: {', '.join(names)}" if names else "no CUDA device (not required)"
-    return Finding(f"PyTorch {library.__version__}, {library.get_num_threads()} threads, {devices}")
+    return Finding(f"PyTorch {library.__version__}, {plural(library.get_num_threads(), 'thread')}, {devices}")
 
 
 def camera(_: Place) -> Finding:

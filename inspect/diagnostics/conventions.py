@@ -20,7 +20,14 @@ from beliefscope.inspect.diagnostics.shapley import run_subsets
 from beliefscope.inspect.diagnostics.standalone_modalities import of_standalone_run
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table
 from beliefscope.inspect.statistics.intervals import LEVEL, MIN_TRAJECTORIES, jackknife, too_few
-from beliefscope.inspect.statistics.measures import error_names, means, removed_share, squared_errors, starts_at_truth
+from beliefscope.inspect.statistics.measures import (
+    Mask,
+    error_names,
+    means,
+    removed_share,
+    squared_errors,
+    starts_at_truth,
+)
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -89,10 +96,15 @@ class Conventions(Diagnostic):
         More than the omission of the input removes: a change that only makes a filter ignore a bad input is none.
         """
         significant = self.low > 0.0 if self.trajectories >= MIN_TRAJECTORIES else np.ones_like(self.share, dtype=bool)
-        gain = 1.0 - (1.0 - self.share) / (1.0 - np.maximum(self.omitted, 0.0))
-        rows, columns = np.nonzero((self.share >= RELEVANT) & (gain >= RELEVANT) & significant)
+        rows, columns = np.nonzero(self._large & significant)
         order = np.argsort(-self.share[rows, columns])
         return [(int(rows[k]), int(columns[k])) for k in order]
+
+    @property
+    def _large(self) -> Mask:
+        """(C, Q): removals of at least ``RELEVANT``, also of the error that remains without the input."""
+        gain = 1.0 - (1.0 - self.share) / (1.0 - np.maximum(self.omitted, 0.0))
+        return (self.share >= RELEVANT) & (gain >= RELEVANT)
 
     @property
     def alarms(self) -> tuple[str, ...]:
@@ -104,8 +116,11 @@ class Conventions(Diagnostic):
     def verdict(self) -> str:
         count = len(self.changes)
         if not self.relevant_removals:
-            limit = percent(RELEVANT)
-            text = f"None of {count} changes of signs, scales, axes and delays lowers an error by {limit} or more."
+            adverb, end = "significantly " if self._large.any() else "", ""
+            if not adverb and (self.share >= RELEVANT).any():
+                end = " below that without the input"
+            limit = f"{percent(RELEVANT)} or more{end}"
+            text = f"None of {count} changes of signs, scales, axes and delays {adverb}lowers an error by {limit}."
         else:
             i, j = self.relevant_removals[0]
             text = f"With {self.changes[i].text}, {self._effect(i, j)}: filter and data may disagree about it."

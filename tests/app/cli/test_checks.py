@@ -18,6 +18,7 @@ from beliefscope.app.cli.checks import CHECKS, Finding, Place, report, run_check
 from beliefscope.app.server import main
 from beliefscope.datasets.io.checksums import changed_files, read_sums
 from beliefscope.datasets.store import sample_path
+from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import PRETRAINED
 
 pytestmark = pytest.mark.slow
@@ -37,7 +38,7 @@ def test_no_check_fails(run: Run, tmp_path: Path) -> None:
     assert (code, failed, err) == (0, {}, "")
     assert list(document["checks"]) == [check.__name__ for check in CHECKS]
     assert document["packages"]["torch"]
-    assert f", {torch.get_num_threads()} threads, " in document["checks"]["torch"]["message"]
+    assert f", {plural(torch.get_num_threads(), 'thread')}, " in document["checks"]["torch"]["message"]
     assert not list(tmp_path.iterdir()), "temporary files remain"
 
 

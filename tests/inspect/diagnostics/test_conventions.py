@@ -11,13 +11,14 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.hand_on_arc import HandOnArc
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostics.conventions import RELEVANT, Conventions, changes_of, conventions
+from beliefscope.inspect.diagnostics.conventions import RELEVANT, Change, Conventions, changes_of, conventions
 from beliefscope.inspect.statistics.measures import squared_errors
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -81,6 +82,20 @@ def test_clean_episodes_have_no_finding() -> None:
     result = conventions(traces(), filter_())
     assert (result.relevant_removals, result.alarms) == ([], ())
     assert result.verdict.startswith(f"None of {len(result.changes)} changes of signs")
+
+
+def test_the_verdict_states_why_large_changes_are_no_finding() -> None:
+    start = "None of 2 changes of signs, scales, axes and delays "
+    for share, omitted, low, end in (
+        (0.1, 0.0, 0.05, "lowers an error by 20 % or more."),
+        (0.21, 0.19, 0.1, "lowers an error by 20 % or more below that without the input."),
+        (0.3, 0.0, -0.1, "significantly lowers an error by 20 % or more."),
+    ):
+        numbers = {"share": share, "omitted": omitted, "low": low, "high": 0.5}
+        arrays = {name: np.full((2, 1), value) for name, value in numbers.items()}
+        changes = (Change("a", ""), Change("b", ""))
+        result = Conventions(PUSH, "filter", 6, False, changes, ("position",), **arrays)
+        assert result.verdict == start + end
 
 
 def test_single_traces_have_no_intervals() -> None:
