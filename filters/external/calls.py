@@ -100,7 +100,7 @@ def described(error: Exception, where: str, adapter: Adapter, task: Task) -> str
     message = (str(error).strip().splitlines() or ["no message"])[0]
     text = f"fails at {where}: {type(error).__name__}: {message}"
     if where == "step 0" and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
-        text += "; the first axis of its inputs is that of N trajectories; Adapter(filter, batched=False) has none"
+        text += "; the first axis of its inputs is that of N episodes; Adapter(filter, batched=False) has none"
     if isinstance(error, KeyError) and message.strip("'") not in task.observations:
         text += f"; the observations are {', '.join(task.observations)}"
     return text

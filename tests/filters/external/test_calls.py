@@ -259,7 +259,7 @@ def test_names_of_other_measurement_models_are_refused() -> None:
 
 
 def test_a_filter_of_one_trajectory_without_batched_false_is_told_of_the_axis() -> None:
-    with pytest.raises(BadInput, match=r"fails at step 0: .*; the first axis of its inputs is that of N trajectories"):
+    with pytest.raises(BadInput, match=r"fails at step 0: .*; the first axis of its inputs is that of N episodes"):
         trace(external(vehicle.NumpyKalman()), vehicle.drive(7, 10))
 
 
