@@ -92,8 +92,8 @@ def diagnose(
       beliefscope diagnose push --filter crossmodal-pf --data push.h5 --json -
       beliefscope diagnose door --filter mine.safetensors --data door.h5 --base crossmodal-ekf --episode 3
       beliefscope diagnose push --filter crossmodal-pf --faults image_occluded=14:from=40:to=60 --repair 142
-      beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from door.h5
-      beliefscope diagnose door --filter new.py:build --profile-from door.h5 --profile-filter old.py:build
+      beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from clean.h5
+      beliefscope diagnose door --filter new.py:build --profile-from clean.h5 --profile-filter old.py:build
       beliefscope diagnose traces/today --profile-from traces/healthy
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
