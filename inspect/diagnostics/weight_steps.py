@@ -141,7 +141,7 @@ def weight_correlations(traces: Sequence[Trace], step_values: Sequence[dict[str,
     """Correlations of each weight with contact, image blackout and the oracle's weight, over the counted steps.
 
     Args:
-        step_values: of each trace: ``beta``, ``effective_weights`` and ``oracle``, (T, K, W), those that it has.
+        step_values: of each trace: ``beta``, ``effective_weights`` and ``oracle``, (T, K, W), where it has them.
     """
     names = [name for name in ("beta", "effective_weights", "oracle") if name in step_values[0]]
     task, modalities = traces[0].task, traces[0].modalities
