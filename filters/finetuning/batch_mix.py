@@ -100,7 +100,9 @@ class Mix:
     def starts(self, length: int, warmup: int = 0) -> list[Tensor]:
         """For each part the first steps of all windows of this length that contain a step of the slice.
 
-        warmup: number of first steps of a window to exclude. Raises BadInput if there is no window.
+        Indices (P,) into ``steps`` for each part. warmup: number of first steps of a window to exclude.
+
+        Raises BadInput if there is no window.
         """
         starts = []
         for part in self.parts:
@@ -119,13 +121,13 @@ class Mix:
         return starts
 
     def sample_starts(self, starts: Sequence[Tensor], count: int, generator: torch.Generator) -> list[Tensor]:
-        """Uniform samples of each part's starts: its share of ``count``, at least one."""
+        """Uniform samples (P,) of each part's starts: its share of ``count``, at least one."""
         counts = [max(1, round(part.share * count)) for part in self.parts]
         picks = [torch.randint(len(first), (n,), generator=generator) for first, n in zip(starts, counts, strict=True)]
         return [first[pick.to(first.device)] for first, pick in zip(starts, picks, strict=True)]
 
     def windows(self, starts: Sequence[Tensor], length: int, warmup: int = 0) -> Windows:
-        """The windows that begin at each part's starts."""
+        """The windows that begin at each part's starts (P,). length, warmup: as for ``starts``."""
         joined = torch.cat(list(starts))
         index = joined + torch.arange(length, device=joined.device)[:, None]
         ends = [0, *torch.tensor([len(first) for first in starts]).cumsum(0).tolist()]
@@ -149,7 +151,7 @@ class Mix:
 
 
 def evenly_spaced(starts: Sequence[Tensor], count: int) -> list[Tensor]:
-    """At most ``count`` of each part's starts, evenly spaced."""
+    """At most ``count`` of each part's starts (P,), evenly spaced."""
     return [
         first[torch.linspace(0, len(first) - 1, min(count, len(first))).round().long().to(first.device)]
         for first in starts

@@ -187,7 +187,10 @@ def run_loop(loop: FineTuneLoop, state: Partial | None, began: float, callbacks:
 def split_episodes(
     episodes: Sequence[Episode], events: Sequence[StepRange]
 ) -> tuple[dict[str, list[Episode]], dict[str, dict[int, list[StepRange]]]]:
-    """Episodes to train on, validate on and test on; and the events of the first group by position in it."""
+    """Episodes to train on, validate on and test on; and the events of the first group by position in it.
+
+    Raises BadInput for an event outside of the episodes.
+    """
     by_episode: dict[int, list[StepRange]] = {}
     for event in events:
         if event.episode >= len(episodes):

@@ -151,7 +151,10 @@ class FineTune:
 
 
 def parse_rates(texts: Iterable[str]) -> tuple[float, tuple[tuple[str, float], ...]]:
-    """Default rate, and rates of patterns, from texts such as ``0.001`` and ``weight_model=0.0001``."""
+    """Default rate, and rates of patterns, from texts such as ``0.001`` and ``weight_model=0.0001``.
+
+    Raises BadInput for other texts.
+    """
     default, rates = FineTune.rate, []
     for text in texts:
         pattern, _, number = text.rpartition("=")

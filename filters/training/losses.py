@@ -28,7 +28,7 @@ def errors(filter_: Filter, states: Tensor, batch: Batch) -> Tensor:
 
 
 def prediction(filter_: Filter, batch: Batch) -> Tensor:
-    """Mean squared error of the dynamics model, T steps ahead from the true state."""
+    """Mean squared error of the dynamics model, 1 to T steps ahead from the true state: a standardised scalar."""
     control = filter_.dynamics.control_part(filter_.statistics.standardise("control", batch.controls))
     target, total = true_states(filter_, batch), torch.zeros((), device=batch.states.device)
     x = filter_.statistics.standardise("state", batch.previous)

@@ -132,7 +132,10 @@ def compose(
 
 
 def parse_event(text: str, traces: Sequence[Trace]) -> tuple[int, int]:
-    """Index of the trace and step of a text such as 68 or 9:68."""
+    """Index of the trace and step of a text such as 68 or 9:68.
+
+    Raises BadInput for another text, and for a step or an episode that the traces do not have.
+    """
     episode, _, step = text.rpartition(":")
     if not step.isdecimal() or (episode and not episode.isdecimal()):
         raise BadInput(f"--event {text!r} is not STEP or EPISODE:STEP, such as 68 or 9:68")
