@@ -5,6 +5,7 @@ import {
   displayName,
   fixed,
   formatBytes,
+  mainName,
   percent,
   probabilityText,
   sentence,
@@ -71,4 +72,14 @@ test('numbers in texts of the server are set', () => {
     '--seed',
   ])
     assert.equal(typeset(text), text);
+});
+
+test('a position belongs to the object of its first axis, or to none', () => {
+  const subject = (/** @type {string} */ name, main = 'position') =>
+    mainName(/** @type {any} */ ({ main: { name: main }, map: { components: [name] } }));
+  assert.deepEqual(
+    ['hinge_x', 'x', 'east'].map((name) => subject(name)),
+    ['hinge', 'position', 'position'],
+  );
+  assert.equal(subject('rotor', 'rotor'), 'rotor');
 });

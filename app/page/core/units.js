@@ -33,12 +33,12 @@ export function mainText(task, value) {
 }
 
 /**
- * Names what the main error is about: the object whose position it is, such as hinge, or the component.
+ * Names what the main error is about: the object of hinge_x and hinge_y, or else the position or the component.
  * @param {Task} task
  */
 export function mainName({ main, map }) {
   if (main.name !== 'position') return main.name;
-  return displayName(map.components[0]).replace(/(^| )x$/, '') || 'position';
+  return /^(.+) x$/.exec(displayName(map.components[0]))?.[1] ?? main.name;
 }
 
 /**
