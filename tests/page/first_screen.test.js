@@ -28,7 +28,7 @@ const run = (last, contact = 5) =>
     fuses: true,
     has: () => false,
     hasTruth: () => true,
-    largestDeviation: () => ({ sigmas: 5, component: 'x' }),
+    largestDeviation: (/** @type {number} */ t) => ({ sigmas: t < 8 ? 1 : 5, component: 'x' }),
     blackout: series((t) => Number(t >= 8 && t <= last)),
     contact: series((t) => Number(t >= contact)),
     weight: () => series((t) => (t >= 8 && t <= last ? 0.9 : 0.25)),
@@ -155,6 +155,14 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.equal(finding(accurate, 0, { ...HEALTHY, miscalibrated: true }).tone, 'warn');
   assert.equal(finding(run(14), 0, HEALTHY).tone, 'warn', 'overconfident, as its healthy record');
   assert.equal(finding(run(14), 0, HEALTHY).step, 8);
+  const elsewhere = { ...run(14), error: () => series((t) => (t === 16 ? 2 : 0.5)) };
+  assert.match(
+    finding(elsewhere, 0, HEALTHY).headline,
+    /^No fault found: mean position error 0\.57 cm/,
+  );
+  assert.equal(finding(elsewhere, 0, HEALTHY).step, 16, 'a failure after the outage');
+  const before = { ...run(14), largestDeviation: () => ({ sigmas: 5, component: 'x' }) };
+  assert.match(finding(before, 0, HEALTHY).headline, /^No fault found/, 'it failed before');
   const plain = finding(run(11), 0, null);
   assert.equal(plain.headline, 'Largest error at step 10.');
   assert.match(plain.evidence, /error 1\.23 cm; largest deviation 5\.0σ in x: overconfident/);

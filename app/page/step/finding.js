@@ -25,8 +25,8 @@ const END = 0.1; // share of the steps
  */
 
 /**
- * Describes a run. A diagnosed fault comes first, then an injected one, an outage of the camera in contact, an error
- * of a filter without a diagnosis, and the largest error.
+ * Describes a run. A diagnosed fault comes first, then an injected one, an outage of the camera in contact unless the
+ * filter fails at another step, an error of a filter without a diagnosis, and the largest error.
  * @param {Trace} trace
  * @param {number} component whose effective weights are described
  * @param {Diagnosis | null} diagnosis null without one
@@ -45,7 +45,8 @@ export function finding(trace, component, diagnosis) {
   const summary = `${worst.headline} ${worst.evidence}`.trim();
   // As its record, which may be poor.
   const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
-  const outage = fault ? null : outageFinding(trace, component);
+  const failed = worst.tone === 'bad' ? worst.step : null;
+  const outage = fault ? null : outageFinding(trace, component, failed);
   if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
   if (trace.header.failure) return failureFinding(trace.header.failure);
   const defect = trace.header.defects?.[0];
@@ -192,13 +193,21 @@ export function divergence(error) {
  * Describes the first outage of the camera that begins in contact; null if there is none.
  * @param {Trace} trace
  * @param {number} component whose effective weights are described
+ * @param {number | null} [failed] step of a failure that must begin in the outage
  * @returns {Omit<Finding, 'tone'> | null}
  */
-export function outageFinding(trace, component) {
+export function outageFinding(trace, component, failed = null) {
   const { modalities } = trace;
   if (modalities.length && !modalities.some((name) => name.includes('image'))) return null;
   const outage = intervals(trace.blackout).find(
-    ([first, last]) => first && trace.contact[first] && last - first >= MIN_STEPS - 1,
+    ([first, last]) =>
+      first &&
+      trace.contact[first] &&
+      last - first >= MIN_STEPS - 1 &&
+      (failed === null ||
+        (first <= failed &&
+          failed <= last &&
+          stepSummary(trace, first - 1, component).tone !== 'bad')),
   );
   if (!outage) return null;
   const [first, last] = outage;
