@@ -3,7 +3,7 @@ import { test } from 'node:test';
 
 import './browser.js';
 import { ServerError } from '../../app/page/data/server_error.js';
-import { isTrainable, recoveredText } from '../../app/page/tabs/diagnosis_cause.js';
+import { isTrainable, placeLabel, recoveredText } from '../../app/page/tabs/diagnosis_cause.js';
 import { JobResults } from '../../app/page/widgets/job_results.js';
 
 const { signal } = new AbortController();
@@ -110,4 +110,12 @@ test('only a cause whose next action is a fine-tuning run offers one', () => {
     isTrainable({ next: 'Fine-tune it: `beliefscope finetune door --filter crossmodal-ekf`.' }),
   );
   assert.ok(!isTrainable({ next: 'Check the camera and its driver.' }));
+});
+
+test('an evidence names its episode only among others', () => {
+  const place = { episode: 9, step: 39, time: null };
+  assert.equal(placeLabel(place, false), 'episode 9, step 39');
+  assert.equal(placeLabel(place, true), 'step 39');
+  assert.equal(placeLabel({ ...place, step: null }, false), 'episode 9');
+  assert.equal(placeLabel({ ...place, step: null }, true), '');
 });

@@ -244,17 +244,18 @@ export class Diagnosis {
     const causes = (result?.causes ?? []).filter(
       ({ probability, evidence }) => probability >= SHOWN && evidence.length > 0,
     );
+    const alone = over === 'episode';
     const rows = causes.map((cause, i) => {
       const canTrain = this.#canStart && !i && isTrainable(cause);
       const open = (/** @type {number} */ e, /** @type {number | null} */ s) =>
         this.#openStep(e, s, cause);
-      return causeItem(cause, open, canTrain ? [this.#finetuneButton()] : []);
+      return causeItem(cause, alone, open, canTrain ? [this.#finetuneButton()] : []);
     });
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
     const items = deviations.map((deviation) =>
-      evidenceItem(deviation, (e, s) => this.#openStep(e, s)),
+      evidenceItem(deviation, alone, (e, s) => this.#openStep(e, s)),
     );
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';

@@ -12,20 +12,21 @@ const PRESENT = 'Probability that this cause is present, alone or together with 
 
 /**
  * @param {DiagnosisCause} cause
+ * @param {boolean} alone whether the displayed episode is the only one
  * @param {OpenStep} open
  * @param {HTMLElement[]} actions after the next action
  */
-export function causeItem(cause, open, actions) {
+export function causeItem(cause, alone, open, actions) {
   const { probability, recovered, evidence, steps } = cause;
   const bar = create('meter', { min: 0, max: 1, value: probability });
   bar.setAttribute('aria-label', `Probability of ${cause.title}`);
   const noun = cause.episodes.length === 1 ? 'episode' : 'episodes';
-  const where = [`${noun} ${cause.episodes.join(', ')}`];
+  const where = alone ? [] : [`${noun} ${cause.episodes.join(', ')}`];
   if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
   /** @type {HTMLElement[]} */
   const lines = [
     create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
-    create('ul', {}, ...evidence.map((item) => evidenceItem(item, open))),
+    create('ul', {}, ...evidence.map((item) => evidenceItem(item, alone, open))),
   ];
   if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
   lines.push(nextAction(cause.next), ...actions);
@@ -44,17 +45,28 @@ export function causeItem(cause, open, actions) {
 
 /**
  * @param {DiagnosisEvidence} evidence
+ * @param {boolean} alone whether the displayed episode is the only one
  * @param {OpenStep} open
  */
-export function evidenceItem({ text, episode, step, time }, open) {
+export function evidenceItem({ text, episode, step, time }, alone, open) {
   const item = create('li', { textContent: typeset(sentence(text)) });
-  if (episode === null) return item;
-  const label =
-    step === null ? `episode ${episode}` : `episode ${episode}, ${stepLabel(step, time)}`;
+  const label = placeLabel({ episode, step, time }, alone);
+  if (episode === null || !label) return item;
   const link = create('button', { type: 'button', className: 'text quiet', textContent: label });
   link.addEventListener('click', () => open(episode, step));
   item.append(' ', link);
   return item;
+}
+
+/**
+ * Names the episode and the step that show an evidence; empty without a step of the only episode.
+ * @param {Pick<DiagnosisEvidence, 'episode' | 'step' | 'time'>} evidence
+ * @param {boolean} alone whether the displayed episode is the only one
+ */
+export function placeLabel({ episode, step, time }, alone) {
+  const parts = alone ? [] : [`episode ${episode}`];
+  if (step !== null) parts.push(stepLabel(step, time));
+  return parts.join(', ');
 }
 
 /**
