@@ -40,6 +40,12 @@ def test_diagnosis_names_causes_and_opens_their_moments(open_page: Any) -> None:
     assert (page.state["tab"], page.state["diagnostic"]) == ("diagnostics", "efficiency")
 
 
+def test_the_finding_is_confirmed_while_the_tab_is_closed(open_page: Any) -> None:
+    page = open_page("?task=push&filter=crossmodal-ekf&episode=189&faults=contact_inverted&tab=scene")
+    page.until("() => document.querySelector('#finding').textContent.includes('Undoing it removes')")
+    assert page.page.locator("#diagnosis").is_hidden()
+
+
 @pytest.mark.long  # tests/app/api/test_diagnosis.py has the same search
 def test_the_smallest_repair_is_drawn_in_the_timeline(open_page: Any) -> None:
     faults = "image_occluded%3D14%3Afrom%3D40%3Ato%3D60"

@@ -33,7 +33,7 @@ const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', ac
 const MEASURE = 'Measure a healthy record';
 const MAX_RESULTS = 24; // in the cache
 const LISTED = 3; // statistics that were not measured
-const SETTLING = 500; // ms until the job of a selection starts
+const SETTLING = { open: 500, closed: 2000 }; // ms until the job of a selection starts
 
 export class Diagnosis {
   #host;
@@ -87,7 +87,7 @@ export class Diagnosis {
     );
   }
 
-  /** Whether the panel is visible; nothing is requested before. */
+  /** Whether the panel is visible. The diagnosis of the displayed episode is also requested before, for the finding. */
   set open(/** @type {boolean} */ open) {
     this.#open = open;
     if (open) this.load();
@@ -115,20 +115,26 @@ export class Diagnosis {
 
   /** Loads the diagnosis of the selected run, or a preliminary one and the state of its job, which it starts. */
   async load() {
-    const trace = this.#trace;
-    if (!this.#open || !trace) return;
+    const [trace, isOpen] = [this.#trace, this.#open];
+    if (!trace) return;
     this.#loading.abort();
+    if (
+      !isOpen &&
+      (!this.#canStart || trace.header.no_diagnosis || this.#store.state.over !== 'episode')
+    )
+      return;
     const { signal } = (this.#loading = new AbortController());
-    this.#repair.show(trace);
+    if (isOpen) this.#repair.show(trace);
     if (this.#liveState) return this.#draw();
     if (trace.header.no_diagnosis) return this.#loadRecord(trace, signal);
-    if (!this.#isLive)
+    if (isOpen && !this.#isLive)
       this.#records.load(this.#recordKey, () => this.#getRecord(trace, signal), signal);
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
     if (this.#entry.state !== 'absent' || !this.#canStart) return;
-    await new Promise((resolve) => setTimeout(resolve, SETTLING));
-    if (!signal.aborted && this.#open && this.#entry.state === 'absent') this.#startOrCancel();
+    const settling = isOpen ? SETTLING.open : SETTLING.closed;
+    await new Promise((resolve) => setTimeout(resolve, settling));
+    if (!signal.aborted && this.#entry.state === 'absent') this.#startOrCancel();
   }
 
   /**
@@ -211,16 +217,16 @@ export class Diagnosis {
   }
 
   #draw() {
+    const { over } = this.#store.state;
+    const entry = this.#entry;
+    if (this.#trace && entry.state === 'ready' && over === 'episode')
+      this.confirmed(this.#trace, entry.result);
     if (!this.#open) return;
     if (this.#trace && !this.#liveState && this.#trace.header.no_diagnosis)
       return this.#drawRecord(this.#trace, this.#trace.header.no_diagnosis);
-    const entry = this.#entry;
-    const { over } = this.#store.state;
     const set = (/** @type {string} */ value) => this.#store.set({ over: value });
     choice(html('.choice', this.#host), this.#isLive ? [] : OVER, over, set);
     const result = entry.state === 'ready' ? entry.result : entry.preliminary;
-    if (this.#trace && entry.state === 'ready' && over === 'episode')
-      this.confirmed(this.#trace, entry.result);
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? findingOf(result) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
