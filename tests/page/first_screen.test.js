@@ -167,6 +167,9 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.equal(plain.headline, 'Largest error at step 10.');
   assert.match(plain.evidence, /error 1\.23 cm; largest deviation 5\.0σ in x: overconfident/);
   assert.deepEqual([plain.tone, plain.step], ['bad', 10]);
+  const header = { no_diagnosis: 'this filter has no healthy record' };
+  const { evidence } = finding({ ...run(11), header }, 0, null);
+  assert.match(evidence, /\. This filter has no healthy record\.$/);
   const healthy = finding(run(11), 0, HEALTHY);
   assert.match(
     healthy.headline,

@@ -51,7 +51,10 @@ export function finding(trace, component, diagnosis) {
   if (trace.header.failure) return failureFinding(trace.header.failure);
   const defect = trace.header.defects?.[0];
   if (defect) return { ...worst, tone: 'bad', headline: sentence(defect), evidence: summary };
-  if (!diagnosis) return worst;
+  if (!diagnosis) {
+    const reason = sentence(trace.header.no_diagnosis ?? '');
+    return { ...worst, evidence: `${worst.evidence} ${reason}`.trim() };
+  }
   const { tone = healthy, headline = healthyHeadline(trace, component, diagnosis) } = fault ?? {};
   return { tone, headline, evidence: summary, step: worst.step };
 }
