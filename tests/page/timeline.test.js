@@ -13,7 +13,13 @@ import {
   parseWindow,
   zoomWindow,
 } from '../../app/page/timeline/step_window.js';
-import { TRACKS, selectedError, trackOptions, tracks } from '../../app/page/timeline/tracks.js';
+import {
+  TRACKS,
+  digitsOf,
+  selectedError,
+  trackOptions,
+  tracks,
+} from '../../app/page/timeline/tracks.js';
 import { FUSION, TASK, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
@@ -178,6 +184,16 @@ test('values in legends', () => {
   const track = { title: '', unit: '', series: [] };
   assert.equal(formatValue(1.2345, track), '1.23');
   assert.equal(formatValue(1.2345, { ...track, digits: 1 }), '1.2');
+});
+
+test('values of a small range have more digits', () => {
+  const digits = (/** @type {number[]} */ ...values) =>
+    digitsOf([{ values: Float32Array.from(values) }]);
+  assert.deepEqual(
+    [digits(0, 75), digits(50, 51.5), digits(3, NaN, 3.7), digits(0, 1e-9)],
+    [1, 2, 2, 3],
+  );
+  assert.deepEqual([digits(5, 5), digits(), digitsOf([])], [1, 1, 1]);
 });
 
 test('legends have room for the longest name, in two columns if it is short', () => {

@@ -199,8 +199,21 @@ function estimateTrack(trace, component) {
     title: capitalised(displayName(name)),
     unit: trace.unitOf(component).unit,
     series: [truth, ...estimates],
-    digits: 1,
+    digits: digitsOf([truth, ...estimates]),
   };
+}
+
+/**
+ * Number of decimals of the values, from 1 to 3, that fits their range: 1 from 5 on, 2 from 0.5 on.
+ * @param {Pick<Series, 'values'>[]} series
+ */
+export function digitsOf(series) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const { values } of series)
+    for (const value of values)
+      if (Number.isFinite(value)) [low, high] = [Math.min(low, value), Math.max(high, value)];
+  const range = high - low;
+  return range > 0 ? Math.min(3, Math.max(1, 1 - Math.floor(Math.log10(range / 5)))) : 1;
 }
 
 /**
@@ -212,14 +225,15 @@ function errorTrack(trace, component) {
   if (!trace.truth(component).some(Number.isFinite)) return emptyTrack('Error', NO_TRUTH);
   const isOther = !trace.main.includes(component);
   const name = capitalised(displayName(trace.components[component].name));
+  const series = availableSeries(trace.sources, (source) =>
+    trace.error(source, isOther ? component : 'main'),
+  );
   return {
     title: isOther ? `${name} error` : `${capitalised(trace.task.main.name)} error`,
     unit: isOther ? trace.unitOf(component).unit : trace.mainUnit,
-    series: availableSeries(trace.sources, (source) =>
-      trace.error(source, isOther ? component : 'main'),
-    ),
+    series,
     fromZero: true,
-    digits: 1,
+    digits: digitsOf(series),
   };
 }
 
@@ -241,7 +255,7 @@ function signedErrorTrack(trace, component) {
     unit: trace.unitOf(component).unit,
     help: 'Estimate minus truth, with the predicted standard deviation. The filter is overconfident where the ±2σ band excludes zero.',
     series: [truth, ...estimates],
-    digits: 1,
+    digits: digitsOf(estimates),
   };
 }
 
@@ -285,7 +299,7 @@ function innovationTrack(trace, component) {
     help: 'Measurement minus prediction of each modality. For a consistent filter 95 % are within the band.',
     series,
     ofModalities: true,
-    digits: 1,
+    digits: digitsOf(series),
   };
 }
 
