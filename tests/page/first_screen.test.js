@@ -56,9 +56,11 @@ test('the finding describes the outage in contact, with weights, error and its e
     headline:
       'The camera goes dark at step 8, in contact; haptics takes over until the image returns at step 15.',
     evidence:
-      'The mean effective weight of haptics rises from 25 % before to 90 % in the outage; the position error stays below 1.3 cm.',
+      'The mean effective weight of haptics rises from 25 % before to 90 % in the outage; the position error rises from 0.5 cm to 1.2 cm.',
     step: 8,
   });
+  const steady = outageFinding({ ...run(14), error: () => series(() => 0.57) }, 0);
+  assert.match(steady?.evidence ?? '', /; the position error stays below 0\.6 cm\.$/);
   assert.match(outageFinding(run(STEPS - 1), 0)?.headline ?? '', /takes over to the end\.$/);
 });
 

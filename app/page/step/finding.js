@@ -11,6 +11,7 @@ import { stepSummary, weightScope } from './step_summary.js';
 const MIN_STEPS = 5; // of an outage
 const MIN_CHANGE = 0.05; // of a weight
 const MIN_RECOVERED = 0.05; // share of the error that an undo removes
+const MIN_RISE = 2; // factor of the error in an outage
 const BEFORE = 10; // steps that are compared with the outage
 const DIVERGED = 5; // times the median error of the first half of the run
 const END = 0.1; // share of the steps
@@ -235,10 +236,15 @@ export function outageFinding(trace, component, failed = null) {
     ({ name, before, during }) =>
       `the mean effective weight of ${displayName(name)}${scope} ${change(before, during)}`,
   );
-  const worst = Math.max(...(trace.error('fused', 'main')?.subarray(first, last + 1) ?? [NaN]));
-  if (worst >= 0)
+  const error = trace.error('fused', 'main');
+  const worst = Math.max(...(error?.subarray(first, last + 1) ?? [NaN]));
+  const before = error?.[first - 1] ?? NaN;
+  const text = (/** @type {number} */ value) => withUnit(fixed(value), trace.mainUnit);
+  if (worst >= MIN_RISE * before)
+    evidence.push(`the ${trace.task.main.name} error rises from ${text(before)} to ${text(worst)}`);
+  else if (worst >= 0)
     evidence.push(
-      `the ${trace.task.main.name} error stays below ${withUnit(fixed(Math.ceil(10 * worst) / 10), trace.mainUnit)}`,
+      `the ${trace.task.main.name} error stays below ${text(Math.ceil(10 * worst) / 10)}`,
     );
   return {
     headline: `The camera goes dark at ${trace.stepLabel(first)}, in contact${action}.`,
