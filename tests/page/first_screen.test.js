@@ -104,7 +104,7 @@ test('an injected fault that the diagnosis does not name comes before an outage'
   assert.equal(result.headline, 'Injected: image frozen, from step 10.');
   assert.equal(
     result.evidence,
-    'Mean position error 0.50 cm before, 2.00 cm from then on. The diagnosis does not name it. Healthy: all is normal.',
+    'The diagnosis does not name it. Mean position error 0.50 cm before, 2.00 cm from then on.',
   );
   assert.deepEqual([result.step, result.tone], [10, 'warn']);
   assert.equal(finding(frozen, 0, FAULT).headline, 'Image frozen from step 31.');
@@ -113,10 +113,7 @@ test('an injected fault that the diagnosis does not name comes before an outage'
   assert.match(finding(part, 0, HEALTHY).evidence, /2\.00 cm in these steps\./);
   const always = finding({ ...frozen, faulty: series(() => 0) }, 0, HEALTHY);
   assert.equal(always.headline, 'Injected: image frozen, in all steps.');
-  assert.match(
-    always.evidence,
-    /^Largest error at step 10\..* The diagnosis does not name it\. Healthy: all is normal\.$/,
-  );
+  assert.match(always.evidence, /^The diagnosis does not name it\. Largest error at step 10\./);
 });
 
 test('a fault comes first, then the outage, then the largest error', () => {

@@ -38,9 +38,9 @@ export function finding(trace, component, diagnosis) {
   if (fault?.evidence) return fault;
   const injected = trace.header.faults ? injectedFinding(trace, component) : null;
   if (injected) {
-    const lead = fault ? 'Diagnosis:' : 'The diagnosis does not name it.';
-    const diagnosed = diagnosis ? `${lead} ${sentence(diagnosis.headline)}` : '';
-    return { ...injected, evidence: `${injected.evidence} ${diagnosed}`.trim() };
+    const unsure = fault && `Diagnosis: ${fault.headline}`;
+    const diagnosed = diagnosis ? (unsure ?? 'The diagnosis does not name it.') : '';
+    return { ...injected, evidence: `${diagnosed} ${injected.evidence}`.trim() };
   }
   const worst = worstFinding(trace, component);
   const summary = `${worst.headline} ${worst.evidence}`.trim();
