@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.errors import BadInput, check_name
-from beliefscope.datasets.task import DISPLAY_UNITS, SENSOR_UNITS, Component, rotation
+from beliefscope.datasets.task import DISPLAY_UNITS, SENSOR_UNITS, Component, axis_name, rotation
+from beliefscope.datasets.text import plural
 
 QUATERNION = "quaternion_yaw"
 """Unit of a component whose column is a quaternion (x, y, z, w): the angle about z, in rad."""
@@ -112,6 +113,7 @@ class ColumnMap:
         modalities: name -> its sensors.
         estimate: recorded estimate: ``filter``: its name; ``mean``; ``std`` or ``covariance``; or ``particles``
             (rows of M n numbers) in their place; ``weights``: modality -> column. Empty for a log without estimates.
+        units: sensor -> unit of its channels, or one for each.
     """
 
     task: str
@@ -127,6 +129,7 @@ class ColumnMap:
     modalities: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     covariates: Mapping[str, CovariateColumn] = field(default_factory=dict)
     estimate: Mapping[str, Any] = field(default_factory=dict)
+    units: Mapping[str, References] = field(default_factory=dict)
 
     @property
     def factors(self) -> np.ndarray:
@@ -149,8 +152,19 @@ class ColumnMap:
         """
         references = {**self.sensors, "control": self.control}
         names = {key: _distinct(listed(references[key])) for key, size in sizes.items() if size > 1}
-        own = {key: each for key, each in names.items() if len({*each} - {""}) == sizes[key]}
-        return {key: tuple(Component(name, SENSOR_UNITS.get(key, "")) for name in each) for key, each in own.items()}
+        names = {key: each for key, each in names.items() if len({*each} - {""}) == sizes[key]}
+        for key in [key for key in self.units if key in sizes and key not in names]:
+            names[key] = [axis_name("", i, sizes[key]).strip() or key for i in range(sizes[key])]
+        units = {key: [unit for unit, _ in self.internal_units(key, sizes[key])] for key in names}
+        return {key: tuple(map(Component, each, units[key])) for key, each in names.items()}
+
+    def internal_units(self, key: str, size: int) -> list[tuple[str, float]]:
+        """Internal unit of each of the channels of a sensor, and its factor from that of the column."""
+        unit = self.units.get(key, SENSOR_UNITS.get(key, ""))
+        units = [unit] * size if isinstance(unit, str) else unit
+        if len(units) != size:
+            raise BadInput(f"sensor {key!r} has {plural(size, 'channel')} and {plural(len(units), 'unit')}")
+        return [UNITS.get(each, (each, 1.0)) for each in units]
 
     @property
     def truth(self) -> set[str]:
@@ -187,12 +201,9 @@ def read_map(path: Path) -> ColumnMap:
     for key in values:
         check_name(f"key of {path.name}", key, KEYS)
     sensors, estimate = (_table(values, name, path) for name in ("sensors", "estimate"))
-    settings = {name: value for name, value in sensors.items() if isinstance(value, dict)}
-    for name, value in settings.items():
-        if value.keys() != {"column", "valid"} or not isinstance(value["valid"], str):
-            raise BadInput(f"sensor {name!r} is {value!r:.100}, expected columns or {{column = NAME, valid = NAME}}")
+    settings = {name: _sensor(name, value) for name, value in sensors.items() if isinstance(value, dict)}
     sensors = {**sensors, **{name: value["column"] for name, value in settings.items()}}
-    valid = {name: value["valid"] for name, value in settings.items()}
+    valid, units = ({n: value[key] for n, value in settings.items() if key in value} for key in ("valid", "unit"))
     for key in estimate:
         check_name("key of [estimate]", key, ESTIMATE)
     dt = values.get("dt")
@@ -214,7 +225,7 @@ def read_map(path: Path) -> ColumnMap:
     covariates = {name: _covariate(name, value) for name, value in _table(values, "covariates", path).items()}
     task = values.get("task", path.stem)
     modalities = _modalities(_table(values, "modalities", path), sensors, path)
-    columns = {"control": control, "sensors": sensors, "valid": valid, "modalities": modalities}
+    columns = {"control": control, "sensors": sensors, "valid": valid, "units": units, "modalities": modalities}
     return ColumnMap(task, state, dt, covariates=covariates, estimate=estimate, **columns, **names)
 
 
@@ -260,12 +271,35 @@ def _component(name: str, value: Any) -> StateColumn:
     column, unit = settings["column"], settings.get("unit", "m")
     if not isinstance(unit, str):
         raise BadInput(f"unit of state {name!r} is {unit!r:.100}, expected a text such as m, cm, rad, deg or m/s")
-    if symbol := SPELLINGS.get(unit.strip().lower()):
-        raise BadInput(f"unit of state {name!r} is {unit!r}, expected {symbol!r}")
+    _check_spelling(f"state {name!r}", unit)
     quaternions = (QUATERNION, *ROTATIONS)
     if not isinstance(column, str) and not (unit in quaternions and _texts(column) and len(column) == 4):
         raise BadInput(f"column of state {name!r} is {column!r:.100}, expected a name, or four of a quaternion")
     return StateColumn(column, unit)
+
+
+def _sensor(name: str, value: dict[str, Any]) -> dict[str, Any]:
+    """Checked settings of a sensor: ``column``, ``valid`` and ``unit``."""
+    if (
+        "column" not in value
+        or not value.keys() <= {"column", "valid", "unit"}
+        or not isinstance(value.get("valid", ""), str)
+    ):
+        expected = "columns or {column = NAME, valid = NAME, unit = UNIT}"
+        raise BadInput(f"sensor {name!r} is {value!r:.100}, expected {expected}")
+    unit = value.get("unit", "")
+    if not isinstance(unit, str) and not _texts(unit):
+        raise BadInput(f"unit of sensor {name!r} is {unit!r:.100}, expected a text such as deg or m/s, or one for each")
+    for each in [unit] if isinstance(unit, str) else unit:
+        _check_spelling(f"sensor {name!r}", each)
+        if each in (QUATERNION, *ROTATIONS):
+            raise BadInput(f"unit of sensor {name!r} is {each!r}, which is one of the state only")
+    return value
+
+
+def _check_spelling(what: str, unit: str) -> None:
+    if symbol := SPELLINGS.get(unit.strip().lower()):
+        raise BadInput(f"unit of {what} is {unit!r}, expected {symbol!r}")
 
 
 def _covariate(name: str, value: Any) -> CovariateColumn:

@@ -16,16 +16,22 @@ from beliefscope.recordings.log_readers.table_folder import FILE
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"(?<![a-z])est|mean|pred|filter|posterior|belief"
 STD = r"std|sigma|\u03c3|(^|_)sd(_|$)"  # \u03c3 is the letter sigma
-FILTERS = r"ekf|ukf|amcl|slam|kalman"
+FILTERS = r"ekf|ukf|amcl|slam|kalman|(^|[./])[kp]f[._/]"
 POSE_ESTIMATES = (rf"{ESTIMATE}|{FILTERS}|local", r"odom")
 """Patterns of the names of estimated poses: of filters before odometry, which may be that of the wheels."""
 
 CONTROL = r"(^|[/_.])(actions?|controls?|cmd|commands?)([/_.]|$)|^u_?\d*$"
-VARIANCE = r"^(P|cov|covariance)[_.\[(]?\d"
+INTERNAL = r"innov|residual|(^|[._/])(nis|nees|ess|n_?eff)([._/]|$)"
+"""Pattern of values within a filter, which are neither estimates nor readings."""
+
+VARIANCE = r"(^|[./])(P|cov|covariance)[_.\[(]?\d"
 """Pattern of the elements of a covariance in columns of their own."""
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
 """Part of a column's name that marks a true value."""
+
+MARKED_UNIT = re.compile(r"_(deg|cm|mm)$")
+"""Unit at the end of a sensor's column."""
 
 UNITS_BY_NAME = {
     **{unit: rf"_{unit}$" for unit in ("deg", "cm", "mm")},
@@ -51,7 +57,9 @@ def guess_map(log: Preview, name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _table(columns: Columns) -> list[str]:
+def _table(every: Columns) -> list[str]:
+    internal = _named(INTERNAL, [n for n, values in every.items() if values.dtype.kind in "fiub"])
+    columns = {n: values for n, values in every.items() if n not in internal}
     flat = [n for n, values in columns.items() if values.ndim == 1 and values.dtype.kind in "fiub"]
     rows = {n: values for n, values in columns.items() if values.ndim > 1}
     time = _named(r"^(t|time|timestamp|stamp)(_s)?$", flat)
@@ -81,7 +89,8 @@ def _table(columns: Columns) -> list[str]:
     lines += [f"episode = {_text(episode[0])}"] if episode else []
     lines += [f"control = {_text(control[0]) if len(control) == 1 else _texts(control)}"] if control else []
     lines += [f"contact = {_text(flags[0])}"] if flags else []
-    lines += _sections({component: _value(component, reference) for component, reference in state.items()}, sensors)
+    values = {component: _value(component, reference) for component, reference in state.items()}
+    lines += _sections(values, {key: _reading(columns, references) for key, references in sensors.items()})
     if mean or ensemble:
         lines.append("[estimate]")
         # Standard deviations of some components only cannot be imported.
@@ -89,6 +98,7 @@ def _table(columns: Columns) -> list[str]:
         deviations = std if complete and not covariance else []
         columns_of = {"mean": mean, "std": deviations, "covariance": covariance, "particles": ensemble}
         lines += [f"{key} = {_text(n[0]) if len(n) == 1 else _texts(n)}" for key, n in columns_of.items() if n]
+    lines += _unused(internal)
     return lines + ([f"# not numbers, for time, episode or [covariates]: {_texts(texts)}"] if texts else [])
 
 
@@ -101,21 +111,24 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     estimate = next((name for pattern in POSE_ESTIMATES for name in _named(pattern, others)), "")
     used = [*state.values(), *poses.get(estimate, {}).values()]
     topics = {_topic(intervals, base_name(reference)) for reference in used}
-    references = [
-        _vector(columns, n) for n in columns if _is_reading(columns, n) and _topic(intervals, n) not in topics
-    ]
+    readings = [n for n in columns if _is_reading(columns, n) and _topic(intervals, n) not in topics]
+    internal = _named(INTERNAL, readings)
+    every = list(dict.fromkeys(_vector(columns, n) for n in readings if n not in internal))
+    control = _named(CONTROL, every)
+    references = [reference for reference in every if reference not in control]
     steps = [*poses.get(estimate, state).values()]  # the filter's own, rather than those of the true states
     clock = intervals[_topic(intervals, base_name(steps[0]))] if steps else 0.0
     clock = clock or min((interval for interval in intervals.values() if interval > 0.0), default=DT)
     lines = [f"dt = {clock:.3g}  # s per step of the common clock"]
+    lines += [f"control = {_text(control[0]) if len(control) == 1 else _texts(control)}"] if control else []
     values = {_key(component): _component(reference) for component, reference in state.items()}
-    lines += _sections(values, {_key(reference.strip("/")): reference for reference in references})
+    lines += _sections(values, {_key(ref.strip("/")): _reading(columns, ref) for ref in references})
     if estimate:
         lines += ["[estimate]", f"mean = {_texts([*poses[estimate].values()])}"]
         covariance = f"{estimate.removesuffix('.pose')}.covariance"
         if covariance in columns and columns[covariance].shape[1:] == (36,):
             lines.append(f"covariance = {_text(covariance + PLANAR_ELEMENTS)}  # of x, y and yaw")
-    return lines
+    return lines + _unused(internal)
 
 
 def _component(reference: str) -> str:
@@ -173,12 +186,28 @@ def _sensors(names: Sequence[str], flat: Sequence[str]) -> dict[str, str | list[
     }
 
 
-def _sections(state: Mapping[str, str], sensors: Mapping[str, str | list[str]]) -> list[str]:
+def _reading(columns: Columns, references: str | list[str]) -> str:
+    """Columns of a sensor, with the units at the ends of their names; of a message, those of its fields."""
+    value = _text(references) if isinstance(references, str) else _texts(references)
+    listed = [references] if isinstance(references, str) else references
+    names = [n for ref in listed for n in ([ref] if ref in columns else columns) if n == ref or n.startswith(f"{ref}.")]
+    marks = [MARKED_UNIT.search(n) for n in names if columns[n].ndim == 1]
+    units = [mark[1] if mark else "" for mark in marks]
+    if not any(units):
+        return value
+    return f"{{column = {value}, unit = {_text(units[0]) if len({*units}) == 1 else _texts(units)}}}"
+
+
+def _unused(internal: Sequence[str]) -> list[str]:
+    return [f"# of the filter, neither sensors nor estimates: {_texts(internal)}"] if internal else []
+
+
+def _sections(state: Mapping[str, str], sensors: Mapping[str, str]) -> list[str]:
     """Lines of [state] and [sensors]."""
     lines = ["[state]  # true values: component = column in m, or {column = NAME, unit = cm, rad, deg, or any}"]
     lines += [f"{_quoted(component)} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
     lines += ["[sensors]  # sensor = column or list of columns; each is a modality unless [modalities] groups them"]
-    return lines + [f"{_quoted(key)} = {_text(n) if isinstance(n, str) else _texts(n)}" for key, n in sensors.items()]
+    return lines + [f"{_quoted(key)} = {value}" for key, value in sensors.items()]
 
 
 def _means(pattern: str, flat: Sequence[str], rows: Columns, others: set[str]) -> list[str]:

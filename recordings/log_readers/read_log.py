@@ -47,7 +47,7 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str, split: str = "te
     with less than ten episodes.
     """
     states = _float32(_states(columns, mapping), "the state")
-    sensors = {name: _sensor(columns, name, refs) for name, refs in mapping.sensors.items()}
+    sensors = {name: _in_units(mapping, name, _sensor(columns, name, refs)) for name, refs in mapping.sensors.items()}
     control = joined(columns, mapping.control, "control") if mapping.control else np.zeros((len(states), 0))
     controls = _float32(control, "the control")
     contact = column(columns, mapping.contact, "contact") if mapping.contact else np.zeros(len(states))
@@ -165,6 +165,16 @@ def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray
         if np.array_equal(images, values):
             return images
     return _float32(column(columns, references, f"sensor {name}"), f"sensor {name!r}")
+
+
+def _in_units(mapping: ColumnMap, name: str, readings: NDArray[Any]) -> NDArray[Any]:
+    """Readings in internal units. Raises BadInput for a unit of images and arrays, and for too few or many units."""
+    if name not in mapping.units:
+        return readings
+    if readings.ndim != 2:
+        raise BadInput(f"sensor {name!r} has a unit and rows of shape {readings.shape[1:]}, expected a list of numbers")
+    factors = np.array([factor for _, factor in mapping.internal_units(name, readings.shape[1])])
+    return (readings * factors).astype(np.float32)
 
 
 def _present(columns: Columns, mapping: ColumnMap, name: str, readings: NDArray[Any]) -> NDArray[np.bool_]:

@@ -173,7 +173,9 @@ def test_import_finds_absent_readings(tmp_path: Path) -> None:
     np.testing.assert_array_equal(episode.present("odo"), steps % 4 == 0)
     np.testing.assert_array_equal(episode.observations["gps"][:, 0], steps - np.maximum(steps % 7 - 2, 0))
     (tmp_path / "map.toml").write_text(text + 'odo = {column = "odo", vald = "fix"}\n')
-    with pytest.raises(BadInput, match=r"sensor 'odo' is .*expected columns or \{column = NAME, valid = NAME\}"):
+    with pytest.raises(
+        BadInput, match=r"sensor 'odo' is .*expected columns or \{column = NAME, valid = NAME, unit = UNIT\}"
+    ):
         read_map(tmp_path / "map.toml")
 
 

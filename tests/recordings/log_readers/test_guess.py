@@ -58,3 +58,20 @@ def test_a_table_of_a_filter_has_its_estimate_covariance_and_controls() -> None:
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"drive.bag is a bag of ROS 1; convert it: .*--src drive.bag --dst drive"):
         preview_columns(tmp_path / "drive.bag")
+
+
+def test_units_of_sensors_are_those_of_their_columns_and_values_of_the_filter_are_no_sensors() -> None:
+    names = ["t", "true_x", "cam_x_mm", "tilt_deg", "speed", "pf.x_mm", "pf.P00", "pf.innov.x", "pf.n_eff"]
+    text = guess_map(Preview({name: np.ones(3) for name in names}), "drive")
+    values = tomllib.loads(text)
+    sensors = {"cam_x_mm": {"column": "cam_x_mm", "unit": "mm"}, "tilt_deg": {"column": "tilt_deg", "unit": "deg"}}
+    assert values["sensors"] == sensors | {"speed": "speed"}
+    assert values["estimate"] == {"mean": "pf.x_mm", "covariance": "pf.P00"}
+    assert '# of the filter, neither sensors nor estimates: ["pf.innov.x", "pf.n_eff"]' in text
+    columns = {"/compass.heading_deg": np.ones(3), "/lidar.range": np.ones(3), "/lidar.bearing_deg": np.ones(3)}
+    columns |= {"/cmd_vel.linear.x": np.ones(3), "/cmd_vel.angular.z": np.ones(3)}
+    topics = dict.fromkeys(("/compass", "/lidar", "/cmd_vel"), 0.1)
+    values = tomllib.loads(guess_map(Preview(columns, topics), "drive"))
+    assert values["control"] == ["/cmd_vel.linear", "/cmd_vel.angular"]
+    assert values["sensors"]["compass"] == {"column": "/compass", "unit": "deg"}
+    assert values["sensors"]["lidar"] == {"column": "/lidar", "unit": ["", "deg"]}
