@@ -15,7 +15,7 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.recordings.log_readers.arrays import Columns, check_downloaded
 from beliefscope.recordings.log_readers.column_map import ELEMENTS, ColumnMap, base_name
 from beliefscope.recordings.log_readers.messages import Preview, on_clock, preview
-from beliefscope.recordings.log_readers.table_folder import TABLES, table_files
+from beliefscope.recordings.log_readers.table_folder import TABLES, numbered, table_files
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
@@ -28,6 +28,9 @@ FOLDERS = {
     **{"zarr.json": "zarr_buffer", ".zgroup": "zarr_buffer"},
 }
 """A file in a folder -> the reader of the folder."""
+
+MESSAGES = (".mcap", ".db3")
+"""Suffixes of logs of messages."""
 
 PACKAGES = {"mcap": "logs", "rosbags": "logs", "zarr": "logs", "av": "video"}
 """Package -> the extra of this package that installs it."""
@@ -71,6 +74,15 @@ def _read(path: Path, mapping: ColumnMap | None) -> Preview:
     return result._replace(columns=columns)
 
 
+def message_logs(path: Path) -> list[Path]:
+    """The logs of messages in a folder, one per episode: files, or folders of bags. Empty for a path that is a log."""
+    if not path.is_dir() or any((path / name).is_file() for name in FOLDERS) or table_files(path):
+        return []
+    entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+    logs = [e for e in entries if (e / "metadata.yaml").is_file() or (e.suffix.lower() in MESSAGES and e.is_file())]
+    return sorted(logs, key=numbered)
+
+
 def _reader(path: Path) -> str:
     if path.is_dir():
         for name, reader in FOLDERS.items():
@@ -79,8 +91,8 @@ def _reader(path: Path) -> str:
         if table_files(path):
             return "table_folder"
         raise BadInput(
-            f"folder {path.name} has none of {', '.join(FOLDERS)}, and no files {', '.join(TABLES)}: not a ROS 2 bag, "
-            "LeRobot or Zarr data, or one table per episode"
+            f"folder {path.name} has none of {', '.join(FOLDERS)}, and no files {', '.join((*TABLES, *MESSAGES))}: "
+            "not a ROS 2 bag, LeRobot or Zarr data, or one log per episode"
         )
     suffix = path.suffix.lower()
     if suffix == ".bag":

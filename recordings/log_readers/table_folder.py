@@ -22,14 +22,15 @@ FILE = "<file>"
 """Column of the episodes: the name of the file of each row. No file has a column with this name."""
 
 
+def numbered(path: Path) -> list[tuple[int, str]]:
+    """Key of an order in which numbers in names count as numbers: ``run_2`` before ``run_10``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
 def table_files(folder: Path) -> list[Path]:
-    """The tables of a folder; numbers in their names count as numbers: ``run_2`` before ``run_10``."""
-
-    def order(path: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
+    """The tables of a folder, in the order of ``numbered``."""
     files = (f for f in folder.iterdir() if f.suffix.lower() in TABLES and not f.name.startswith(".") and f.is_file())
-    return sorted(files, key=order)
+    return sorted(files, key=numbered)
 
 
 def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:

@@ -54,8 +54,8 @@ def import_(
     of val and evaluated on those of test; --split auto makes a data set for all three.
 
     Formats of logs: NumPy (.npz), HDF5 (.h5, .hdf5), CSV and Parquet, also folders of them with one file per episode;
-    MCAP, ROS 2 bags (folder or .db3), Zarr replay buffers (folder or .zip), LeRobot data sets (folder, version 3), and
-    Rerun recordings of other programs (.rrd with --map or --guess).
+    MCAP and ROS 2 bags (folder or .db3), also folders of them; Zarr replay buffers (folder or .zip), LeRobot data sets
+    (folder, version 3), and Rerun recordings of other programs (.rrd with --map or --guess).
 
     \b
     Examples:
@@ -70,9 +70,10 @@ def import_(
     """
     from beliefscope.datasets.dataset import SPLITS
     from beliefscope.recordings.log_readers.column_map import read_map
-    from beliefscope.recordings.log_readers.columns import preview_columns
+    from beliefscope.recordings.log_readers.columns import message_logs, preview_columns
     from beliefscope.recordings.log_readers.guess import guess_map
 
+    sources = [log for source in sources for log in message_logs(source)[: 1 if guess else None] or [source]]
     if guess:
         if len(sources) > 1:
             raise BadInput(f"--guess prints the map of one log, not of {len(sources)}")
@@ -104,8 +105,11 @@ def _folder(
     if len(set(names)) < len(names):
         raise BadInput("files need different names, without their suffixes, to become traces of one folder")
     opt.check_folder(folder, "output")
-    opt.check_output(folder / names[0] if folder.is_dir() else folder)
-    folder.mkdir(exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"folder {str(folder)!r} cannot be created: {error.strerror}") from None
+    opt.check_output(folder / names[0])
     if len(sources) == 1:
         results = import_file(sources[0], folder / names[0])
         if len(results) == 1:

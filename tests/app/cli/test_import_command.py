@@ -140,3 +140,24 @@ def test_several_files_need_a_folder_and_different_names(run: Run, log: Path, ou
     code, _, error = run("import", *files, "--map", log.with_name("map.toml"), "-o", log.with_name(output))
     assert (code, error) == (2, f"error: {message.format(log.parent)}\n")
     assert not log.with_name(output).exists()
+
+
+def test_a_folder_of_logs_of_messages_becomes_a_folder_of_traces(run: Run, tmp_path: Path) -> None:
+    writer = pytest.importorskip("mcap.writer")
+    (tmp_path / "logs").mkdir()
+    for name in ("run_2", "run_10"):
+        with (tmp_path / "logs" / f"{name}.mcap").open("wb") as stream:
+            log = writer.Writer(stream)
+            log.start()
+            channel = log.register_channel("/pose", "json", log.register_schema("any", "jsonschema", b"{}"))
+            for step in range(STEPS):
+                log.add_message(channel, step * 100_000_000, json.dumps({"x": step / 7, "y": 1.0}).encode(), 0)
+            log.finish()
+    text = 'dt = 0.1\n[state]\nx = "/pose.x"\n[sensors]\ngps = "/pose"\n[estimate]\nmean = ["/pose.x"]\n'
+    (tmp_path / "map.toml").write_text(text)
+    output = tmp_path / "traces" / "today"
+    code, out, error = run("import", tmp_path / "logs", "--map", tmp_path / "map.toml", "-o", output)
+    assert code == 0, error
+    lines = [line.partition(" (")[0] for line in out.splitlines()]
+    assert lines == [str(output / "run_2.trace"), str(output / "run_10.trace"), "2 of 2 files imported"]
+    assert "[sensors]" in run("import --guess", tmp_path / "logs")[1]
