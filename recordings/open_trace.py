@@ -46,9 +46,14 @@ def recorded_runs(path: Path) -> list[Trace]:
     traces = [open_trace(file) for file in files]
     checkpoint_of(traces, files)
     traces = of_one_task(traces, [str(file) for file in files])
+    return sorted(with_distinct_indices(traces), key=lambda trace: trace.episode_index)
+
+
+def with_distinct_indices(traces: Sequence[Trace]) -> list[Trace]:
+    """The runs, numbered in their order if some have the same index of the episode."""
     if len({trace.episode_index for trace in traces}) < len(traces):
         return [replace(trace, episode_index=index) for index, trace in enumerate(traces)]
-    return sorted(traces, key=lambda trace: trace.episode_index)
+    return list(traces)
 
 
 def of_one_task(traces: Sequence[Trace], places: Sequence[str]) -> list[Trace]:

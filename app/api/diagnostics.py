@@ -1,4 +1,4 @@
-"""Routes under ``/api/diagnostics``: diagnostics of one episode or of all held-out episodes; slow ones as jobs."""
+"""Routes under ``/api/diagnostics``: diagnostics of one episode, all held-out ones or all runs; slow ones as jobs."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,11 +13,13 @@ from beliefscope.app.api.models import JobReply, Progress, Reply, ResultViews, f
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
+from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.text import plural
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Entry
 
@@ -108,7 +110,8 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     ) -> JobReply:
         _check(entry, store.request(selection))
         arguments = _arguments(store, entry, selection, options, episodes)
-        scope = f"all {plural(len(arguments['selections']), 'held-out episode')}" if episodes else ""
+        unit = "run" if selection.data.startswith(LIVE_PREFIX) else "held-out episode"
+        scope = f"all {plural(len(arguments['selections']), unit)}" if episodes else ""
         state = {"over": episodes, "diagnostic": entry.name, "options": urlencode(options)}
         title, link = f"{entry.title} of {selection.describe(scope)}", selection.link("diagnostics", **state)
         return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
@@ -123,12 +126,17 @@ def _arguments(
     store: TraceStore, entry: Entry, selection: Selection, options: Mapping[str, Any], episodes: Episodes
 ) -> dict[str, Any]:
     """Arguments of the job, with everything that its result depends on."""
-    indices = store.dataset(selection.task, selection.data)[1].held_out() if episodes else [selection.episode]
-    selections = [replace(selection, episode=index) for index in indices]
+    is_live = selection.data.startswith(LIVE_PREFIX)
+    if episodes and is_live:
+        selections = store.live.of_same_filter(selection)
+    else:
+        indices = store.dataset(selection.task, selection.data)[1].held_out() if episodes else [selection.episode]
+        selections = [replace(selection, episode=index) for index in indices]
+    known = not (is_live and isinstance(store.request(selection).checkpoint, UnavailableFilter))
     return {
         "diagnostic": entry.name,
         "options": dict(sorted(options.items())),
         "selections": [item.to_json() for item in selections],
         "keys": [store.key(item) for item in selections],
-        "record": store.record_version(selection.task, selection.filter),
+        "record": store.record_version(selection.task, selection.filter) if known else None,
     }

@@ -8,6 +8,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
                 filter_name, checkpoint = resolve_filter(run, store.filters_of(run))
                 unavailable = isinstance(checkpoint, UnavailableFilter) and bool(run.template.checkpoint_hash)
                 entry = {"filter": filter_name, "available": not unavailable, "kind": run.template.kind}
-                if other := difference(tasks.setdefault(run.task.name, run.task), run.task):
+                if other := difference(_unwrapped(tasks.setdefault(run.task.name, run.task)), _unwrapped(run.task)):
                     raise BadInput(f"live run {name!r} has {other}, unlike a newer run")
                 entries.append(describe(run) | entry)
             except BadInput as error:
@@ -111,6 +112,11 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
         if path is None:
             raise NotFound(f"Live run {name!r} has no recording.")
         return StreamingResponse(_follow_file(run, path), media_type="application/octet-stream")
+
+
+def _unwrapped(task: Task) -> Task:
+    """The task without marks of angles that wrap, which a log shows only if its values span more than half a turn."""
+    return replace(task, components=tuple(replace(component, wraps=False) for component in task.components))
 
 
 async def _next_block(runs: LiveRuns, name: str, request: StepsRequest) -> bytes:

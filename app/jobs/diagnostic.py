@@ -8,6 +8,7 @@ from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.open_trace import of_one_task, with_distinct_indices
 
 POLL_INTERVAL = 0.25  # s
 
@@ -25,6 +26,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 report(0.5 * (i + traced.progress) / count, f"running the filter over episode {selection.episode}")
             traces.append(traced.trace)
             report(0.5 * (i + 1) / count, f"{i + 1} of {count} episodes filtered")
+        if len({selection.data for selection in selections}) > 1:  # live runs, each a data set of its own
+            traces = with_distinct_indices(of_one_task(traces, [selection.data for selection in selections]))
         message = f"evaluating {count} episodes" if count > 1 else f"evaluating episode {selections[0].episode}"
         report(0.5, message)
         callback = {"progress": lambda share: report(0.5 + 0.5 * share, message)} if entry.takes_progress else {}

@@ -153,6 +153,18 @@ class LiveRuns:
             raise BadInput(f"live run {run.name!r} is still running; this needs all of its steps")
         return run
 
+    def of_same_filter(self, selection: Selection) -> list[Selection]:
+        """The ended runs with the task and filter of a selected live run, in the order of their names."""
+        run = self.ended_run(selection.data)
+        selections = []
+        for name in sorted(self.newest()):
+            with suppress(BadInput):
+                other = self[name]
+                if other.state != "running" and other.reader.steps and _filter(other) == _filter(run):
+                    episode = other.template.episode_index
+                    selections.append(replace(selection, data=f"{LIVE_PREFIX}{name}", episode=episode))
+        return selections
+
     def episode(self, data: str) -> Episode:
         """The input of a run's filter. Raises BadInput while the run is running, and if its first state is unknown."""
         run = self.ended_run(data)
@@ -167,6 +179,11 @@ class LiveRuns:
             for run in self._runs.values():
                 run.close()
             self._runs.clear()
+
+
+def _filter(run: LiveRun) -> tuple[str, str, str]:
+    """Task, name and hash of a run's filter."""
+    return run.task.name, run.template.filter, run.template.checkpoint_hash
 
 
 def describe(run: LiveRun) -> dict[str, Any]:

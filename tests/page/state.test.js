@@ -1,6 +1,7 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 
+import { isRecordedOnly } from '../../app/page/core/episodes.js';
 import { Store, completeLink, parsePermalink, permalink } from '../../app/page/core/state.js';
 import { addLiveRuns } from '../../app/page/tabs/live_runs.js';
 import { Undo } from '../../app/page/core/undo.js';
@@ -59,7 +60,17 @@ test('live runs of one filter are all in the catalog', () => {
     assert.equal(state.task, 'rover');
     assert.equal(state.filter, 'recorded');
     assert.equal(state.data, search.includes('mon') ? 'live:mon' : 'live:tue');
+    assert.equal(isRecordedOnly(catalog, state), true);
   }
+  assert.equal(isRecordedOnly(catalog, stateOf('')), false);
+  const listed = /** @type {any} */ ([{ name: 'damaged', state: 'damaged' }, ...runs]);
+  const examples = [{ title: '', help: '', link: '?task=door&filter=crossmodal-pf' }];
+  assert.equal(
+    completeLink('', { ...catalog, examples }, listed),
+    '?task=rover&filter=recorded&data=live%3Atue',
+  );
+  assert.equal(completeLink('', { ...catalog, examples: [] }, listed), '');
+  assert.equal(completeLink('?task=door', { ...catalog, examples }, listed), '?task=door');
 });
 
 test('an episode opens at its start, unless it is the first of its data set', () => {

@@ -23,7 +23,8 @@ def import_(
     ),
     output: Path | None = opt.option(
         "RUN.trace|RUN.live|DATA.h5|DIR",
-        "Output: a trace, a run for the folder live of a workspace, a data set, or a folder of traces by episode.",
+        "Output: a trace, a run for the folder live of a workspace, a data set, or a folder of traces by episode; "
+        "a folder named live gets runs.",
         None,
         "-o",
         "--output",
@@ -46,7 +47,8 @@ def import_(
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
     If a live run is in progress or was killed, its complete steps are imported. With a folder as output, each file
-    becomes a trace of the same name, or one per episode with its index after the name; files with errors are reported.
+    becomes a trace of the same name, or one per episode with its index after the name; in the folder live of a
+    workspace, a run that the page displays. Files with errors are reported.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
@@ -66,6 +68,7 @@ def import_(
       beliefscope import logs --map map.toml --split auto -o logs.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
       beliefscope import log.csv --map map.toml -o run.live
+      beliefscope import logs --map map.toml -o workspace/live
       beliefscope import drive.mcap --map map.toml -o drive.h5
     """
     from beliefscope.datasets.dataset import SPLITS
@@ -100,8 +103,9 @@ def import_(
 def _folder(
     sources: list[Path], folder: Path, import_file: Callable[[Path, Path], list[console.Result]]
 ) -> console.Result:
-    """Write a trace for each file or episode; report files with errors."""
-    names = [f"{source.stem}.trace" for source in sources]
+    """Write a trace, or a run into a folder ``live``, for each file or episode; report files with errors."""
+    suffix = ".live" if folder.absolute().name == "live" else ".trace"  # the runs of a workspace
+    names = [f"{source.stem}{suffix}" for source in sources]
     if len(set(names)) < len(names):
         raise BadInput("files need different names, without their suffixes, to become traces of one folder")
     opt.check_folder(folder, "output")

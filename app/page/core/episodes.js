@@ -1,6 +1,6 @@
 /** Episodes of a data set. The catalog lists large data sets in part. */
 
-/** @import { DataSet, Task } from '../types/server.js' */
+/** @import { Catalog, DataSet, Task } from '../types/server.js' */
 
 /** @param {Pick<DataSet, 'count' | 'episodes'>} set */
 export const isComplete = ({ count, episodes }) => episodes.length === count;
@@ -31,3 +31,14 @@ export const filtersOf = (task, data) => task.filters.filter(({ live }) => !live
  */
 export const firstData = (task) =>
   task.data.find(({ name }) => filtersOf(task, name).length) ?? task.data[0];
+
+/**
+ * Whether a filter is known only from its recorded runs, such as those of imported logs, and cannot run.
+ * @param {Catalog} catalog
+ * @param {{task: string, filter: string, data: string}} selection
+ */
+export function isRecordedOnly({ tasks }, { task: name, filter, data }) {
+  const task = tasks.find((item) => item.name === name);
+  const same = task ? filtersOf(task, data).find((item) => item.name === filter) : undefined;
+  return Boolean(same?.live);
+}

@@ -28,8 +28,9 @@ async function start() {
     throw new api.ServerError(
       'Nothing to display: no task has both episodes and a trained filter.',
     );
-  const link = awaitedRun(location.search, live) ? '' : location.search;
-  const { state, problems } = parsePermalink(completeLink(link, catalog), catalog);
+  const isAwaited = Boolean(awaitedRun(location.search, live));
+  const link = completeLink(isAwaited ? '' : location.search, catalog, isAwaited ? [] : live.runs);
+  const { state, problems } = parsePermalink(link, catalog);
   if (state.faults)
     await api.checkSelection({ ...state, against: '' }).catch((error) => {
       problems.push(

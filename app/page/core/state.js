@@ -1,7 +1,7 @@
 /** The state of the page and its permalink: opening the link restores the state. */
 
 /** @import { Catalog } from '../data/api.js' */
-/** @import { DataSet } from '../types/server.js' */
+/** @import { DataSet, LiveList } from '../types/server.js' */
 
 import { SCALAR, TRACKS } from '../timeline/tracks.js';
 import { MAP_QUANTITIES, SCENE_CHOICES } from './constants.js';
@@ -303,13 +303,20 @@ export function parsePermalink(search, catalog) {
 
 /**
  * Completes the query string of an address that names no task: by the task of the live run that it names, or else by
- * the first example, whose own values yield to those of the address.
+ * the first example, whose own values yield to those of the address. In place of an example, an empty address opens
+ * the newest live or imported run, if there is one.
  * @param {string} search query string
  * @param {Catalog} catalog
+ * @param {LiveList['runs']} [runs] live runs, the newest first
  */
-export function completeLink(search, { examples, tasks }) {
+export function completeLink(search, { examples, tasks }, runs = []) {
   const query = new URLSearchParams(search);
   if (query.has('task')) return search;
+  const newest = runs.find((run) => 'data' in run);
+  if (!query.size && examples.length && newest && 'data' in newest) {
+    const { task, filter, data } = newest;
+    return `?${new URLSearchParams({ task, filter, data })}`;
+  }
   const owner = tasks.find(({ data }) =>
     data.some(({ live, name }) => live && name === query.get('data')),
   );

@@ -6,7 +6,7 @@
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { filtersOf } from '../core/episodes.js';
+import { filtersOf, isRecordedOnly } from '../core/episodes.js';
 import { displayName, fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
@@ -245,18 +245,28 @@ export class ComparisonForm {
     const parts = this.#form.querySelectorAll('[data-kind]');
     for (const part of parts) part.hidden = part.dataset.kind !== this.#kind;
     const isExternal = this.#trace?.header.kind === 'external';
-    html('[data-kind="intervention"] > .why-not', this.#form).textContent = isExternal
-      ? 'Interventions on the page need a built-in filter. For an external filter, use beliefscope counterfactual.'
+    const cannotRun = isRecordedOnly(this.#catalog, this.#store.state)
+      ? 'The filter of this run is known only from its recorded runs, so it cannot run again.'
       : '';
+    html('[data-kind="intervention"] > .why-not', this.#form).textContent =
+      cannotRun ||
+      (isExternal
+        ? 'Interventions on the page need a built-in filter. For an external filter, use beliefscope counterfactual.'
+        : '');
     const noInputs = !this.#only.options.length;
-    this.#only.disabled = noInputs;
-    html('[data-kind="only"] .why-not', this.#form).textContent = noInputs
-      ? 'This filter has no separate modalities to run standalone.'
-      : 'The same filter and random numbers, without the observations of all other modalities.';
+    this.#only.disabled = noInputs || Boolean(cannotRun);
+    html('[data-kind="only"] .why-not', this.#form).textContent =
+      cannotRun ||
+      (noInputs
+        ? 'This filter has no separate modalities to run standalone.'
+        : 'The same filter and random numbers, without the observations of all other modalities.');
+    html('[data-kind="faults"] .why-not', this.#form).textContent = cannotRun;
+    element('[name=faults]', HTMLSelectElement, this.#form).disabled = Boolean(cannotRun);
     html('.betas', this.#form).hidden = isExternal;
     const fields = this.#form.querySelectorAll('[data-kind="intervention"] :is(input, select)');
     for (const field of fields) field.toggleAttribute('disabled', isExternal);
     element('.run', HTMLButtonElement, this.#form).disabled =
+      (this.#kind !== 'filter' && Boolean(cannotRun)) ||
       (this.#kind === 'intervention' && isExternal) ||
       (this.#kind === 'only' && noInputs) ||
       (this.#kind === 'filter' && this.#filter.disabled);

@@ -25,6 +25,11 @@ const OVER = [
   ['episode', 'this episode'],
   ['held-out', 'all held-out'],
 ];
+/** Of live and imported runs. @type {[string, string][]} */
+const OVER_RUNS = [
+  ['episode', 'this run'],
+  ['held-out', 'all its runs'],
+];
 const MAX_RESULTS = 48;
 /** Labels of the button by state. @type {Partial<Record<Result['state'], string>>} */
 const ACTIONS = { absent: 'Compute', ended: 'Try again', active: 'Cancel' };
@@ -228,6 +233,7 @@ export class Diagnostics {
   /** Shows the selected diagnostic, or the list of all. */
   #showSelected() {
     const { diagnostic, over } = this.#store.state;
+    const runs = this.#trace?.live ? OVER_RUNS : OVER;
     const selected = this.#selected;
     const names = this.#entries.map(({ name }) => name).join(', ');
     html('.top h3', this.#host).textContent =
@@ -236,7 +242,7 @@ export class Diagnostics {
         : (selected?.title ?? 'Diagnostics of this run');
     this.#list.hidden = Boolean(selected);
     this.#article.hidden = this.#backButton.hidden = !selected;
-    choice(html('#over', this.#host), OVER, over, (value) => this.#store.set({ over: value }));
+    choice(html('#over', this.#host), runs, over, (value) => this.#store.set({ over: value }));
     if (selected) {
       html('.question', this.#article).textContent = selected.question;
       this.#article.scrollTop = 0;

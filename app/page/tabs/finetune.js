@@ -7,6 +7,7 @@
 /** @import { Decision } from './finetune_run.js' */
 
 import { element, html, messageOf } from '../core/dom.js';
+import { isRecordedOnly } from '../core/episodes.js';
 import { permalink } from '../core/state.js';
 import * as api from '../data/api.js';
 import { isActive } from '../widgets/jobs.js';
@@ -33,6 +34,7 @@ export class Finetune {
   #runs;
   /** @type {FineTuneOffer | null} */
   #offer = null;
+  #catalog;
   #offerKey = ''; // selection of the offer and its weaknesses
   /** @type {FineTuneDetails | null} */
   #run = null;
@@ -52,6 +54,7 @@ export class Finetune {
    */
   constructor(host, catalog, store, jobs, faultDialog) {
     this.#host = host;
+    this.#catalog = catalog;
     this.#store = store;
     this.#jobs = jobs;
     host.innerHTML = BODY;
@@ -89,6 +92,11 @@ export class Finetune {
   async #load() {
     if (!this.#open) return;
     const { task, filter, data, episode, faults, run } = this.#store.state;
+    if (!run && isRecordedOnly(this.#catalog, { task, filter, data })) {
+      this.#loading.abort();
+      const text = `The filter ${filter} is known only from its recorded runs: it has no modules to train.`;
+      return setPanelState(this.#host, 'empty', text);
+    }
     const key = JSON.stringify([task, filter, data, ...(run ? [] : [episode, faults])]);
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());

@@ -1,0 +1,66 @@
+"""Runs of imported logs in a workspace: their list, and diagnostics of all runs of a filter."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from beliefscope.app.runs.settings import Settings
+
+pytestmark = pytest.mark.slow
+
+Run = Callable[..., tuple[int, str, str]]
+
+MAP = """
+task = "ferry"
+dt = 0.1
+[state]
+x = "x"
+yaw = {column = "yaw", unit = "rad"}
+[sensors]
+gps = "gps"
+[estimate]
+filter = "node"
+mean = ["mean", "yaw"]
+std = ["std", "std"]
+"""
+
+
+@pytest.fixture
+def imported(run: Run, tmp_path: Path) -> Settings:
+    """A workspace with six runs; in one of them, the heading spans more than half a turn."""
+    rng = np.random.default_rng(0)
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for i in range(6):
+        x = np.cumsum(rng.normal(0.0, 0.1, 60))
+        yaw = np.linspace(0.0, 5.0 if i == 2 else 0.5, 60)
+        np.savez(logs / f"day_{i}.npz", x=x, yaw=yaw, gps=x, mean=x + rng.normal(0.0, 0.1, 60), std=np.full(60, 0.1))
+    (tmp_path / "map.toml").write_text(MAP)
+    live = tmp_path / "workspace" / "live"
+    for path in sorted(logs.iterdir()):
+        assert run("import", path, "--map", tmp_path / "map.toml", "-o", live)[0] == 0
+    assert {path.name for path in live.iterdir()} == {f"day_{i}.live" for i in range(6)}
+    return Settings(tmp_path / "workspace")
+
+
+def test_diagnostics_of_all_runs_of_a_filter(imported: Settings, open_client: Callable[..., TestClient]) -> None:
+    with open_client(imported) as client:
+        listed = client.get("/api/live").json()["runs"]
+        assert {run["state"] for run in listed} == {"ended"}, listed
+        query = {"data": "live:day_1", "episodes": "held-out"}
+        url = "/api/diagnostics/consistency/ferry/node/0"
+        assert client.get(url, params=query).json() == {"job": None}
+        assert client.post(url, params=query).json()["job"]["title"].endswith("all 6 runs")
+        end = time.monotonic() + 90.0
+        while (answer := client.get(url, params=query)).status_code == 202 and time.monotonic() < end:
+            time.sleep(0.05)
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["trajectories"] == 6
+    (table, *_) = answer.json()["tables"]
+    assert max(row[table["columns"].index("episodes")] for row in table["rows"]) == 6
