@@ -232,8 +232,8 @@ export class Diagnostics {
 
   /** Shows the selected diagnostic, or the list of all. */
   #showSelected() {
-    const { diagnostic, over } = this.#store.state;
-    const runs = this.#trace?.live ? OVER_RUNS : OVER;
+    const { diagnostic, over, data } = this.#store.state;
+    const runs = data.startsWith('live:') ? OVER_RUNS : OVER;
     const selected = this.#selected;
     const names = this.#entries.map(({ name }) => name).join(', ');
     html('.top h3', this.#host).textContent =
