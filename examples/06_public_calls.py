@@ -31,6 +31,8 @@ def main(folder: Path) -> None:
     print(diagnosis.headline)
     healthy: bs.HealthyProfile = bs.healthy_record(checkpoint, data)  # the checkpoint has one; other filters need it
     print(bs.diagnose(checkpoint, data, [9, 19], faults="blackout=0.8", profile_from=healthy).headline)
+    few, many = ([bs.trace(checkpoint, data, index) for index in data.held_out()[a:b]] for a, b in ((0, 2), (2, 13)))
+    print(bs.diagnose_runs(few, many).headline)
     metrics: bs.Metrics = bs.evaluate(checkpoint, data, [9, 19], faults="blackout=0.4", start_offset="3cm")
     print(metrics.rmse, metrics.nees, metrics.baselines["stay"])
     failures: bs.Failures = bs.find_failures(checkpoint, data, [9, 19], by="disagreement")

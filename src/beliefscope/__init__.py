@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
     from beliefscope.inspect.trace import Trace, load_trace, save_trace
     from beliefscope.recordings.live import LiveRecorder
+    from beliefscope.recordings.recorded_diagnosis import diagnose_runs
     from beliefscope.recordings.sweep_table import Experiments
 
 __version__ = "0.2.0"
@@ -73,6 +74,7 @@ _SOURCES = {
     "inspect.maps.likelihood_map": ("LikelihoodMap",),
     "inspect.trace": ("Trace", "load_trace", "save_trace"),
     "recordings.live": ("LiveRecorder",),
+    "recordings.recorded_diagnosis": ("diagnose_runs",),
     "recordings.sweep_table": ("Experiments",),
 }
 """Module -> its public names."""
@@ -102,6 +104,7 @@ __all__ = [
     "__version__",
     "compare",
     "diagnose",
+    "diagnose_runs",
     "evaluate",
     "experiments",
     "export_page",

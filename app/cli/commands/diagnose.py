@@ -171,18 +171,13 @@ def _of_recordings(
     from beliefscope.filters.names import is_run
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
     from beliefscope.inspect.healthy import overlap_warning, recorded_profile
-    from beliefscope.inspect.traces.provenance import checkpoint_of
-    from beliefscope.recordings.open_trace import of_one_task, recorded_runs
+    from beliefscope.recordings.open_trace import recorded_runs
+    from beliefscope.recordings.recorded_diagnosis import comparable
 
     traces = recorded_runs(Path(runs.task))
     clean = recorded_runs(healthy) if healthy and is_run(str(healthy)) else []
     places = [runs.task] * len(traces) + [str(healthy)] * len(clean)
-    every = of_one_task([*traces, *clean], places)
-    traces, clean = every[: len(traces)], every[len(traces) :]
-    first, version = traces[0], traces[0].checkpoint_hash
-    checkpoint = checkpoint_of(traces, [Path(runs.task)] * len(traces), runs.filter)
-    if checkpoint is None or (clean and clean[0].checkpoint_hash != version):  # the runs of another version
-        checkpoint = UnavailableFilter(first.filter, version, first.task)
+    traces, clean, checkpoint = comparable(traces, clean, places, runs.filter)
     if episode is not None:
         traces = [trace for trace in traces if trace.episode_index == episode]
         if not traces:

@@ -67,7 +67,6 @@ def import_(
       beliefscope import log.csv --map map.toml -o log.h5
       beliefscope import logs --map map.toml --split auto -o logs.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
-      beliefscope import log.csv --map map.toml -o run.live
       beliefscope import logs --map map.toml -o workspace/live
       beliefscope import drive.mcap --map map.toml -o drive.h5
     """

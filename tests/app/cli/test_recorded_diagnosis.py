@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+import beliefscope as bs
 
 pytestmark = pytest.mark.slow
 
@@ -106,6 +109,18 @@ def test_recorded_runs_need_healthy_ones(run: Run, diagnose: Callable[[str], str
     code, _, error = run("diagnose --repair 0", recordings / "again", "--profile-from", recordings / "clean")
     assert code == 2
     assert "recorded runs are diagnosed as they are" in error
+
+
+def test_recorded_runs_are_diagnosed_in_python(diagnose: Callable[[str], str], recordings: Path) -> None:
+    headline = diagnose("biased")
+    diagnosis = bs.diagnose_runs(str(recordings / "biased"), recordings / "clean")
+    assert (diagnosis.headline, diagnosis.causes[0].cause.name) == (headline, "beacon.bias")
+    traces = [bs.load_trace(path) for path in sorted((recordings / "biased").iterdir())]
+    assert bs.diagnose_runs(traces, recordings / "clean").headline == headline
+    with pytest.warns(UserWarning, match="the healthy record contains 6 of the 6 diagnosed episodes"):
+        bs.diagnose_runs(traces, [*traces, *(bs.load_trace(path) for path in sorted((recordings / "clean").iterdir()))])
+    with pytest.raises(bs.BadInput, match="runs has no recorded runs"):
+        bs.diagnose_runs([], recordings / "clean")
 
 
 def test_a_task_needs_a_filter(run: Run) -> None:
