@@ -8,7 +8,9 @@ import io
 import os
 import signal
 import sys
-from contextlib import suppress
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from importlib import import_module
 from typing import Annotated, Any
@@ -34,6 +36,9 @@ INTERRUPTED = 130
 TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM, of the shell."""
 
+
+OF_TRACES = {"inspect", "export"}
+"""Commands whose arguments are traces."""
 
 RESUMED = {"collect", "train", "finetune", "study", "sweep"}
 """Commands that continue interrupted work."""
@@ -70,6 +75,25 @@ def _no_type(ctx: object) -> None:
     """The type of an argument in the help text: none, as its name states what it is."""
 
 
+@contextmanager
+def _short_warnings() -> Iterator[None]:
+    """Python's warnings for users in the form of a command's own: without the place in the code."""
+    default = warnings.formatwarning
+
+    def short(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+    ) -> str:
+        if not issubclass(category, UserWarning):
+            return default(message, category, filename, lineno, line)
+        return f"Warning: {' '.join(str(message).split())}\n"
+
+    warnings.formatwarning = short
+    try:
+        yield
+    finally:
+        warnings.formatwarning = default
+
+
 def main() -> None:
     """Run the command in ``sys.argv`` and exit."""
     debug = "--debug" in sys.argv[1:]
@@ -79,13 +103,17 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # like standard error: file names may not be valid text
     signal.signal(signal.SIGTERM, _terminate)
     try:
-        code = command_group()(prog_name="beliefscope", standalone_mode=False)
+        with nullcontext() if debug else _short_warnings():
+            code = command_group()(prog_name="beliefscope", standalone_mode=False)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         console.flush()
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
         message = error.format_message().rstrip(".").replace("Value error, ", "")
+        if getattr(error, "option_name", "") == "--data":  # resembles no option
+            reason = ": traces contain their episodes" if command.split()[-1] in OF_TRACES else ""
+            message = f"No such option: --data{reason}"
         end = "" if message.endswith("?") else "."
         console.fail(f"{message}{end} See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
