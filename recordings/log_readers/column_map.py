@@ -40,7 +40,7 @@ ELEMENTS = re.compile(r"(.*)\[(\d{1,9}(?:,\d{1,9})*)\]")
 """``NAME[I]`` or ``NAME[I,J,...]``: elements of the rows of an array."""
 
 NAMES = ("time", "clock", "episode", "contact")
-KEYS = ("task", "dt", *NAMES, "control", "state", "sensors", "modalities", "covariates", "estimate")
+KEYS = ("task", "dt", *NAMES, "control", "state", "sensors", "modalities", "covariates", "estimate", "innovations")
 VALUES = ("mean", "std", "covariance", "particles")
 ESTIMATE = ("filter", *VALUES, "weights")
 
@@ -68,6 +68,14 @@ def _distinct(names: Sequence[str]) -> list[str]:
     starts = [names[0][: match.end()] for match in re.finditer(r"[._/ ]", names[0])]
     shared = max((len(start) for start in starts if all(name.startswith(start) for name in names)), default=0)
     return [name[shared:].replace("/", ".") for name in names]
+
+
+def internal_units(unit: References, size: int, what: str) -> list[tuple[str, float]]:
+    """Internal unit of each of ``size`` channels, and its factor. Raises BadInput for another number of units."""
+    units = [unit] * size if isinstance(unit, str) else unit
+    if len(units) != size:
+        raise BadInput(f"{what} has {plural(size, 'channel')} and {plural(len(units), 'unit')}")
+    return [UNITS.get(each, (each, 1.0)) for each in units]
 
 
 @dataclass(frozen=True)
@@ -98,6 +106,21 @@ class CovariateColumn:
 
 
 @dataclass(frozen=True)
+class InnovationColumns:
+    """Columns of the innovations of a modality, of their covariance S or standard deviations, and of its gate."""
+
+    innovation: References
+    covariance: References = ""
+    std: References = ""
+    accepted: str = ""
+    unit: References = ""
+
+    @property
+    def references(self) -> set[str]:
+        return {*listed(self.innovation), *listed(self.covariance), *listed(self.std), self.accepted} - {""}
+
+
+@dataclass(frozen=True)
 class ColumnMap:
     """What the columns of a log are.
 
@@ -113,7 +136,7 @@ class ColumnMap:
         modalities: name -> its sensors.
         estimate: recorded estimate: ``filter``: its name; ``mean``; ``std`` or ``covariance``; or ``particles``
             (rows of M n numbers) in their place; ``weights``: modality -> column. Empty for a log without estimates.
-        units: sensor -> unit of its channels, or one for each.
+        units: sensor -> unit of its channels, or one for each. innovations: modality -> its columns.
     """
 
     task: str
@@ -130,6 +153,7 @@ class ColumnMap:
     covariates: Mapping[str, CovariateColumn] = field(default_factory=dict)
     estimate: Mapping[str, Any] = field(default_factory=dict)
     units: Mapping[str, References] = field(default_factory=dict)
+    innovations: Mapping[str, InnovationColumns] = field(default_factory=dict)
 
     @property
     def factors(self) -> np.ndarray:
@@ -160,11 +184,7 @@ class ColumnMap:
 
     def internal_units(self, key: str, size: int) -> list[tuple[str, float]]:
         """Internal unit of each of the channels of a sensor, and its factor from that of the column."""
-        unit = self.units.get(key, SENSOR_UNITS.get(key, ""))
-        units = [unit] * size if isinstance(unit, str) else unit
-        if len(units) != size:
-            raise BadInput(f"sensor {key!r} has {plural(size, 'channel')} and {plural(len(units), 'unit')}")
-        return [UNITS.get(each, (each, 1.0)) for each in units]
+        return internal_units(self.units.get(key, SENSOR_UNITS.get(key, "")), size, f"sensor {key!r}")
 
     @property
     def truth(self) -> set[str]:
@@ -187,7 +207,8 @@ class ColumnMap:
     def references(self) -> set[str]:
         """References to all columns but ``time``."""
         others = {self.contact, *self.valid.values(), *(covariate.column for covariate in self.covariates.values())}
-        return self.required | (others - {""})
+        innovations = {name for entry in self.innovations.values() for name in entry.references}
+        return self.required | innovations | (others - {""})
 
 
 def read_map(path: Path) -> ColumnMap:
@@ -225,7 +246,9 @@ def read_map(path: Path) -> ColumnMap:
     covariates = {name: _covariate(name, value) for name, value in _table(values, "covariates", path).items()}
     task = values.get("task", path.stem)
     modalities = _modalities(_table(values, "modalities", path), sensors, path)
+    innovations = {n: _innovation(n, v, modalities) for n, v in _table(values, "innovations", path).items()}
     columns = {"control": control, "sensors": sensors, "valid": valid, "units": units, "modalities": modalities}
+    columns |= {"innovations": innovations}
     return ColumnMap(task, state, dt, covariates=covariates, estimate=estimate, **columns, **names)
 
 
@@ -287,14 +310,29 @@ def _sensor(name: str, value: dict[str, Any]) -> dict[str, Any]:
     ):
         expected = "columns or {column = NAME, valid = NAME, unit = UNIT}"
         raise BadInput(f"sensor {name!r} is {value!r:.100}, expected {expected}")
-    unit = value.get("unit", "")
-    if not isinstance(unit, str) and not _texts(unit):
-        raise BadInput(f"unit of sensor {name!r} is {unit!r:.100}, expected a text such as deg or m/s, or one for each")
-    for each in [unit] if isinstance(unit, str) else unit:
-        _check_spelling(f"sensor {name!r}", each)
-        if each in (QUATERNION, *ROTATIONS):
-            raise BadInput(f"unit of sensor {name!r} is {each!r}, which is one of the state only")
+    _check_unit(f"sensor {name!r}", value.get("unit", ""))
     return value
+
+
+def _innovation(name: str, value: Any, modalities: Mapping[str, Any]) -> InnovationColumns:
+    check_name("modality of [innovations]", name, modalities)
+    keys = ("innovation", "covariance", "std", "accepted", "unit")
+    valid = isinstance(value, dict) and value.keys() <= {*keys} and ("covariance" in value) != ("std" in value)
+    if not (valid and "innovation" in value and all(isinstance(v, str) or _texts(v) for v in value.values())):
+        expected = "{innovation = COLUMNS, covariance = COLUMNS or std = COLUMNS, accepted = NAME, unit = UNIT}"
+        raise BadInput(f"innovations of {name!r} are {value!r:.100}, expected {expected}")
+    _check_unit(f"innovations of {name!r}", value.get("unit", ""))
+    return InnovationColumns(**value)
+
+
+def _check_unit(what: str, unit: Any) -> None:
+    """Raise BadInput unless this is a unit of readings, or a list of units."""
+    if not isinstance(unit, str) and not _texts(unit):
+        raise BadInput(f"unit of {what} is {unit!r:.100}, expected a text such as deg or m/s, or one for each")
+    for each in [unit] if isinstance(unit, str) else unit:
+        _check_spelling(what, each)
+        if each in (QUATERNION, *ROTATIONS):
+            raise BadInput(f"unit of {what} is {each!r}, which is one of the state only")
 
 
 def _check_spelling(what: str, unit: str) -> None:

@@ -23,6 +23,7 @@ from beliefscope.recordings.log_readers.arrays import Columns
 from beliefscope.recordings.log_readers.column_map import ColumnMap, CovariateColumn, base_name, listed
 from beliefscope.recordings.log_readers.columns import column, joined
 from beliefscope.recordings.log_readers.estimate import estimate_values, scalar
+from beliefscope.recordings.log_readers.innovations import innovation_values
 from beliefscope.recordings.log_readers.messages import CLOCK, NEW
 from beliefscope.recordings.log_readers.table_folder import FILE
 
@@ -118,14 +119,15 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
             raise BadInput(f"{display_name(name)} has {plural(len(array), 'row')} and the state {rows}")
         if len(unknown := at[~np.isfinite(array[at]).reshape(len(at), -1).all(axis=1)]):
             raise BadInput(f"{display_name(name)} has no finite value in row {unknown[0]}, episode {index}")
+    modalities = tuple(mapping.estimate.get("weights", {}) or mapping.innovations)
+    estimate |= innovation_values(columns, mapping, modalities)
     values = {name: torch.from_numpy(array[at]) for name, array in estimate.items()}
-    weights = mapping.estimate.get("weights", {})
     check_values(values, (len(at),), {"n": n}, source)
     arrays: dict[str, Any] = {name: value.float().numpy() for name, value in derived(values, episode.task).items()}
     settings = {"source": source} | ({"particles": arrays["particles"].shape[1]} if "particles" in arrays else {})
     return Trace(
         episode=episode,
-        modalities=tuple(weights),
+        modalities=modalities,
         kind="external",
         filter=str(mapping.estimate.get("filter", "recorded")),
         start_mean=np.full(n, np.nan, np.float32),
@@ -133,7 +135,7 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
         data_hash=episode.digest(),
         episode_index=index,
         settings=settings,
-        **dict[str, Any](fill_missing(arrays, len(weights))),
+        **dict[str, Any](fill_missing(arrays, len(modalities))),
     )
 
 
