@@ -67,6 +67,8 @@ test('times of irregular steps', () => {
   const irregular = makeTrace({ ...FUSION, time: times });
   assert.equal(irregular.seconds(3), 1.5);
   assert.equal(irregular.stepText, '0.25 to 1.00 s');
+  const jitter = { shape: [4], values: [0, 0.0487, 0.1, 0.15] };
+  assert.equal(makeTrace({ ...FUSION, time: jitter }).stepText, '0.049 to 0.051 s');
   assert.equal(irregular.timestamp(3), 1.5);
   assert.equal(irregular.stepLabel(3), 'step 3 (1.50 s)');
   assert.equal(trace.timestamp(3), null);

@@ -135,12 +135,19 @@ export class Trace {
   /** Duration of the steps: `0.10 s`, or the shortest and the longest. */
   get stepText() {
     const times = this.#slice('time');
-    if (!times || times.length < 2) return `${fixed(this.dt, 2)} s`;
+    const digits = Math.max(2, -Math.floor(Math.log10(this.dt)));
+    if (!times || times.length < 2) return `${fixed(this.dt, digits)} s`;
     const steps = times
       .subarray(1)
       .map((time, i) => time - times[i])
       .sort();
-    return `${fixed(steps[0], 2)} to ${fixed(steps[steps.length - 1], 2)} s`;
+    for (let more = 0; more < 3; more++) {
+      const [low, high] = [steps[0], steps[steps.length - 1]].map((step) =>
+        fixed(step, digits + more),
+      );
+      if (low !== high) return `${low} to ${high} s`;
+    }
+    return `${fixed(this.dt, digits)} s`;
   }
 
   /** Columns of the filter's own scalars. */

@@ -144,11 +144,11 @@ export class Figures {
         ],
         series: [
           {},
-          ...styles.map(({ stroke, dash, width }) => ({
+          ...styles.map(({ stroke, dash, width }, i) => ({
             stroke,
             dash,
             width,
-            points: { show: false },
+            points: isolatedPoints(curves[i].values, stroke),
           })),
         ],
         hooks: {
@@ -250,4 +250,18 @@ function curvesByChart(curves) {
   const groups = new Map();
   for (const curve of curves) groups.set(curve.chart, [...(groups.get(curve.chart) ?? []), curve]);
   return [...groups.values()];
+}
+
+/**
+ * Returns the style of points without neighbours, which a line does not show, such as those of a slow sensor.
+ * @param {(number | null)[]} values
+ * @param {string} fill
+ */
+function isolatedPoints(values, fill) {
+  const isolated = values.flatMap((value, i) =>
+    value !== null && (values[i - 1] ?? null) === null && (values[i + 1] ?? null) === null
+      ? [i]
+      : [],
+  );
+  return isolated.length ? { show: true, size: 4, fill, filter: () => isolated } : { show: false };
 }
