@@ -15,6 +15,7 @@ from beliefscope.filters.names import RUNS
 from beliefscope.inspect.trace import Trace, load_trace
 from beliefscope.inspect.traces.live_file import SUFFIX, load_live
 from beliefscope.inspect.traces.provenance import checkpoint_of
+from beliefscope.recordings.log_readers.table_folder import numbered
 from beliefscope.recordings.probe import RecordingProbe
 
 
@@ -37,16 +38,26 @@ def open_traces(paths: Sequence[Path], filter_: str, task: str = "") -> tuple[li
     return traces, checkpoint_of(traces, paths, filter_)
 
 
+def run_files(path: Path) -> list[Path]:
+    """The recorded runs of a folder, in the order of ``numbered``; a file itself."""
+    return sorted((f for f in path.iterdir() if f.suffix in RUNS), key=numbered) if path.is_dir() else [path]
+
+
 def recorded_runs(path: Path) -> list[Trace]:
     """The runs of a file or folder, by their episodes; in the order of the files if these have the same index.
 
     Raises BadInput as ``open_trace``, and for runs of different filters or tasks.
     """
-    files = sorted(file for file in path.iterdir() if file.suffix in RUNS) if path.is_dir() else [path]
+    return list(runs_by_file(path).values())
+
+
+def runs_by_file(path: Path) -> dict[Path, Trace]:
+    """As ``recorded_runs``, by their files."""
+    files = run_files(path)
     traces = [open_trace(file) for file in files]
     checkpoint_of(traces, files)
-    traces = of_one_task(traces, [str(file) for file in files])
-    return sorted(with_distinct_indices(traces), key=lambda trace: trace.episode_index)
+    traces = with_distinct_indices(of_one_task(traces, [str(file) for file in files]))
+    return dict(sorted(zip(files, traces, strict=True), key=lambda pair: pair[1].episode_index))
 
 
 def with_distinct_indices(traces: Sequence[Trace]) -> list[Trace]:

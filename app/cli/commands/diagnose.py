@@ -170,11 +170,13 @@ def _of_recordings(
     from beliefscope.filters.external.unavailable import UnavailableFilter
     from beliefscope.filters.names import is_run
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
+    from beliefscope.inspect.diagnostics.views import Table
     from beliefscope.inspect.healthy import overlap_warning, recorded_profile
-    from beliefscope.recordings.open_trace import recorded_runs
+    from beliefscope.recordings.open_trace import recorded_runs, runs_by_file
     from beliefscope.recordings.recorded_diagnosis import comparable
 
-    traces = recorded_runs(Path(runs.task))
+    opened = runs_by_file(Path(runs.task))
+    files, traces = {trace.episode_index: file for file, trace in opened.items()}, list(opened.values())
     clean = recorded_runs(healthy) if healthy and is_run(str(healthy)) else []
     places = [runs.task] * len(traces) + [str(healthy)] * len(clean)
     traces, clean, checkpoint = comparable(traces, clean, places, runs.filter)
@@ -204,7 +206,11 @@ def _of_recordings(
             profile=profile,
             progress=advance,
         )
-    return console.Result(result.to_json(), "\n\n".join([result.headline, *map(str, result.tables())]))
+    used = {trace.episode_index: files[trace.episode_index] for trace in traces}
+    listed = Table("Runs", ("episode", "file"), tuple((str(index), file.name) for index, file in used.items()))
+    document = result.to_json() | {"runs": [{"episode": i, "path": str(file)} for i, file in used.items()]}
+    parts = [result.headline, *map(str, result.tables()), *([str(listed)] if len(used) > 1 else [])]
+    return console.Result(document, "\n\n".join(parts))
 
 
 def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:

@@ -6,7 +6,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 
 
 def inspect(
-    paths: list[Path] = opt.argument("TRACE...", "Traces of one filter."),
+    paths: list[Path] = opt.argument("TRACE|DIR...", "Traces of one filter, or folders of them."),
     filter: str = opt.TRACE_FILTER,
     task: str = opt.TASK_OF_FILES,
     only: list[str] | None = opt.option("NAME", "Run only this diagnostic. Repeatable.", None),
@@ -26,13 +26,13 @@ def inspect(
     \b
     Examples:
       beliefscope inspect run.trace
-      beliefscope inspect runs/*.trace --only consistency --figures figures --format pdf
+      beliefscope inspect runs --only consistency --figures figures --format pdf
       beliefscope inspect run.trace --only saliency --option step=68 --option target=beta:image
       beliefscope inspect run.trace --filter mine.safetensors --all --json -
     """
     from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
     from beliefscope.inspect.diagnostics.plotting import write_figure
-    from beliefscope.recordings.open_trace import open_traces
+    from beliefscope.recordings.open_trace import open_traces, run_files
 
     for name in only or ():
         check_name("diagnostic", name, DIAGNOSTICS)
@@ -46,6 +46,7 @@ def inspect(
         for name, entry in entries.items()
     }
     opt.check_folder(figures, "--figures")
+    paths = [file for path in paths for file in (run_files(path) if path.is_dir() else [path]) or [path]]
     traces, checkpoint = open_traces(paths, filter, task)
     with console.progress("Inspecting") as advance:
         results, reasons = run_diagnostics(traces, checkpoint, parsed, bool(every or only), advance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -120,6 +121,24 @@ def test_recorded_runs_are_diagnosed_in_python(diagnose: Callable[[str], str], r
         bs.diagnose_runs(traces, [*traces, *(bs.load_trace(path) for path in sorted((recordings / "clean").iterdir()))])
     with pytest.raises(bs.BadInput, match="runs has no recorded runs"):
         bs.diagnose_runs([], recordings / "clean")
+
+
+def test_the_files_of_recorded_runs_are_listed(
+    run: Run, diagnose: Callable[[str], str], recordings: Path, tmp_path: Path
+) -> None:
+    """Also of runs with the same index of the episode, whose order is that of the numbers in their names."""
+    diagnose("biased")
+    source = recordings / "biased" / "biased-0.trace"
+    for number in (2, 10):
+        (tmp_path / f"run_{number}.trace").write_bytes(source.read_bytes())
+    code, text, error = run("diagnose", tmp_path, "--profile-from", recordings / "clean")
+    assert code == 0, error
+    assert [line.split() for line in text.splitlines()[-2:]] == [["0", "run_2.trace"], ["1", "run_10.trace"]]
+    code, text, error = run("inspect --only consistency --json -", tmp_path)
+    assert code == 0, error
+    assert [entry["path"] for entry in json.loads(text)["traces"]] == [
+        str(tmp_path / f"run_{number}.trace") for number in (2, 10)
+    ]
 
 
 def test_a_task_needs_a_filter(run: Run) -> None:
