@@ -9,6 +9,7 @@ from itertools import compress
 
 import numpy as np
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
@@ -20,6 +21,7 @@ from beliefscope.inspect.diagnosis.model_checks import reports_estimates_only
 from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+from beliefscope.inspect.diagnosis.window_checks import RANGE
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
@@ -192,6 +194,17 @@ def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tu
     affected: (E,) mask of the episodes of the case.
     """
     episodes = [trace.episode for trace, hit in zip(case.traces, affected, strict=True) if hit]
-    localisations = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]
+    localisations = [located(case, deviation, episode) for episode in episodes]
     intervals = [steps for steps in localisations if steps is not None]
     return (min(first for first, _ in intervals), 1 + max(last for _, last in intervals)) if intervals else None
+
+
+def located(case: Case, deviation: Deviation, episode: Episode) -> tuple[int, int] | None:
+    """First and last step of an episode that shows a deviation; None if unknown."""
+    kind, subject, phase = deviation.statistic.split("/")
+    record, start = case.profile.statistics, f"{kind}/{subject}/"
+    levels = (values for name, values in record.items() if name.startswith(start) and not name.endswith(f"/{RANGE}"))
+    known = next((values[np.isfinite(values)] for values in levels if np.isfinite(values).any()), None)
+    level = None if known is None else float(np.median(known))
+    healthy = level if phase == RANGE else deviation.healthy
+    return localise(deviation.statistic, episode, case.profile.reference, healthy)

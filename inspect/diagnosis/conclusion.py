@@ -23,6 +23,7 @@ from beliefscope.inspect.diagnosis.case import (
     affected_episodes,
     affected_steps,
     checked_alarm_rate,
+    located,
     symptoms_of,
 )
 from beliefscope.inspect.diagnosis.cause import (
@@ -39,7 +40,7 @@ from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
-from beliefscope.inspect.diagnosis.sensor_checks import covers_episode, localise
+from beliefscope.inspect.diagnosis.sensor_checks import covers_episode
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnosis.wrong_noise import too_small
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
@@ -276,7 +277,7 @@ def _evidence(case: Case, deviation: Deviation) -> Evidence:
     """A deviation and the episode that shows it most."""
     distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.grouped]
     trace = case.traces[int(np.nanargmax(distance))]
-    steps = localise(deviation.statistic, trace.episode, case.profile.reference)
+    steps = located(case, deviation, trace.episode)
     step = None if steps is None else steps[0]
     time = None if step is None else trace.episode.time_of(step)
     return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step, time)

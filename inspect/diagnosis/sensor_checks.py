@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
@@ -37,6 +38,9 @@ from beliefscope.inspect.diagnostics.statistic_kinds import sensor_of
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys, with_gray_images
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
+
+SMOOTH = 9
+"""Steps whose median is the size of the noise of a vector sensor: single differences of few channels vary by chance."""
 
 CONTRAST = {"level": 0.3, "noise": 0.7, "position noise": 0.7, "brightness": 0.5}
 """Kind of statistic -> largest size of its deviation in the other steps, relative to the affected ones."""
@@ -69,11 +73,16 @@ def with_continuous_angles(episode: Episode) -> Episode:
     return replace(episode, observations={**episode.observations, **changed}) if changed else episode
 
 
-def localise(statistic: str, episode: Episode, reference: Reference | None) -> tuple[int, int] | None:
+def localise(
+    statistic: str, episode: Episode, reference: Reference | None, healthy: float | None = None
+) -> tuple[int, int] | None:
     """First and last step that a statistic of sensors is about; None if it has no steps, such as a lag.
 
     Lost, repeated and saturated readings are marked step by step; of noise, level and exposure it is the interval that
     differs most from the rest of the episode; of other statistics of windows, the most deviating windows.
+
+    Args:
+        healthy: value of the statistic in a window; None if unknown.
     """
     kind, subject, phase = statistic.split("/")
     key, axis = sensor_of(subject, episode.observations)
@@ -94,7 +103,7 @@ def localise(statistic: str, episode: Episode, reference: Reference | None) -> t
         return None
     windows = window_values(episode, reference)
     values = next((v for name, v in windows.items() if name.startswith(f"{kind}/{subject}/")), None)
-    return None if values is None or not np.isfinite(values).any() else deviating_windows(values)
+    return None if values is None or not np.isfinite(values).any() else deviating_windows(values, healthy)
 
 
 def covers_episode(statistic: str, episode: Episode) -> bool:
@@ -170,6 +179,8 @@ def _sizes(kind: str, key: str, axis: str, episode: Episode, reference: Referenc
         case "noise" | "position noise" if present.sum() > 2:
             chosen = readings[:, [axis_index(axis)]] if axis else readings.reshape(len(readings), -1)
             size = np.median(np.abs(np.diff(chosen[present], n=2, axis=0)), axis=1)
+            if not is_image(episode.observations[key]):  # the median of many pixels varies less
+                size = median_filter(size, SMOOTH, mode="nearest")
             series = np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12)
             steps = np.arange(len(readings))
             return np.interp(steps, steps[present], _without_lost(series, episode.observations[key][present]))

@@ -83,12 +83,13 @@ def window_starts(steps: int) -> range:
     return range(0, steps - LENGTH + 1, STRIDE)
 
 
-def deviating_windows(values: Array) -> tuple[int, int] | None:
+def deviating_windows(values: Array, healthy: float | None = None) -> tuple[int, int] | None:
     """First and last step of the windows around the most deviating one of values (W,); None if all are equal.
 
-    They deviate from the median by at least half as much as it does.
+    They deviate from the healthy value by at least half as much as it does; if that is unknown, from the median, which
+    a fault of more than half of the windows would move.
     """
-    distance = np.abs(values - np.nanmedian(values))
+    distance = np.abs(values - (np.nanmedian(values) if healthy is None else healthy))
     if not np.nanmax(distance) > 0.0:
         return None
     most = int(np.nanargmax(distance))
@@ -96,7 +97,9 @@ def deviating_windows(values: Array) -> tuple[int, int] | None:
     before, after = np.flatnonzero(near[:most]), np.flatnonzero(near[most:])
     first = before[-1] + 1 if len(before) else 0
     last = most + after[0] - 1 if len(after) else len(values) - 1
-    return int(first * STRIDE), int(last * STRIDE + LENGTH - 1)
+    # A window that a fault begins or ends in deviates by half, more or less.
+    start, end = first * STRIDE + (STRIDE // 2 if first else 0), last * STRIDE + LENGTH - 1
+    return int(start), int(end if last == len(values) - 1 else end - STRIDE // 2)
 
 
 def _part(episode: Episode, first: int) -> Episode:
