@@ -32,6 +32,10 @@ ALARM_RATE = 0.02
 SHARED = 0.25
 """Mean deviation of episodes, relative to that of others, from which a fault affects them as well."""
 
+CERTAIN = 2.0
+"""Ratio to its critical value from which a deviation of most episodes is significant by itself. The test by divisions
+cannot show it if the record is small: too many divisions hold all episodes with the fault."""
+
 REPEATED = ("frozen/", "stuck/")
 """Statistics of the share of repeated readings of a sensor in an episode."""
 
@@ -126,7 +130,8 @@ def compared(
     scattered, grouped = with_scatter(*with_adjusted(profile, rows, sensors))
     comparison = compare(scattered, grouped, task=inputs.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
-    p_value = 0.0 if _repeats_readings(profile, rows) else comparison.p_value
+    certain = _repeats_readings(profile, rows) or _most_deviate(scattered, grouped, deviations)
+    p_value = 0.0 if certain else comparison.p_value
     return Case(inputs, traces, rows, sensors, grouped, profile, deviations, p_value, alarm_rate)
 
 
@@ -136,6 +141,17 @@ def _repeats_readings(profile: HealthyProfile, rows: Rows) -> bool:
         n: np.nanmax(v) for n, v in profile.statistics.items() if n.startswith(REPEATED) and np.isfinite(v).any()
     }
     return any(row.get(name, 0.0) >= MOST for name, most in healthy.items() if most <= RARE for row in rows)
+
+
+def _most_deviate(profile: HealthyProfile, rows: Rows, deviations: Sequence[Deviation]) -> bool:
+    """Whether more than half of several episodes are outside of the record's range in a large deviation."""
+    for deviation in (d for d in deviations if d.alarm and abs(d.t) >= CERTAIN):
+        record = profile.statistics[deviation.statistic]
+        values = np.array([row.get(deviation.statistic, np.nan) for row in rows])
+        outside = (values < np.nanmin(record)) | (values > np.nanmax(record))
+        if len(rows) > 1 and outside.mean() > 0.5:
+            return True
+    return False
 
 
 def focus(case: Case) -> Case:

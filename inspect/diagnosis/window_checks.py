@@ -97,9 +97,11 @@ def deviating_windows(values: Array, healthy: float | None = None) -> tuple[int,
     before, after = np.flatnonzero(near[:most]), np.flatnonzero(near[most:])
     first = before[-1] + 1 if len(before) else 0
     last = most + after[0] - 1 if len(after) else len(values) - 1
+    start, end = int(first * STRIDE), int(last * STRIDE + LENGTH - 1)
+    if first == last:
+        return start, end
     # A window that a fault begins or ends in deviates by half, more or less.
-    start, end = first * STRIDE + (STRIDE // 2 if first else 0), last * STRIDE + LENGTH - 1
-    return int(start), int(end if last == len(values) - 1 else end - STRIDE // 2)
+    return start + STRIDE // 2 * bool(first), end - STRIDE // 2 * bool(last < len(values) - 1)
 
 
 def _part(episode: Episode, first: int) -> Episode:

@@ -145,7 +145,9 @@ def test_a_bias_begins_in_free_motion(task: str) -> None:
 def test_windows_that_deviate_are_adjacent() -> None:
     values = np.array([1.0, 1.0, 3.0, 4.0, 1.0, np.nan, 4.5, 1.0])
     assert deviating_windows(values) == (6 * STRIDE, 6 * STRIDE + LENGTH - 1)
-    assert deviating_windows(values[:5]) == (2 * STRIDE, 3 * STRIDE + LENGTH - 1)
+    assert deviating_windows(values[:5]) == (2 * STRIDE + STRIDE // 2, 3 * STRIDE + LENGTH - 1 - STRIDE // 2)
+    late = np.array([1.0, 1.0, 5.0, 5.0, 5.0, 5.0])  # the first ones would deviate from the median
+    assert deviating_windows(late, healthy=1.0) == (2 * STRIDE + STRIDE // 2, 5 * STRIDE + LENGTH - 1)
     assert deviating_windows(np.ones(4)) is None
 
 
