@@ -54,6 +54,7 @@ def sensor_statistics(
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
+    values |= {f"absent/{key}/all": float(1.0 - episode.present(key).mean()) for key in episode.task.masks}
     values |= vector_statistics(episode) | law_statistics(episode)
     values |= contact_distance_statistics(episode, reference)
     values |= window_statistics(episode, reference) | reading_statistics(episode, readings)

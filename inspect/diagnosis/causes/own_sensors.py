@@ -36,6 +36,9 @@ DELAYED = (
 )
 """As ``BIASED``, of a delay."""
 
+CONNECTION = "Check the connection of the sensor and the load of the computer that receives its messages."
+"""Next action of lost readings."""
+
 VECTOR = (
     ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
     ("saturation", "saturation", "saturated", "Extend the measuring range of the sensor."),
@@ -71,6 +74,10 @@ def sensor_causes(task: Task) -> tuple[Cause, ...]:
             symptom = Symptom(_patterns(key, *kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
             result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
+        if key in task.masks:
+            lost = Symptom(_patterns(key, "absent"))
+            title = f"Readings of sensor {display_name(key)} lost"
+            result.append(Cause(f"{key}.dropout", title, (lost,), changed, CONNECTION, f"drop {modality}"))
         result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
         result += _changed_views(key, modality) if key in task.images else []
     for key in modelled_sensors(task):

@@ -27,7 +27,7 @@ RECORDED = (
     ),
     Cause(
         "filter.changed",
-        "Filter changed while its readings are healthy",
+        "Filter changed, while its readings show no fault",
         (Symptom(ERRORS),),
         FILTER,
         "Compare the code and parameters of the filter with those of the healthy runs; as an external filter "

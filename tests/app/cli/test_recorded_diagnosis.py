@@ -94,7 +94,7 @@ def diagnose(run: Run, recordings: Path) -> Callable[[str], str]:
         ("again", "Healthy: "),
         ("biased", "Sensor beacon biased, "),
         ("sure", "Covariance of the filter too small, "),
-        ("wrong", "Filter changed while its readings are healthy, "),
+        ("wrong", "Filter changed, while its readings show no fault, "),
     ],
 )
 def test_a_fault_of_recorded_runs_is_named(diagnose: Callable[[str], str], name: str, headline: str) -> None:
