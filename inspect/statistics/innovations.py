@@ -130,8 +130,9 @@ def least_certain(covariance: Array) -> NDArray[np.intp]:
     the sample covariance of an ensemble by less than chance does.
     """
     sizes = np.linalg.slogdet(covariance)[1]
-    usual = int(np.nanmean(sizes, axis=0).argmax())
-    return np.where(sizes.max(-1) - sizes[:, usual] < SAME_SIZE, usual, sizes.argmax(-1))
+    smaller = sizes.max(-1, keepdims=True) - sizes
+    usual = int(np.median(smaller, axis=0).argmin())
+    return np.where(smaller[:, usual] < SAME_SIZE, usual, sizes.argmax(-1))
 
 
 def _particle_moments(task: Task, particles: AnyArray, log_weights: AnyArray) -> Moments:

@@ -264,6 +264,20 @@ def test_episodes_are_affected_unless_they_are_healthy() -> None:
     assert affected_episodes(every, every.deviations).tolist() == [True] * 6
 
 
+@pytest.mark.parametrize(("faulty", "alarm"), [(3, True), (1, False), (0, False)])
+def test_most_episodes_far_outside_of_a_small_record_are_an_alarm(faulty: int, alarm: bool) -> None:
+    """Of 12 healthy and 5 tested episodes, 1.5 % of the divisions hold three with the same fault."""
+    rng = np.random.default_rng(0)
+    names = [f"level/force {axis}/free motion" for axis in "xyz"] + [f"noise/force {axis}/all" for axis in "xyz"]
+    record = {name: rng.normal(5.0, 0.5, 12) for name in names}
+    rows = [{name: float(rng.normal(5.0, 0.5)) for name in names} for _ in range(5)]
+    for row in rows[:faulty]:
+        row[names[0]] = 100.0
+    inputs = RunInputs(checkpoint(), {}, 300, frozenset())
+    case = compared(inputs, [], rows, rows, HealthyProfile("test", 12, None, record), 0.02)
+    assert [d.statistic for d in case.alarms[:1]] == ([names[0]] if alarm else [])
+
+
 def deviations_in(values: Callable[[float, float], list[float]]) -> Case:
     """A case whose force along x has levels by episode, from those of healthy episodes and their standard deviation."""
     healthy = np.array([0.1 * (i % 11) for i in range(44)])

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from beliefscope.inspect.diagnosis.image_checks import registration
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnosis.image_checks import image_statistics, registration
+from beliefscope.inspect.diagnosis.window_checks import window_statistics
+from beliefscope.inspect.healthy import sensor_record
 from beliefscope.inspect.statistics.reference_images import Reference, normalised
 from beliefscope.inspect.statistics.signals import Array
 
@@ -45,3 +49,32 @@ def test_the_shift_is_that_of_the_largest_correlation_summed_over_the_images(shi
     i, j = np.unravel_index(middle.argmax(), middle.shape)
     x, y = registration(healthy, hand, images)
     assert (round(x), round(y)) == (j - columns, i - rows) == shift
+
+
+TASK = Task("table", (Component("x", "m"), Component("y", "m")), {"image": (12, 12)}, {"image": ("image",)}, 0, 0.1)
+
+
+def film(seed: int, gain: float = 1.0, noise: float = 4.0, first: int = 0) -> Episode:
+    """A still scene of gray levels 60 to 160 with noise, both multiplied by the camera's gain from a step on."""
+    scene = np.random.default_rng(0).uniform(60.0, 160.0, (12, 12))
+    images = scene + np.random.default_rng(seed).normal(0.0, noise, (80, 12, 12))
+    images[first:] *= gain
+    return Episode(TASK, np.zeros((80, 2)), observations={"image": images.clip(0, 255).round().astype(np.uint8)})
+
+
+def test_a_gain_of_the_camera_is_no_noise() -> None:
+    reference = sensor_record([film(seed) for seed in range(5)]).reference
+
+    def of(episode: Episode) -> dict[str, float]:
+        return image_statistics(episode, "image", reference) | window_statistics(episode, reference)
+
+    films = film(9), film(9, gain=1.5), film(9, gain=1.5, first=30), film(9, noise=6.0)
+    healthy, bright, late, noisy = map(of, films)
+    for name in ("noise/image/all", "noise/image/extreme"):
+        assert bright[name] == pytest.approx(healthy[name], rel=0.05)
+        assert noisy[name] == pytest.approx(1.5 * healthy[name], rel=0.1)
+    assert late["noise/image/extreme"] == pytest.approx(healthy["noise/image/extreme"], rel=0.1)
+    assert bright["brightness/image/all"] == pytest.approx(1.5, rel=0.02)
+    assert noisy["brightness/image/all"] == pytest.approx(1.0, rel=0.02)
+    assert healthy["clipped/image/all"] == 0.0
+    assert of(film(9, gain=2.0))["clipped/image/all"] == pytest.approx(0.3, abs=0.1)  # of levels from 128

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_innovation_checks import STD, Boat, run, sail, wrapped
+from tests.inspect.diagnosis.test_innovation_checks import STD, Boat, loaded, run, sail, wrapped
 
-from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
+from beliefscope.inspect.diagnosis.measurement_checks import is_of_readings, measurement_model_statistics
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.trace import Trace
@@ -50,6 +51,30 @@ def test_an_offset_of_the_measurement_function_shows_whatever_the_readings() -> 
         innovation=wrong.innovation + np.stack([shift, [0.0, 0.0]]).astype(np.float32),
     )
     assert rms(measurement_model_statistics(shifted, models())) == pytest.approx([radar_range, bearing], rel=1e-3)
+
+
+class Scaled(Boat):
+    """Reports the innovations of the range in another unit, or those of a virtual sensor whose gain varies."""
+
+    def __init__(self, factor: float, is_virtual: bool = False) -> None:
+        super().__init__()
+        self.factor, self.is_virtual = factor, is_virtual
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        gain = self.factor * (1.0 + abs(self.mean[0]) if self.is_virtual else 1.0)
+        result = super().__call__(observations=observations, controls=controls)
+        if result["innovation"][0] is not None:
+            result["innovation"][0] = result["innovation"][0] * np.array([gain, 1.0])
+        return result
+
+
+@pytest.mark.parametrize(
+    ("filter_", "expected"),
+    [(Boat(), True), (Boat(offset=5.0), True), (Scaled(100.0), True), (Scaled(1.0, True), False)],
+)
+def test_innovations_of_a_virtual_sensor_are_not_those_of_its_readings(filter_: Boat, expected: bool) -> None:
+    assert is_of_readings(run(filter_), loaded(filter_), models(), "radar x") == expected
+    assert is_of_readings(run(filter_), loaded(filter_), models(), "radar y")
 
 
 def test_a_belief_before_each_update_is_that_of_its_measurement_function() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.inspect.diagnosis.test_catalog import deviation
 
-from beliefscope.datasets.covariate import CONTACT
+from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.simulation.door import DOOR
@@ -303,3 +303,28 @@ def test_headlines_name_the_channels_of_a_cause(t_values: dict[str, float], expe
     assert channels_text(case, cause) == expected
     unnamed = SimpleNamespace(alarms=alarms, inputs=SimpleNamespace(checkpoint=SimpleNamespace(task=TASK)))
     assert channels_text(unnamed, cause) == ""
+
+
+def test_lost_readings_of_a_sensor_with_a_mask_have_a_cause() -> None:
+    task = replace(TASK, masks={"gps": "gps reading"}, covariates={"gps reading": Covariate("boolean")})
+    steps, received = 60, np.arange(60) % 3 == 0
+    observations = {"image": np.zeros((steps, 8, 8), np.uint8), "gps": np.zeros((steps, 2))}
+    episode = Episode(task, np.zeros((steps, 2)), observations=observations, covariates={"gps reading": received})
+    assert sensor_statistics(episode, None)["absent/gps/all"] == pytest.approx(2 / 3)
+    lost = deviation("absent/gps/all", 5.0)
+    assert ranked(task, lost)["gps.dropout"] > 0.9
+    assert not any(cause.name == "gps.dropout" for cause in causes_of(TASK))
+
+
+def test_a_saturated_channel_is_not_stuck() -> None:
+    episode = slide(0)
+    force = episode.observations["wrench"].copy()
+    waves = 2.0 + np.sin(np.arange(60)) + 0.01 * np.random.default_rng(0).normal(size=60)
+    force[:, 0] = np.minimum(waves, 2.5)  # reaches the limit in several stretches
+    saturated = replace(episode, observations={**episode.observations, "wrench": force})
+    force = force.copy()
+    force[:, 0] = np.where(np.arange(60) < 20, waves, waves[20])
+    stuck = replace(episode, observations={**episode.observations, "wrench": force})
+    first, second = (sensor_statistics(e, None) for e in (saturated, stuck))
+    assert (first["saturation/wrench x/all"], first["stuck/wrench x/all"]) == (pytest.approx(0.3, abs=0.1), 0.0)
+    assert (second["saturation/wrench x/all"], second["stuck/wrench x/all"]) == (0.0, pytest.approx(39 / 60))

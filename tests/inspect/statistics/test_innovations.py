@@ -10,7 +10,7 @@ import pytest
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.inspect.diagnostics.gates import innovations_of
-from beliefscope.inspect.statistics.innovations import autocorrelations, nis_of, whiteness_of
+from beliefscope.inspect.statistics.innovations import autocorrelations, least_certain, nis_of, whiteness_of
 from beliefscope.inspect.statistics.measures import counted
 from beliefscope.inspect.trace import Trace, trace
 
@@ -68,3 +68,14 @@ def test_a_covariance_that_is_not_positive_definite_has_no_squared_innovation(
     assert np.argwhere(np.isnan(nis) & ~np.isnan(usual)).tolist() == [[3, 0]]
     assert np.nanmin(nis) >= 0.0
     np.testing.assert_equal(innovations_of([invalid]).nis, nis)
+
+
+def test_the_belief_before_all_updates_is_the_same_but_for_steps_that_show_another_one() -> None:
+    """Sample covariances of 64 members before three updates that hardly change them: the second is one at step 5."""
+    rng = np.random.default_rng(0)
+    members = rng.normal(size=(20, 1, 64, 4)) * np.array([1.0, 0.98, 0.96])[:, None, None]
+    members = members + 0.02 * rng.normal(size=members.shape)
+    members[5] *= np.array([0.5, 1.0, 0.4])[:, None, None]
+    deviation = members - members.mean(-2, keepdims=True)
+    covariance = np.swapaxes(deviation, -1, -2) @ deviation / 63
+    assert least_certain(covariance).tolist() == [1 if step == 5 else 0 for step in range(20)]
