@@ -23,6 +23,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings, runs_in_processes
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
+from beliefscope.app.workspace.healthy_records import record_path
 from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.app.workspace.saved_filters import SavedFilters
 from beliefscope.datasets.dataset import Dataset
@@ -162,9 +163,6 @@ class TraceStore:
         record = self._records.get(self._record_path(run.checkpoint))
         return record is not None and record is not run.checkpoint.healthy_profile
 
-    def _record_path(self, checkpoint: Checkpoint) -> Path:
-        return self.settings.workspace / "healthy" / f"{checkpoint.hash}.json"
-
     def cached(self, selection: Selection) -> TracedRun | None:
         """The selected run if its trace is complete and in memory."""
         if (live_run := self._live_run(selection)) is not None:
@@ -196,12 +194,18 @@ class TraceStore:
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
         """With the healthy record of the workspace, if it was measured. Raises BadInput for an unknown name."""
         with self._lock:
-            checkpoint = self._filter(task, filter_)
+            return self._with_record(self._filter(task, filter_))
+
+    def _with_record(self, checkpoint: Checkpoint) -> Checkpoint:
+        with self._lock:
             record = self._records.get(self._record_path(checkpoint))
-            if record is not None:
-                checkpoint = copy.copy(checkpoint)
-                object.__setattr__(checkpoint, "healthy_profile", record)  # a checkpoint is frozen
-            return checkpoint
+        if record is not None:
+            checkpoint = copy.copy(checkpoint)
+            object.__setattr__(checkpoint, "healthy_profile", record)  # a checkpoint is frozen
+        return checkpoint
+
+    def _record_path(self, checkpoint: Checkpoint) -> Path:
+        return record_path(self.settings.workspace, checkpoint)
 
     def record_version(self, task: str, filter_: str) -> int | None:
         """Differs between measurements of the record in the workspace; None without. Raises as ``checkpoint``."""
@@ -261,7 +265,7 @@ class TraceStore:
         if not selection.data.startswith(LIVE_PREFIX):
             return None
         run = self.live[selection.data.removeprefix(LIVE_PREFIX)]
-        return self.live.traced_run(run, selection, self.filters_of(run))
+        return self.live.traced_run(run, selection, self.filters_of(run), self._with_record)
 
     def _episode(self, selection: Selection) -> Episode:
         with self._lock:

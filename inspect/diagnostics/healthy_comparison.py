@@ -60,7 +60,7 @@ SMALLEST_REST = 0.005
 MIN_HEALTHY = 10
 """Minimum number of healthy episodes with a value of a statistic."""
 
-COMPARE_RUNS = "beliefscope diagnose DIR --profile-from HEALTHY_DIR"
+COMPARE_RUNS = "beliefscope diagnose DIR --profile-from HEALTHY_DIR --workspace WORKSPACE"
 """Diagnosis of a filter that is not available."""
 
 COUNTED = ("steps", "gray levels")
@@ -351,5 +351,5 @@ def no_diagnosis(checkpoint: Checkpoint) -> str | None:
             return None
         lacking = f"a healthy record of {plural(count, 'episode')}, fewer than the {MIN_HEALTHY} needed"
     if isinstance(checkpoint, UnavailableFilter):
-        lacking += f"; compare its recorded runs with at least {MIN_HEALTHY} healthy ones: {COMPARE_RUNS}"
+        lacking += f"; compare its recorded runs with at least {MIN_HEALTHY} healthy ones, here as well: {COMPARE_RUNS}"
     return f"this filter has {lacking}"

@@ -75,6 +75,11 @@ def diagnose(
     repair: int | None = opt.option(
         "I", "Also find the smallest repair of the largest failure of this episode.", None, parser=opt.integer(0)
     ),
+    workspace: Path | None = opt.option(
+        "DIR",
+        "Workspace that keeps the healthy record of recorded runs, so that the page diagnoses the runs of this filter.",
+        None,
+    ),
     workers: int = 1,
     engine: opt.Engine = "local",
 ) -> console.Result:
@@ -95,6 +100,7 @@ def diagnose(
       beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from clean.h5
       beliefscope diagnose door --filter new.py:build --profile-from clean.h5 --profile-filter old.py:build
       beliefscope diagnose traces/today --profile-from traces/healthy
+      beliefscope diagnose workspace/live --profile-from traces/healthy --workspace workspace
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
     if alarm_rate is not None and not 0.0 < alarm_rate < 1.0:
@@ -106,7 +112,9 @@ def diagnose(
             raise BadInput(
                 "recorded runs are diagnosed as they are, without --faults, --base, --profile-filter, --repair"
             )
-        return _of_recordings(runs, episode, alarm_rate, profile_from)
+        return _of_recordings(runs, episode, alarm_rate, profile_from, workspace)
+    if workspace is not None:
+        raise BadInput("--workspace is for recorded runs; the page itself measures the record of a filter that can run")
     return _of_filter(runs, episode, base, alarm_rate, profile_from, profile_filter, repair, workers, engine)
 
 
@@ -161,11 +169,11 @@ def _of_filter(
 
 
 def _of_recordings(
-    runs: opt.Runs, episode: int | None, alarm_rate: float | None, healthy: Path | None
+    runs: opt.Runs, episode: int | None, alarm_rate: float | None, healthy: Path | None, workspace: Path | None
 ) -> console.Result:
     """The diagnosis of recorded runs, with a healthy record of other ones or of the filter.
 
-    healthy: runs, or clean data over which the filter runs.
+    healthy: runs, or clean data over which the filter runs. workspace: keeps the record.
     """
     from beliefscope.filters.external.unavailable import UnavailableFilter
     from beliefscope.filters.names import is_run
@@ -196,6 +204,8 @@ def _of_recordings(
         )
     else:
         profile = _profile(checkpoint, healthy, len(traces), alarm_rate, [trace.episode for trace in traces])
+    if workspace is not None:
+        _keep(workspace, checkpoint, profile)
     with console.progress("Diagnosing") as advance:
         result = diagnose_traces(
             checkpoint,
@@ -211,6 +221,15 @@ def _of_recordings(
     document = result.to_json() | {"runs": [{"episode": i, "path": str(file)} for i, file in used.items()]}
     parts = [result.headline, *map(str, result.tables()), *([str(listed)] if len(used) > 1 else [])]
     return console.Result(document, "\n\n".join(parts))
+
+
+def _keep(workspace: Path, checkpoint: Checkpoint, profile: HealthyProfile) -> None:
+    """Write the healthy record of a filter, where the page finds it."""
+    from beliefscope.app.workspace.healthy_records import record_path
+    from beliefscope.app.workspace.json_files import write_record
+
+    opt.check_workspace(workspace)
+    write_record(profile.to_json(), record_path(workspace, checkpoint))
 
 
 def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:

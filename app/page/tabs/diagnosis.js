@@ -233,10 +233,10 @@ export class Diagnosis {
     const state = stateOf(entry);
     this.#writeHeadline(result?.headline ?? state);
     const { episode } = this.#store.state;
-    const source = this.#isLive ? 'this live run' : `episode ${episode}`;
-    html('.status', this.#host).textContent = entry.preliminary
-      ? `Preliminary, from ${source} alone and before any cause is undone. ${state}`
-      : '';
+    const preliminary = this.#isLive
+      ? 'From this live run alone: no cause is undone.'
+      : `Preliminary, from episode ${episode} alone and before any cause is undone.`;
+    html('.status', this.#host).textContent = entry.preliminary ? `${preliminary} ${state}` : '';
     showJobButton(html('.doing', this.#host), entry, {
       action: this.#trace && !this.#isLive ? (ACTIONS[entry.state] ?? '') : '',
       progress: 'Progress of the diagnosis',

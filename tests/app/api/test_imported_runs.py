@@ -64,3 +64,36 @@ def test_diagnostics_of_all_runs_of_a_filter(imported: Settings, open_client: Ca
     assert answer.json()["trajectories"] == 6
     (table, *_) = answer.json()["tables"]
     assert max(row[table["columns"].index("episodes")] for row in table["rows"]) == 6
+
+
+def test_runs_are_diagnosed_with_a_kept_record(
+    run: Run, imported: Settings, open_client: Callable[..., TestClient]
+) -> None:
+    folder = imported.workspace.parent
+    live = imported.workspace / "live"
+    rng = np.random.default_rng(1)
+    for name, count, size in (("healthy", 12, 0.1), ("wrong", 1, 0.5)):
+        (folder / name).mkdir()
+        for i in range(count):
+            x, yaw = np.cumsum(rng.normal(0.0, 0.1, 60)), np.linspace(0.0, 0.5, 60)
+            values = {"x": x, "yaw": yaw, "gps": x, "mean": x + rng.normal(0.0, size, 60), "std": np.full(60, 0.1)}
+            np.savez(folder / name / f"{name}_{i}.npz", **values)
+        logs = sorted((folder / name).iterdir())
+        output = live if name == "wrong" else folder / "traces"
+        assert run("import", *logs, "--map", folder / "map.toml", "-o", output)[0] == 0
+    with open_client(imported) as client:
+        url, query = "ferry/node/0", {"data": "live:wrong_0"}
+        assert "no healthy record" in client.get(f"/api/diagnosis/{url}", params=query).text
+        command = ("diagnose", live / "wrong_0.live", "--profile-from", folder / "traces")
+        assert run(*command, "--workspace", imported.workspace)[0] == 0
+        answer = client.get(f"/api/diagnosis/{url}", params=query).json()["preliminary"]
+        assert answer["headline"].startswith("Filter changed, while its readings show no fault")
+        assert answer["healthy_episodes"] == 12
+        other = client.get(f"/api/diagnosis/{url}", params={"data": "live:day_1"}).json()["preliminary"]
+        assert other["state"] == "healthy"
+
+
+def test_a_kept_record_is_of_recorded_runs(run: Run, tmp_path: Path) -> None:
+    code, _, error = run("diagnose", "door", "--filter", "crossmodal-ekf", "--workspace", tmp_path)
+    assert code == 2
+    assert "--workspace is for recorded runs" in error
