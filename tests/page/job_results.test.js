@@ -99,7 +99,7 @@ test('the effect of undoing a cause has a direction and no sign', () => {
   );
   assert.match(
     recoveredText({ ...angle, error: -0.2 }),
-    /^Undoing it increases the angle error by 20 %;/,
+    /^Undoing it does not help: the angle error increases by 20 %;/,
   );
   for (const error of [-0.004, 0, 0.004])
     assert.match(recoveredText({ ...angle, error }), /^Undoing it does not change the error; the/);

@@ -84,7 +84,7 @@ export function recoveredText({ error, low, high, nll, measure }) {
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
   if (!Math.round(100 * error)) return `Undoing it does not change the error; ${likelihood}.`;
   if (error < 0)
-    return `Undoing it increases the ${measure} error by ${percent(-error)}; ${likelihood}.`;
+    return `Undoing it does not help: the ${measure} error increases by ${percent(-error)}; ${likelihood}.`;
   return `Undoing it removes ${percent(error)}${range} of the ${measure} error; ${likelihood}.`;
 }
 
