@@ -59,6 +59,14 @@ def loss_of(source: str) -> Loss:
     return function
 
 
+def has_loss(source: str) -> bool:
+    """Whether a build function has a loss, so that its filter can be fine-tuned."""
+    try:
+        return callable(loss_of(source))
+    except BadInput:
+        return False
+
+
 def finetune_external(
     base: ExternalFilter,
     loss: Loss,

@@ -15,7 +15,8 @@ from beliefscope.datasets.text import capitalised
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
-from beliefscope.filters.names import PRETRAINED
+from beliefscope.filters.finetuning.external import has_loss
+from beliefscope.filters.names import PRETRAINED, is_code
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.case import (
     ALARM_RATE,
@@ -248,7 +249,9 @@ def command_line(command: Command, checkpoint: Checkpoint) -> str:
 
 
 def _is_trainable(checkpoint: ExternalFilter) -> bool:
-    if isinstance(checkpoint, UnavailableFilter):
+    """Whether the filter has parameters and, if its file is known, a loss in it."""
+    source = checkpoint.source
+    if isinstance(checkpoint, UnavailableFilter) or (is_code(source) and not has_loss(source)):
         return False
     return any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)())
 
@@ -298,10 +301,11 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
         )
         return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {action}"
     first = candidates[0]
-    similar = [c for c in candidates[1:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
+    similar = [c for c in candidates[1:3] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:
-        actions = " ".join(dict.fromkeys((first.next, similar[0].next)))
-        return f"{first.cause.title} or {_lower(similar[0].cause.title)}, not separable; try: {actions}"
+        actions = " ".join(dict.fromkeys(c.next for c in (first, *similar)))
+        *titles, last = (first.cause.title, *(_lower(c.cause.title) for c in similar))
+        return f"{', '.join(titles)} or {last}, not separable; try: {actions}"
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"

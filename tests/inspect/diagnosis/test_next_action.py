@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from torch import Tensor, nn
 
 from beliefscope.datasets.task import Component, Task
@@ -26,7 +27,9 @@ def test_of_checkpoints() -> None:
     assert command.format("mine.safetensors") in next_action(cause, own)
 
 
-def test_of_an_external_filter_whose_loss_selects_what_is_trained() -> None:
+def test_of_an_external_filter_whose_loss_selects_what_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Still(nn.Linear):
         def forward(self, *, observations: object, controls: Tensor) -> Tensor:
             return self.weight.expand(*controls.shape[:-1], 1)
@@ -35,7 +38,12 @@ def test_of_an_external_filter_whose_loss_selects_what_is_trained() -> None:
     external = ExternalFilter(adapter, TASK, "own-still", "own.py:still")
     (cause,) = (cause for cause in causes_of(TASK) if cause.name == "model.touch.bias")
     command = "`beliefscope finetune peg --filter own.py:still --data DATA -o tuned.safetensors`"
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text("def loss(module, windows):\n    return module.weight.sum()\n")
     assert command in next_action(cause, external)
+    Path("other.py").write_text("")
+    other = ExternalFilter(adapter, TASK, "own-still", "other.py:still")
+    assert next_action(cause, other).endswith("Correct it in the filter's own code.")
     assert "`beliefscope slices peg --filter own.py:still --data DATA`" in search_action(external, 6)
 
 
