@@ -169,9 +169,10 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     def get_record(task: str, filter: str, data: str = "", healthy_filter: str = "") -> Response:
         """The healthy record that was measured for a filter, whatever the data, or the job that measures it."""
         job = jobs.find("healthy", _record_arguments(store, task, filter, data, healthy_filter))
-        if store.record_version(task, filter) is None or (job and job.active):
+        checkpoint = store.checkpoint(task, filter)
+        if store.record_version(checkpoint) is None or (job and job.active):
             return JSONResponse({"job": job and asdict(job)}, status_code=202)
-        record = store.checkpoint(task, filter).healthy_profile or {}
+        record = checkpoint.healthy_profile or {}
         return JSONResponse({"data": str(record.get("data"))})
 
     @app.post("/api/healthy-record/{task}/{filter}", status_code=202)
@@ -213,16 +214,17 @@ def preliminary_diagnosis(store: TraceStore, selection: Selection) -> Any:
 def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, Any]:
     """Arguments of the job. Raises BadInput for an unknown name or invalid faults."""
     name, data = store.dataset(selection.task, selection.data)
-    selection.faults.check(store.checkpoint(selection.task, selection.filter).task)
+    checkpoint = store.checkpoint(selection.task, selection.filter)
+    selection.faults.check(checkpoint.task)
     held_out = [index for index in data.held_out() if index != selection.episode][: MAX_EPISODES - 1]
     episodes = [selection.episode, *(held_out if over == "held-out" else ())]
-    others = {"faults": str(selection.faults), "record": store.record_version(selection.task, selection.filter)}
+    others = {"faults": str(selection.faults), "record": store.record_version(checkpoint)}
     return arguments_over_episodes(store, selection.task, selection.filter, name, episodes, **others)
 
 
 def _repair_arguments(store: TraceStore, selection: Selection) -> dict[str, Any]:
     """Arguments of the job: the bound of its error is that of the healthy record."""
-    record = store.record_version(selection.task, selection.filter)
+    record = store.record_version(store.checkpoint(selection.task, selection.filter))
     return {"selection": selection.to_json(), "key": store.key(selection), "record": record}
 
 

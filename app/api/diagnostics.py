@@ -19,7 +19,6 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.text import plural
-from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Entry
 
@@ -102,14 +101,15 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
                 key, lambda: {"trajectories": 1, **entry([run.trace], run.checkpoint, **options).views()}
             )
             return Response(result, media_type="application/json")
-        return result_or_job(jobs, "diagnostic", _arguments(store, entry, selection, options, episodes))
+        return result_or_job(jobs, "diagnostic", _arguments(store, entry, selection, run, options, episodes))
 
     @app.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
     def compute(
         entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
     ) -> JobReply:
-        _check(entry, store.request(selection))
-        arguments = _arguments(store, entry, selection, options, episodes)
+        run = store.request(selection)
+        _check(entry, run)
+        arguments = _arguments(store, entry, selection, run, options, episodes)
         unit = "run" if selection.data.startswith(LIVE_PREFIX) else "held-out episode"
         scope = f"all {plural(len(arguments['selections']), unit)}" if episodes else ""
         state = {"over": episodes, "diagnostic": entry.name, "options": urlencode(options)}
@@ -123,20 +123,24 @@ def _check(entry: Entry, run: TracedRun) -> None:
 
 
 def _arguments(
-    store: TraceStore, entry: Entry, selection: Selection, options: Mapping[str, Any], episodes: Episodes
+    store: TraceStore,
+    entry: Entry,
+    selection: Selection,
+    run: TracedRun,
+    options: Mapping[str, Any],
+    episodes: Episodes,
 ) -> dict[str, Any]:
-    """Arguments of the job, with everything that its result depends on."""
+    """Arguments of the job, with everything that its result depends on. run: the selected one."""
     is_live = selection.data.startswith(LIVE_PREFIX)
     if episodes and is_live:
         selections = store.live.of_same_filter(selection)
     else:
         indices = store.dataset(selection.task, selection.data)[1].held_out() if episodes else [selection.episode]
         selections = [replace(selection, episode=index) for index in indices]
-    known = not (is_live and isinstance(store.request(selection).checkpoint, UnavailableFilter))
     return {
         "diagnostic": entry.name,
         "options": dict(sorted(options.items())),
         "selections": [item.to_json() for item in selections],
         "keys": [store.key(item) for item in selections],
-        "record": store.record_version(selection.task, selection.filter) if known else None,
+        "record": store.record_version(run.checkpoint),
     }

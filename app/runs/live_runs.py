@@ -130,12 +130,12 @@ class LiveRuns:
     ) -> TracedRun | None:
         """The live run, or None if the selection applies another filter, faults or an intervention to its episode.
 
-        with_record: gives a filter that is not available its healthy record, if there is one.
+        with_record: gives the filter the healthy record of the workspace, if there is one.
 
         Raises BadInput if the run belongs to another task or episode.
         """
         name, checkpoint = resolve_filter(run, filters)
-        checkpoint = with_record(checkpoint) if isinstance(checkpoint, UnavailableFilter) else checkpoint
+        checkpoint = with_record(checkpoint)
         if (selection.task, selection.episode) != (run.task.name, run.template.episode_index):
             raise BadInput(
                 f"live run {run.name!r} is of task {run.task.name!r}, episode {run.template.episode_index}, "

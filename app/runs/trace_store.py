@@ -207,10 +207,10 @@ class TraceStore:
     def _record_path(self, checkpoint: Checkpoint) -> Path:
         return record_path(self.settings.workspace, checkpoint)
 
-    def record_version(self, task: str, filter_: str) -> int | None:
-        """Differs between measurements of the record in the workspace; None without. Raises as ``checkpoint``."""
+    def record_version(self, checkpoint: Checkpoint) -> int | None:
+        """Differs between measurements of the filter's record in the workspace; None without."""
         with self._lock:
-            return self._records.modified(self._record_path(self._filter(task, filter_)))
+            return self._records.modified(self._record_path(checkpoint))
 
     def write_record(self, checkpoint: Checkpoint, record: dict[str, Any]) -> None:
         """Keep a healthy record of a filter in the workspace; replaces an earlier one."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from httpx import Response
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
@@ -49,6 +50,15 @@ def imported(run: Run, tmp_path: Path) -> Settings:
     return Settings(tmp_path / "workspace")
 
 
+def finished(client: TestClient, url: str, query: dict[str, str]) -> Response:
+    """The result of a job that has started."""
+    end = time.monotonic() + 90.0
+    while (answer := client.get(url, params=query)).status_code == 202 and time.monotonic() < end:
+        time.sleep(0.05)
+    assert answer.status_code == 200, answer.text
+    return answer
+
+
 def test_diagnostics_of_all_runs_of_a_filter(imported: Settings, open_client: Callable[..., TestClient]) -> None:
     with open_client(imported) as client:
         listed = client.get("/api/live").json()["runs"]
@@ -57,10 +67,7 @@ def test_diagnostics_of_all_runs_of_a_filter(imported: Settings, open_client: Ca
         url = "/api/diagnostics/consistency/ferry/node/0"
         assert client.get(url, params=query).json() == {"job": None}
         assert client.post(url, params=query).json()["job"]["title"].endswith("all 6 runs")
-        end = time.monotonic() + 90.0
-        while (answer := client.get(url, params=query)).status_code == 202 and time.monotonic() < end:
-            time.sleep(0.05)
-    assert answer.status_code == 200, answer.text
+        answer = finished(client, url, query)
     assert answer.json()["trajectories"] == 6
     (table, *_) = answer.json()["tables"]
     assert max(row[table["columns"].index("episodes")] for row in table["rows"]) == 6
@@ -84,11 +91,15 @@ def test_runs_are_diagnosed_with_a_kept_record(
     with open_client(imported) as client:
         url, query = "ferry/node/0", {"data": "live:wrong_0"}
         assert "no healthy record" in client.get(f"/api/diagnosis/{url}", params=query).text
+        all_runs, over = f"/api/diagnostics/consistency/{url}", {"data": "live:day_1", "episodes": "held-out"}
+        client.post(all_runs, params=over)
+        assert "No healthy record" in finished(client, all_runs, over).json()["verdict"]
         command = ("diagnose", live / "wrong_0.live", "--profile-from", folder / "traces")
         assert run(*command, "--workspace", imported.workspace)[0] == 0
         answer = client.get(f"/api/diagnosis/{url}", params=query).json()["preliminary"]
         assert answer["headline"].startswith("Filter changed, while its readings show no fault")
         assert answer["healthy_episodes"] == 12
+        assert client.get(all_runs, params=over).json() == {"job": None}  # not the result without the record
         other = client.get(f"/api/diagnosis/{url}", params={"data": "live:day_1"}).json()["preliminary"]
         assert other["state"] == "healthy"
 
