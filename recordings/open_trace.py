@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,16 +73,17 @@ def of_one_task(traces: Sequence[Trace], places: Sequence[str]) -> list[Trace]:
     An angle wraps in all of them if it does in one: a log shows this only if its values span more than half a turn.
     """
     wraps = [any(bools) for bools in zip(*([c.wraps for c in t.task.components] for t in traces), strict=False)]
-
-    def wrapped(task: Task) -> Task:
-        pairs = zip(task.components, wraps, strict=False)
-        return replace(task, components=tuple(replace(component, wraps=wrap) for component, wrap in pairs))
-
-    first = wrapped(traces[0].task)
+    first = with_wraps(traces[0].task, wraps)
     for trace, place in zip(traces, places, strict=True):
-        if other := difference(first, wrapped(trace.task)):
+        if other := difference(first, with_wraps(trace.task, wraps)):
             raise BadInput(f"{place} is of {other}, not of that of {places[0]}")
     return [replace(trace, episode=replace(trace.episode, task=first)) for trace in traces]
+
+
+def with_wraps(task: Task, wraps: Iterable[bool]) -> Task:
+    """The task with other marks of components that wrap around, in their order."""
+    pairs = zip(task.components, wraps, strict=False)
+    return replace(task, components=tuple(replace(component, wraps=wrap) for component, wrap in pairs))
 
 
 def _open(read: Callable[[Path, Sequence[Task]], Trace], path: Path, name: str) -> Trace:

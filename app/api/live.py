@@ -8,7 +8,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
-from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from beliefscope.datasets.task_json import difference
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.traces.live_run import LiveRun
 from beliefscope.inspect.traces.sensors import camera_images
+from beliefscope.recordings.open_trace import with_wraps
 
 MAX_BLOCK = 1 << 22  # bytes of the run's file per message
 POLL_INTERVAL = 0.02  # s between checks of a file
@@ -116,7 +117,7 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
 
 def _unwrapped(task: Task) -> Task:
     """The task without marks of angles that wrap, which a log shows only if its values span more than half a turn."""
-    return replace(task, components=tuple(replace(component, wraps=False) for component in task.components))
+    return with_wraps(task, repeat(False))
 
 
 async def _next_block(runs: LiveRuns, name: str, request: StepsRequest) -> bytes:

@@ -62,9 +62,10 @@ def loss_of(source: str) -> Loss:
 def has_loss(source: str) -> bool:
     """Whether a build function has a loss, so that its filter can be fine-tuned."""
     try:
-        return callable(loss_of(source))
+        loss_of(source)
     except BadInput:
         return False
+    return True
 
 
 def finetune_external(

@@ -145,11 +145,13 @@ def _repeats_readings(profile: HealthyProfile, rows: Rows) -> bool:
 
 def _most_deviate(profile: HealthyProfile, rows: Rows, deviations: Sequence[Deviation]) -> bool:
     """Whether more than half of several episodes are outside of the record's range in a large deviation."""
+    if len(rows) < 2:
+        return False
     for deviation in (d for d in deviations if d.alarm and abs(d.t) >= CERTAIN):
         record = profile.statistics[deviation.statistic]
         values = np.array([row.get(deviation.statistic, np.nan) for row in rows])
         outside = (values < np.nanmin(record)) | (values > np.nanmax(record))
-        if len(rows) > 1 and outside.mean() > 0.5:
+        if outside.mean() > 0.5:
             return True
     return False
 
@@ -217,10 +219,10 @@ def affected_steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tu
 
 def located(case: Case, deviation: Deviation, episode: Episode) -> tuple[int, int] | None:
     """First and last step of an episode that shows a deviation; None if unknown."""
-    kind, subject, phase = deviation.statistic.split("/")
-    record, start = case.profile.statistics, f"{kind}/{subject}/"
-    levels = (values for name, values in record.items() if name.startswith(start) and not name.endswith(f"/{RANGE}"))
-    known = next((values[np.isfinite(values)] for values in levels if np.isfinite(values).any()), None)
-    level = None if known is None else float(np.median(known))
-    healthy = level if phase == RANGE else deviation.healthy
+    start, _, phase = deviation.statistic.rpartition("/")
+    healthy: float | None = deviation.healthy
+    if phase == RANGE:  # its windows have values of the other phases
+        record = case.profile.statistics.items()
+        others = (v for name, v in record if name.startswith(f"{start}/") and name != deviation.statistic)
+        healthy = next((float(np.nanmedian(v)) for v in others if np.isfinite(v).any()), None)
     return localise(deviation.statistic, episode, case.profile.reference, healthy)

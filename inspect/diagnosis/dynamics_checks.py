@@ -105,7 +105,9 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     steps = 1 + np.flatnonzero(measures.counted(trace)[1:])
     if len(steps) < MIN_STEPS:
         return {}
-    ignored = {"ignored start//all": float(not uses_start(trace, checkpoint))} if has_true_starts(checkpoint) else {}
+    starts = has_true_starts(checkpoint)
+    ignores = starts and not uses_start(trace, checkpoint)
+    ignored = {"ignored start//all": float(ignores)} if starts else {}
     if belief is None or task.rotations:
         return ignored
     change = task.difference(states[steps], states[steps - 1])
@@ -115,9 +117,9 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
         task, {"dynamics offset": _offset(trace, steps, measures.wrapped(task, predicted - change))}
     )
     values |= ignored
-    if ignored:
-        if any(ignored.values()):
-            return values
+    if ignores:
+        return values
+    if starts:
         steps = some_steps(trace, checkpoint)
         started = predictions_from_truth(trace, checkpoint, steps)
         if started is None:

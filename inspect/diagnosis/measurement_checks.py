@@ -146,27 +146,29 @@ def is_of_readings(trace: Trace, checkpoint: ExternalFilter, models: Sequence[Re
     It then changes by a constant factor with a reading. Those of virtual sensors, whose networks have outputs of their
     own, do not; nor can they be compared with the readings. True if single steps do not show it.
     """
-    if not has_true_starts(checkpoint):
+    places = (
+        (k, model, i, column)
+        for k in range(len(trace.modalities))
+        for model, columns in _sensors(trace, k, models)
+        for i, column in enumerate(columns)
+        if axis == axis_name(model.key, model.channels[i], trace.episode.observations[model.key].shape[1])
+    )
+    place = next(places, None)
+    if place is None or not has_true_starts(checkpoint):
         return True
-    for k in range(len(trace.modalities)):
-        for model, columns in _sensors(trace, k, models):
-            names = [axis_name(model.key, i, readings_of(trace.episode, model.key).shape[1]) for i in model.channels]
-            if axis not in names or model.key not in trace.episode.observations:
-                continue
-            i = names.index(axis)
-            readings = trace.episode.observations[model.key].copy()
-            readings[:, model.channels[i]] += model.noise[i]
-            episode = replace(trace.episode, observations={**trace.episode.observations, model.key: readings})
-            steps, std = some_steps(trace, checkpoint), smallest_std(trace)
-            runs = [run_from_truth(run, checkpoint, steps, std) for run in (trace, replace(trace, episode=episode))]
-            before, after = (None if run is None else run.get("innovation") for run in runs)
-            if before is None or after is None:
-                return True
-            gains = (after - before)[:, k, columns[i]] / model.noise[i]
-            middle = float(np.nanmedian(gains)) if np.isfinite(gains).any() else 1.0
-            spread = float(np.nanmedian(np.abs(gains - middle)))
-            return abs(middle - 1.0) < OWN_GAIN or spread < CONSTANT * abs(middle)
-    return True
+    k, model, i, column = place
+    readings = trace.episode.observations[model.key].copy()
+    readings[:, model.channels[i]] += model.noise[i]
+    changed = replace(trace.episode, observations={**trace.episode.observations, model.key: readings})
+    steps, std = some_steps(trace, checkpoint), smallest_std(trace)
+    runs = (run_from_truth(run, checkpoint, steps, std) for run in (trace, replace(trace, episode=changed)))
+    before, after = (None if run is None else run.get("innovation") for run in runs)
+    if before is None or after is None:
+        return True
+    gains = (after - before)[:, k, column] / model.noise[i]
+    middle = float(np.nanmedian(gains)) if np.isfinite(gains).any() else 1.0
+    spread = float(np.nanmedian(np.abs(gains - middle)))
+    return abs(middle - 1.0) < OWN_GAIN or spread < CONSTANT * abs(middle)
 
 
 def _earlier(readings: Array, present: Mask, late: int) -> Array:

@@ -15,6 +15,7 @@ MODEL_KINDS = ("likelihood offset", "likelihood width", "innovation offset", "in
 """Kinds of statistics of the measurement models of external filters, at true states."""
 
 MODELS = "|".join(f"{kind}/*" for kind in MODEL_KINDS)
+"""All measurement models of external filters."""
 
 DYNAMICS = f"dynamics */*|{MODELS}|{FILTER}"
 """The dynamics model."""

@@ -12,6 +12,7 @@ OBJECT = "object offset/*"
 """Position of the object in the image against the labelled one."""
 
 EXPOSURE = "brightness/image/*|clipped/image/*"
+"""Brightness of the image, and saturated pixels."""
 
 LANDMARKS = f"{HAND}|{OBJECT}|hand match/image*|object match/*"
 """Everything about landmarks in the image."""
