@@ -20,7 +20,7 @@ from beliefscope.datasets.catalog import load_task
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.case import compared, observe
 from beliefscope.inspect.diagnosis.diagnose import required_profile
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
 from beliefscope.inspect.traces.batch import trace_all
 
 RATES = (0.05, 0.02, 0.01)

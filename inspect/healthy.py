@@ -13,9 +13,9 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
-from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
-from beliefscope.inspect.diagnosis.reading_checks import modelled_keys
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics
+from beliefscope.inspect.diagnosis.checks.readings import modelled_keys
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, pretrained_reference
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel

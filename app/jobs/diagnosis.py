@@ -8,7 +8,7 @@ from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
-from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
+from beliefscope.inspect.diagnosis.undo.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.healthy_profile import pretrained_reference
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import profile_of

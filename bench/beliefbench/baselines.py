@@ -14,8 +14,8 @@ import numpy as np
 from beliefbench.cases import Case, healthy_profile, load_case, read_truth
 from beliefbench.scorecard import Answer, component
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace

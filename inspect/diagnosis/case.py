@@ -16,12 +16,12 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Cause
-from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics, with_scatter
-from beliefscope.inspect.diagnosis.model_checks import reports_estimates_only
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnosis.checks.modules import reports_estimates_only
+from beliefscope.inspect.diagnosis.checks.sensors import localise, sensor_statistics
+from beliefscope.inspect.diagnosis.checks.windows import RANGE
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
-from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
-from beliefscope.inspect.diagnosis.window_checks import RANGE
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace

@@ -25,7 +25,7 @@ from beliefscope.inspect.diagnosis.causes import (
 from beliefscope.inspect.diagnosis.causes.consequences import model_of
 from beliefscope.inspect.diagnosis.causes.external_filters import external_causes, in_predictions
 from beliefscope.inspect.diagnosis.causes.recorded import OF_ESTIMATES, RECORDED
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts
+from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts
 from beliefscope.inspect.statistics.reference_images import HAND
 
 CAUSES: tuple[Cause, ...] = (

@@ -77,7 +77,7 @@ class Cause:
         consequences: patterns of statistics that it may change as well.
         lowers: patterns of statistics that it may decrease, but not increase.
         raises: patterns of statistics that it may increase, but not decrease.
-        undo: names of interventions that undo it (``inspect/diagnosis/undo.py``), joined by ``|``: the first one
+        undo: names of interventions that undo it (``inspect/diagnosis/undo/undo.py``), joined by ``|``: the first one
             that is possible does; empty if there is none.
         next: next action; without its full stop if a command follows.
         prior: added to the score; negative for a cause that would explain almost everything.

@@ -38,10 +38,10 @@ from beliefscope.inspect.diagnosis.cause import (
     probability_text,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
+from beliefscope.inspect.diagnosis.checks.sensors import covers_episode
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
-from beliefscope.inspect.diagnosis.sensor_checks import covers_episode
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnosis.wrong_noise import too_small
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation

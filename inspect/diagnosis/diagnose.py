@@ -34,10 +34,10 @@ from beliefscope.inspect.diagnosis.case import (
 )
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
-from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import Explanation, burden, probabilities
-from beliefscope.inspect.diagnosis.undo import brings_back
+from beliefscope.inspect.diagnosis.undo.confirmation import recovery, replay_without
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.undo import brings_back
 from beliefscope.inspect.diagnosis.visibility import Effect, effect_ratios
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile

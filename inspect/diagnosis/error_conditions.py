@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.task import Component, display_name
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.cause import Cause
-from beliefscope.inspect.diagnosis.true_starts import (
+from beliefscope.inspect.diagnosis.checks.true_starts import (
     has_true_starts,
     predictions_from_truth,
     run_from_truth,

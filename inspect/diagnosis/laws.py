@@ -11,7 +11,7 @@ from beliefscope.datasets.text import capitalised
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import Case
 from beliefscope.inspect.diagnosis.cause import index_ranges
-from beliefscope.inspect.diagnosis.measurement_checks import is_of_readings
+from beliefscope.inspect.diagnosis.checks.measurements import is_of_readings
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
 from beliefscope.inspect.diagnostics.statistic_kinds import label_of

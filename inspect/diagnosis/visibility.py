@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.inspect.diagnosis.cause import Recovery
-from beliefscope.inspect.diagnosis.model_checks import component_errors
+from beliefscope.inspect.diagnosis.checks.modules import component_errors
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.statistics.measures import counted, errors, nees
 from beliefscope.inspect.trace import Trace

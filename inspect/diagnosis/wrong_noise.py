@@ -13,7 +13,7 @@ import numpy as np
 from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts
+from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 SMALLEST = 3.0

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from tests.app.api.test_diagnosis import BOATS
-from tests.inspect.diagnosis.test_innovation_checks import sail, task
+from tests.inspect.diagnosis.checks.test_innovations import sail, task
 
 from beliefscope.datasets.store import write_dataset
 

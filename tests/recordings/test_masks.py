@@ -20,7 +20,7 @@ from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
-from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+from beliefscope.inspect.diagnosis.checks.sensors import localise, sensor_statistics
 from beliefscope.inspect.slices.covariates import _step_columns
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace

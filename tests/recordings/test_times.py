@@ -24,7 +24,7 @@ from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.catalog import run_diagnostics
 from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.compare.two_runs import compare_runs
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
 from beliefscope.inspect.slices.covariates import _step_columns
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader

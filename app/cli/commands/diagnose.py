@@ -132,7 +132,7 @@ def _of_filter(
     """The diagnosis of a filter that runs over episodes, with the arguments of ``diagnose``."""
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
-    from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
+    from beliefscope.inspect.diagnosis.undo.repair import healthy_bound, smallest_repair
     from beliefscope.inspect.trace import trace
 
     checkpoint, faults = runs.open()

@@ -9,8 +9,8 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import data, fusion, model
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
 from beliefscope.inspect.diagnosis.causes.own_sensors import KNOWN, offset_of
-from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
-from beliefscope.inspect.diagnosis.vector_checks import commands_hand
+from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
+from beliefscope.inspect.diagnosis.checks.vectors import commands_hand
 from beliefscope.inspect.statistics.reference_images import HAND
 
 MODALITIES = ("image", "haptics")

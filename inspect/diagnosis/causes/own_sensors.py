@@ -10,8 +10,8 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import image
 from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS, model_of
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
-from beliefscope.inspect.diagnosis.reading_checks import modelled_sensors
-from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, has_labels_only
+from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
+from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, has_labels_only
 from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")

@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl
 
 import pytest
 from starlette.testclient import TestClient
-from tests.inspect.diagnosis.test_innovation_checks import sail, task
+from tests.inspect.diagnosis.checks.test_innovations import sail, task
 
 from beliefscope.app.api.diagnosis import _repair_arguments
 from beliefscope.app.runs.selection import Selection
@@ -22,7 +22,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
-from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
+from beliefscope.inspect.diagnosis.undo.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.views import as_json
 
 pytestmark = pytest.mark.slow
@@ -118,7 +118,7 @@ BOATS = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
 import beliefscope as bs
-from tests.inspect.diagnosis.test_innovation_checks import BIAS, FLIPPED, STD, Boat, sail, task
+from tests.inspect.diagnosis.checks.test_innovations import BIAS, FLIPPED, STD, Boat, sail, task
 
 TASK = task(4)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_innovation_checks import Boat, run as boat_run
+from tests.inspect.diagnosis.checks.test_innovations import Boat, run as boat_run
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults

@@ -8,7 +8,7 @@ import pytest
 from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
 from beliefscope.inspect.statistics.signals import is_angle
 
 

@@ -34,7 +34,7 @@ from beliefscope.inspect.diagnosis.case import (
 from beliefscope.inspect.diagnosis.cause import SHOWN
 from beliefscope.inspect.diagnosis.conclusion import conclude, healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose, preliminary
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, pretrained_reference, profile_document
 from beliefscope.inspect.healthy import profile_of, sensor_record

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis import test_innovation_checks as boats
+from tests.inspect.diagnosis.checks import test_innovations as boats
 from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, drive
 
 import beliefscope as bs

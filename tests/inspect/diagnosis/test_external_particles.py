@@ -16,10 +16,10 @@ from beliefscope.datasets.covariate import CONTACT
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.cause import Diagnosis
+from beliefscope.inspect.diagnosis.checks.equations import relative_spread, reported_particle_statistics
+from beliefscope.inspect.diagnosis.checks.modules import model_statistics
+from beliefscope.inspect.diagnosis.checks.true_starts import with_particles_near_truth
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.equation_checks import relative_spread, reported_particle_statistics
-from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.true_starts import with_particles_near_truth
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 

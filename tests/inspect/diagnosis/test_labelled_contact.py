@@ -15,10 +15,10 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import CAUSES, causes_of
 from beliefscope.inspect.diagnosis.causes.own_sensors import sensor_causes
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
-from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
-from beliefscope.inspect.diagnosis.undo_readings import advance
-from beliefscope.inspect.diagnosis.window_checks import window_values
+from beliefscope.inspect.diagnosis.checks.sensors import biased_steps, localise, sensor_statistics
+from beliefscope.inspect.diagnosis.checks.windows import window_values
+from beliefscope.inspect.diagnosis.undo.readings import advance
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 TASK = Task(

@@ -11,7 +11,7 @@ import beliefscope as bs
 from beliefscope.inspect.diagnosis.case import compared
 from beliefscope.inspect.diagnosis.conclusion import healthy
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 

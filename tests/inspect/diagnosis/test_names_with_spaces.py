@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.diagnosis.undo import brings_back
+from beliefscope.inspect.diagnosis.undo.undo import brings_back
 from beliefscope.inspect.diagnostics.statistic_kinds import sensor_of, unit_of
 
 TASK = Task(

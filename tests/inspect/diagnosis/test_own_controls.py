@@ -18,11 +18,11 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.external.load import as_external
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.dynamics_checks import module_dynamics_statistics
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs, Undo
+from beliefscope.inspect.diagnosis.checks.dynamics import module_dynamics_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import law_statistics
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
-from beliefscope.inspect.diagnosis.undo_readings import advance, negate_control, scale_control
-from beliefscope.inspect.diagnosis.vector_checks import law_statistics
+from beliefscope.inspect.diagnosis.undo.readings import advance, negate_control, scale_control
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs, Undo
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 TASK = Task("cart", (Component("x", "m"), Component("y", "m")), {"gps": (2,)}, {"gps": ("gps",)}, 2, 0.1)

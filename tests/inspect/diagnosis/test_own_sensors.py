@@ -17,12 +17,12 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
 from beliefscope.inspect.diagnosis.conclusion import channels_text
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
-from beliefscope.inspect.diagnosis.undo import undo
-from beliefscope.inspect.diagnosis.undo_readings import scale_control
+from beliefscope.inspect.diagnosis.undo.readings import scale_control
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.undo import undo
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import SensorRecord, sensor_record

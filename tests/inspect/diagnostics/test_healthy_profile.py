@@ -16,7 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import (
     SUFFIX,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_innovation_checks import FLIPPED, STD, Array, Boat, loaded, run, sail, task, wrapped
+from tests.inspect.diagnosis.checks.test_innovations import FLIPPED, STD, Array, Boat, loaded, run, sail, task, wrapped
 
 import beliefscope as bs
 from beliefscope.datasets.errors import BadInput

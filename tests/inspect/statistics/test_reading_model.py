@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task, rotation
-from beliefscope.inspect.diagnosis.reading_checks import modelled_keys, modelled_sensors, reading_statistics
+from beliefscope.inspect.diagnosis.checks.readings import modelled_keys, modelled_sensors, reading_statistics
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.signals import wrapped

@@ -21,9 +21,9 @@ from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.inspect.accuracy_tables import accuracy_tables
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.compare.counterfactual import compare
-from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
-from beliefscope.inspect.diagnosis.undo import drop
+from beliefscope.inspect.diagnosis.checks.modules import model_statistics
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.undo import drop
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import ARRAYS, trace

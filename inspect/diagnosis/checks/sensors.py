@@ -14,9 +14,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
-from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics, motion_statistics
-from beliefscope.inspect.diagnosis.reading_checks import reading_statistics
-from beliefscope.inspect.diagnosis.vector_checks import (
+from beliefscope.inspect.diagnosis.checks.images import (
+    brightness_of,
+    frozen_images,
+    image_statistics,
+    motion_statistics,
+)
+from beliefscope.inspect.diagnosis.checks.readings import reading_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import (
     angle_channels,
     axis_index,
     contact_changes,
@@ -27,7 +32,7 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     stuck,
     vector_statistics,
 )
-from beliefscope.inspect.diagnosis.window_checks import (
+from beliefscope.inspect.diagnosis.checks.windows import (
     EXTREME,
     RANGE,
     deviating_windows,

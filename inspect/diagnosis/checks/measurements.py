@@ -11,8 +11,8 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import axis_name
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnosis.innovation_checks import MIN_STEPS
-from beliefscope.inspect.diagnosis.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
+from beliefscope.inspect.diagnosis.checks.innovations import MIN_STEPS
+from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
 from beliefscope.inspect.statistics.innovations import channel_names, prediction
 from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_features import Indices

@@ -9,8 +9,8 @@ import numpy as np
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnosis.label_checks import common_part, label_statistics
-from beliefscope.inspect.diagnosis.model_checks import model_statistics
+from beliefscope.inspect.diagnosis.checks.labels import common_part, label_statistics
+from beliefscope.inspect.diagnosis.checks.modules import model_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.reading_model import ReadingModel

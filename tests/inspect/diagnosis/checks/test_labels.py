@@ -13,7 +13,7 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
-from beliefscope.inspect.diagnosis.label_checks import label_statistics
+from beliefscope.inspect.diagnosis.checks.labels import label_statistics
 from beliefscope.inspect.trace import Trace, trace
 
 

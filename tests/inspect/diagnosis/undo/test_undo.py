@@ -18,13 +18,13 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics
+from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import free_motion
 from beliefscope.inspect.diagnosis.diagnose import required_profile
-from beliefscope.inspect.diagnosis.episode_statistics import episode_statistics
-from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood, recovery
-from beliefscope.inspect.diagnosis.run_inputs import RunInputs
-from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
-from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, brings_back, undo
-from beliefscope.inspect.diagnosis.vector_checks import free_motion
+from beliefscope.inspect.diagnosis.undo.confirmation import negative_log_likelihood, recovery
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.undo import BY_SUBJECT, UNDO, brings_back, undo
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all

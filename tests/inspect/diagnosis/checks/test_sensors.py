@@ -16,9 +16,9 @@ from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 from beliefscope.datasets.store import open_dataset
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.diagnosis.sensor_checks import biased_steps, localise, sensor_statistics
-from beliefscope.inspect.diagnosis.vector_checks import free_motion, impedance_statistics, saturated
-from beliefscope.inspect.diagnosis.window_checks import LENGTH, STRIDE, deviating_windows
+from beliefscope.inspect.diagnosis.checks.sensors import biased_steps, localise, sensor_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import free_motion, impedance_statistics, saturated
+from beliefscope.inspect.diagnosis.checks.windows import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
 TASKS = ("door", pytest.param("push", marks=pytest.mark.long))

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
 from beliefscope.datasets.task import axis_name
-from beliefscope.inspect.diagnosis.reading_checks import delayed_errors
-from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs, Undo
-from beliefscope.inspect.diagnosis.sensor_checks import biased_steps
-from beliefscope.inspect.diagnosis.vector_checks import (
+from beliefscope.inspect.diagnosis.checks.readings import delayed_errors
+from beliefscope.inspect.diagnosis.checks.sensors import biased_steps
+from beliefscope.inspect.diagnosis.checks.vectors import (
     CHANGE,
     FORCE,
     TORQUE,
@@ -26,6 +25,7 @@ from beliefscope.inspect.diagnosis.vector_checks import (
     in_contact,
     lever,
 )
+from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
 from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND

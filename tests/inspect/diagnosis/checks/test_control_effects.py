@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_dynamics_checks import LateCart, ParticleCart, cart
+from tests.inspect.diagnosis.checks.test_dynamics import LateCart, ParticleCart, cart
 from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart
 
 import beliefscope as bs
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnosis.control_effects import control_effects
+from beliefscope.inspect.diagnosis.checks.control_effects import control_effects
+from beliefscope.inspect.diagnosis.checks.true_starts import predictions_from_truth, some_steps
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.true_starts import predictions_from_truth, some_steps
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 

@@ -21,11 +21,11 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
-from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
-from beliefscope.inspect.diagnosis.equation_checks import equation_statistics, reported_particle_statistics
-from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
-from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
-from beliefscope.inspect.diagnosis.true_starts import with_innovations_near_truth, with_particles_near_truth
+from beliefscope.inspect.diagnosis.checks.dynamics import dynamics_statistics
+from beliefscope.inspect.diagnosis.checks.equations import equation_statistics, reported_particle_statistics
+from beliefscope.inspect.diagnosis.checks.innovations import innovation_statistics
+from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_statistics
+from beliefscope.inspect.diagnosis.checks.true_starts import with_innovations_near_truth, with_particles_near_truth
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array

@@ -11,26 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tests.inspect.diagnosis.checks.test_innovations import Boat, loaded, sail
 from tests.inspect.diagnosis.test_catalog import deviation
 from tests.inspect.diagnosis.test_external_dynamics import SENSORS, TASK, Cart, drive, loaded as of_cart, profile
-from tests.inspect.diagnosis.test_innovation_checks import Boat, loaded, sail
 
 import beliefscope as bs
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import matches
 from beliefscope.inspect.diagnosis.causes.external_filters import OF_DYNAMICS, OF_TRUE_STATES
-from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.dynamics_checks import dynamics_statistics
-from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
-from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.scoring import explain
-from beliefscope.inspect.diagnosis.true_starts import (
+from beliefscope.inspect.diagnosis.checks.dynamics import dynamics_statistics
+from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_statistics
+from beliefscope.inspect.diagnosis.checks.modules import model_statistics
+from beliefscope.inspect.diagnosis.checks.true_starts import (
     has_true_starts,
     predictions_from_truth,
     some_steps,
     with_innovations_near_truth,
 )
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.scoring import explain
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.healthy import profile_of, sensor_record
 

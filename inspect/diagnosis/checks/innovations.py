@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from beliefscope.inspect.diagnosis.vector_checks import angle_channels
+from beliefscope.inspect.diagnosis.checks.vectors import angle_channels
 from beliefscope.inspect.statistics.innovations import channel_names, innovations, prediction
 from beliefscope.inspect.statistics.measures import Array, Mask, absent, counted
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN

@@ -10,8 +10,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.cause import Cause, Recovery
-from beliefscope.inspect.diagnosis.run_inputs import Deviations, RunInputs
-from beliefscope.inspect.diagnosis.undo import undo
+from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs
+from beliefscope.inspect.diagnosis.undo.undo import undo
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import virtual_innovations
 from beliefscope.inspect.statistics.intervals import jackknife

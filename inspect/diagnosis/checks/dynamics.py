@@ -15,14 +15,14 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
-from beliefscope.inspect.diagnosis.control_effects import control_effects
-from beliefscope.inspect.diagnosis.true_starts import (
+from beliefscope.inspect.diagnosis.checks.control_effects import control_effects
+from beliefscope.inspect.diagnosis.checks.true_starts import (
     has_true_starts,
     predictions_from_truth,
     some_steps,
     uses_start,
 )
-from beliefscope.inspect.diagnosis.vector_checks import commands_hand
+from beliefscope.inspect.diagnosis.checks.vectors import commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import prediction
 from beliefscope.inspect.statistics.measures import Array, Mask

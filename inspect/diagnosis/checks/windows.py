@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.diagnosis.image_checks import image_statistics, is_usable, occluded_share
-from beliefscope.inspect.diagnosis.vector_checks import vector_statistics
+from beliefscope.inspect.diagnosis.checks.images import image_statistics, is_usable, occluded_share
+from beliefscope.inspect.diagnosis.checks.vectors import vector_statistics
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys
 from beliefscope.inspect.statistics.signals import Array
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import axis_name
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnosis.true_starts import Predictions, predictions_by_calls
-from beliefscope.inspect.diagnosis.vector_checks import commands_hand
+from beliefscope.inspect.diagnosis.checks.true_starts import Predictions, predictions_by_calls
+from beliefscope.inspect.diagnosis.checks.vectors import commands_hand
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.reading_features import monomials

@@ -11,7 +11,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
-from beliefscope.inspect.diagnosis.repair import (
+from beliefscope.inspect.diagnosis.undo.repair import (
     MAX_REPLAYS,
     Candidate,
     Candidates,

@@ -8,7 +8,7 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task, axis_name
-from beliefscope.inspect.diagnosis.vector_checks import FORCE, TORQUE, commands_hand
+from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, commands_hand
 from beliefscope.inspect.statistics.reading_features import FIRST_CHANGES
 from beliefscope.inspect.statistics.reading_model import (
     CONTROL,

@@ -14,9 +14,9 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.inspect.diagnosis.dynamics_checks import module_dynamics_statistics
-from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
-from beliefscope.inspect.diagnosis.model_checks import (
+from beliefscope.inspect.diagnosis.checks.dynamics import module_dynamics_statistics
+from beliefscope.inspect.diagnosis.checks.equations import equation_statistics
+from beliefscope.inspect.diagnosis.checks.modules import (
     likelihood_moments,
     measurement_statistics,
     model_statistics,

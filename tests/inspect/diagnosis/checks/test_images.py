@@ -8,8 +8,8 @@ from scipy import ndimage
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.diagnosis.image_checks import image_statistics, registration
-from beliefscope.inspect.diagnosis.window_checks import window_statistics
+from beliefscope.inspect.diagnosis.checks.images import image_statistics, registration
+from beliefscope.inspect.diagnosis.checks.windows import window_statistics
 from beliefscope.inspect.healthy import sensor_record
 from beliefscope.inspect.statistics.reference_images import Reference, normalised
 from beliefscope.inspect.statistics.signals import Array

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.inspect.diagnosis.test_innovation_checks import STD, Boat, loaded, run, sail, wrapped
+from tests.inspect.diagnosis.checks.test_innovations import STD, Boat, loaded, run, sail, wrapped
 
-from beliefscope.inspect.diagnosis.measurement_checks import is_of_readings, measurement_model_statistics
+from beliefscope.inspect.diagnosis.checks.measurements import is_of_readings, measurement_model_statistics
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.trace import Trace

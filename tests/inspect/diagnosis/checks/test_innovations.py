@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 import beliefscope as bs
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.checks.dynamics import external_dynamics_statistics
+from beliefscope.inspect.diagnosis.checks.innovations import innovation_statistics
+from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import stuck
 from beliefscope.inspect.diagnosis.diagnose import diagnose
-from beliefscope.inspect.diagnosis.dynamics_checks import external_dynamics_statistics
-from beliefscope.inspect.diagnosis.innovation_checks import innovation_statistics
-from beliefscope.inspect.diagnosis.measurement_checks import measurement_model_statistics
-from beliefscope.inspect.diagnosis.vector_checks import stuck
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.trace import Trace
