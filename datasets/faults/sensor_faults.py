@@ -42,6 +42,18 @@ class SensorBias(SensorFault):
 
 
 @dataclass(frozen=True)
+class SensorDrift(SensorFault):
+    """A bias that grows linearly from the fault's first step is added to all values of a sensor."""
+
+    name = "sensor_drift"
+    rate: float = number_field(0.1, "units of the sensor per second", "growth of the bias")
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        since = span.dt * (np.arange(len(readings)) - span.first)
+        return readings + self.rate * since.reshape(-1, *(1,) * (readings.ndim - 1))
+
+
+@dataclass(frozen=True)
 class SensorGain(SensorFault):
     """The values of a sensor are scaled."""
 
@@ -87,4 +99,4 @@ class SensorSwapped(SensorFault):
         return readings[..., order]
 
 
-SENSOR_FAULTS = (SensorBias, SensorGain, SensorNoise, SensorFrozen, SensorSwapped)
+SENSOR_FAULTS = (SensorBias, SensorDrift, SensorGain, SensorNoise, SensorFrozen, SensorSwapped)

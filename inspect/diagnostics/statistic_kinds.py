@@ -85,6 +85,11 @@ KINDS = {
     "reading lag": ("delay{of} behind the labels", False, 0.5),
     "reading lag scatter": ("variation between episodes of the delay{of} behind the labels", False, 0.5),
     "reading bias": ("error{of} against the value expected from the labels, relative to its noise,", False, 0.3),
+    "reading drift": (
+        "change{of} over the episode against the value expected from the labels, relative to its noise,",
+        False,
+        0.3,
+    ),
     "reading scatter": ("variation between episodes of the error{of}, relative to its noise,", False, 0.3),
     "reading gain": ("slope{of} on the value expected from the labels", False, 0.02),
     "reading noise": ("noise{of} around the value expected from the labels, relative to healthy noise,", True, 0.05),

@@ -48,11 +48,12 @@ class ComparedReadings:
         return np.where(self.model.is_angle, near, self.measured)
 
     def pairs(self, delay: int = 0) -> tuple[Array, Array]:
-        """Readings (S, A) and the readings expected ``delay`` steps earlier, of at most ``MAX_PAIRS`` steps."""
-        steps = self._steps(delay)
+        """Readings (S, A) and the readings expected ``delay`` steps earlier, of the ``steps``."""
+        steps = self.steps(delay)
         return self.readings[steps], self.expected[steps - delay]
 
-    def _steps(self, delay: int) -> Indices:
+    def steps(self, delay: int = 0) -> Indices:
+        """(S,) at most ``MAX_PAIRS`` steps with a reading, and with an expected one ``delay`` steps earlier."""
         steps = np.flatnonzero(self.present)
         steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(self.present))]
         return steps[:: 1 + len(steps) // MAX_PAIRS]
@@ -62,7 +63,7 @@ class ComparedReadings:
 
         Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
         """
-        steps = self._steps(delay)
+        steps = self.steps(delay)
         readings, expected = self.measured[steps], self.expected[steps - delay]
         if len(readings) < MIN_STEPS:
             return np.full((2, readings.shape[1], readings.shape[1]), np.nan)

@@ -238,6 +238,8 @@ def test_faults_of_any_sensor(key: str) -> None:
     is_image, last = clean.observations[key].dtype == np.uint8, readings.shape[-1]
     limited = (lambda values: np.rint(values).clip(0, 255)) if is_image else (lambda values: values)
     np.testing.assert_allclose(inject(f"sensor_bias={key}:offset=3"), limited(readings + 3.0), rtol=1e-5, atol=1e-6)
+    drift = 3.0 * TASK.dt * np.arange(len(readings)).reshape(-1, *(1,) * (readings.ndim - 1))
+    np.testing.assert_allclose(inject(f"sensor_drift={key}:rate=3"), limited(readings + drift), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(inject(f"sensor_gain={key}:factor=0.5"), limited(0.5 * readings), rtol=1e-5, atol=1e-6)
     assert (inject(f"sensor_frozen={key}:from=4")[4:] == readings[4]).all()
     noisy = inject(f"sensor_noise={key}:std=0.1")

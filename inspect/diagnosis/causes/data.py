@@ -26,7 +26,7 @@ CAUSES = (
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
         f"{OBJECT}|object match/*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*"
-        "|reading lag/*|reading bias/*|reading gain/*|reading noise/*|reading scatter/*",
+        "|reading lag/*|reading bias/*|reading drift/*|reading gain/*|reading noise/*|reading scatter/*",
         "Synchronise the clock of the motion capture with the sensors.",
         "advance labels",
     ),
@@ -39,7 +39,7 @@ CAUSES = (
             Symptom("module bias/*", 0, 0.3, "common"),
         ),
         f"object match/*|contact distance error/*|contact distance scatter/*|{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}"
-        "|reading bias/*",
+        "|reading bias/*|reading drift/*",
         "Register the frame of the motion capture with the robot's.",
         "shift labels",
     ),

@@ -87,7 +87,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         Cause(
             "control.bias",
             "Controls biased",
-            (Symptom("reading bias/control*", 0),),
+            (Symptom("reading bias/control*|reading drift/control*", 0),),
             changed,
             "Calibrate the zero of the controls.",
         ),

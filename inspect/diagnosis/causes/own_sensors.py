@@ -20,7 +20,7 @@ KNOWN = ("image", "force", "torque", "effector_position", "contact")
 SYNCHRONISE = "Synchronise the clocks of the sensors."
 """Next action of a delay."""
 
-BIASED = ("level", "drift", "saturation", "contact lag", "reading bias")
+BIASED = ("level", "drift", "saturation", "contact lag", "reading bias", "reading drift")
 """Kinds of statistics of vector sensors that a bias changes."""
 
 DELAYED = (
@@ -38,6 +38,12 @@ DELAYED = (
 
 CONNECTION = "Check the connection of the sensor and the load of the computer that receives its messages."
 """Next action of lost readings."""
+
+WARM = "Let the sensor warm up and tare it before each episode."
+"""Next action of a drift."""
+
+GROWS = 0.25
+"""Prior of a drift: it is also a bias in the mean."""
 
 VECTOR = (
     ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
@@ -92,7 +98,7 @@ def _patterns(key: str, *kinds: str) -> str:
 
 
 def _changed_readings(key: str, modality: str) -> list[Cause]:
-    """Noise, bias and gain of a vector sensor. A gain changes size and noise alike, noise their ratio.
+    """Noise, bias, drift and gain of a vector sensor. A gain changes size and noise alike, noise their ratio.
 
     A bias of a part of an episode adds to the noise around the mean error.
     """
@@ -101,12 +107,14 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     scaled = of(*BIASED, *delays, "change", "size", "noise", "reading noise", "reading scatter")
     noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
+    drift = (Symptom(of("reading drift"), 0),)
     slope = (Symptom(of("reading gain"), 0),)
     gain = (Symptom(of("size"), 0, otherwise=slope), Symptom(of("noise"), 0, otherwise=slope))
-    rough = f"{scaled}|{of('roughness', 'stuck')}"
+    rough = f"{scaled}|{of('roughness')}"
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor.", ""),
         ("bias", "biased", bias, of(*BIASED, *delays), "Tare the sensor.", f"tare {key}|"),
+        ("drift", "drifting", drift, of(*BIASED, *delays), WARM, f"detrend {key}|"),
         ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor.", f"scale {key}|"),
     )
     return [
@@ -117,7 +125,9 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             f"{changed}|{_downstream(modality)}",
             action,
             f"{undo}drop {modality}",
-            raises=of("reading noise") if mechanism == "bias" else "",
+            lowers=of("stuck") if mechanism == "noise" else "",
+            raises=of("reading noise", "noise") if mechanism in ("bias", "drift") else "",
+            prior=GROWS if mechanism == "drift" else 0.0,
         )
         for mechanism, words, symptoms, changed, action, undo in entries
     ]

@@ -31,6 +31,9 @@ SURELY = 4.0
 BLOCKS = 10
 """Number of parts of an episode that are taken as independent of each other."""
 
+EDGES = 151
+"""Number of steps, evenly spaced, at which a bias may begin or end."""
+
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
 
@@ -55,8 +58,9 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     """Of each channel that the labels explain, against its expected readings.
 
     ``reading lag``: steps by which the readings of a sensor follow the expected ones; of a short delay, also fractions.
-    The others are those at this lag. ``reading bias``: mean error relative to the noise. ``reading gain``: slope of the
-    readings on the expected ones. ``reading noise``: standard deviation from this line, relative to the noise.
+    The others are those at this lag. ``reading bias``: mean error relative to the noise. ``reading drift``: change of
+    the error over the episode, likewise. ``reading gain``: slope of the readings on the expected ones. ``reading
+    noise``: standard deviation from this line, relative to the noise.
     ``inverted``: half the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then
     fit (``FITS``). ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged,
     whatever their signs, for the best other channel.
@@ -69,7 +73,8 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         delay, errors = delayed_errors(compared, episode.dt)
         is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())  # sign and order
         values[f"reading lag/{model.key}/all"] = _short_delay(compared) if delay == 0.0 and is_own else delay
-        line = _line(*compared.pairs(0 if np.isnan(delay) else int(delay)), model.gain_spreads)
+        whole = 0 if np.isnan(delay) else int(delay)
+        line = _line(*compared.pairs(whole), compared.steps(whole) / len(episode), model.gain_spreads)
         least = errors.min(0)
         own = np.diagonal(least)
         exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
@@ -78,6 +83,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
             values[f"reading bias/{axis}/all"] = float(line["bias"][i] / model.noise[i])
+            values[f"reading drift/{axis}/all"] = float(line["drift"][i] / model.noise[i])
             values[f"reading gain/{axis}/all"] = float(line["gain"][i])
             values[f"reading noise/{axis}/all"] = float(line["noise"][i] / model.noise[i])
             values[f"inverted/{axis}/all"] = float(inverted[i])
@@ -100,16 +106,19 @@ def _short_delay(compared: ComparedReadings) -> float:
     return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
 
 
-def _line(readings: Array, expected: Array, spread: Array) -> dict[str, Array]:
-    """``bias``, ``gain`` and ``noise`` (A,) of readings (S, A): a line through the expected ones, and what it leaves.
+def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict[str, Array]:
+    """``bias``, ``drift``, ``gain`` and ``noise`` (A,) of readings (S, A) at times (S,), from 0 to 1 over the episode.
 
-    NaN for too few steps. Noise changes slopes as well: gains are shrunk towards 1 if their standard errors exceed the
-    spread (A,) of healthy ones, but little if they differ from 1 by far more than ``SURELY`` of them (positive-part
-    James-Stein estimator). The noise is that before the gain.
+    They are those of a line through the expected readings, and, if there is a drift, the times; NaN for too few steps.
+    Noise changes slopes as well: gains are shrunk towards 1 if their standard errors exceed the spread (A,) of healthy
+    ones, but little if they differ from 1 by far more than ``SURELY`` of them (positive-part James-Stein estimator).
+    The noise is that before the gain.
     """
     if len(readings) < MIN_STEPS:
-        return dict.fromkeys(("bias", "gain", "noise"), np.full(readings.shape[1], np.nan))
+        return dict.fromkeys(("bias", "drift", "gain", "noise"), np.full(readings.shape[1], np.nan))
     x, y = expected - expected.mean(0), readings - readings.mean(0)
+    drift, drifted = _drift(x, y - x, times - times.mean())
+    y = y - drifted
     power = np.maximum(np.square(x).sum(0), 1e-24)
     slope = (x * y).sum(0) / power
     rest = np.sqrt(np.square(y - slope * x).mean(0))
@@ -117,7 +126,42 @@ def _line(readings: Array, expected: Array, spread: Array) -> dict[str, Array]:
     sure = 1.0 - np.square(SURELY * error / np.maximum(np.abs(slope - 1.0), 1e-12))
     share = np.maximum(np.minimum(np.square(spread / error), 1.0), sure)
     before = np.where(sure > 0.0, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
-    return {"bias": (readings - expected).mean(0), "gain": 1.0 + share * (slope - 1.0), "noise": rest / before}
+    bias, gain = (readings - expected).mean(0), 1.0 + share * (slope - 1.0)
+    return {"bias": bias, "drift": drift, "gain": gain, "noise": rest / before}
+
+
+def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
+    """(A,) slope of errors (S, A) with a mean of 0 by the times (S,), and the part (S, A) that is a drift or a bias.
+
+    A gain and a bias in an interval also change errors over time. The slope is shrunk by the ratio of the squares that
+    the better of these leaves to those that a line leaves. The part is that of the line or of the interval, if it
+    leaves least of the three.
+    """
+    time = times[:, None]
+    power = np.square(errors).sum(0)
+    slope = (time * errors).sum(0) / np.square(time).sum()
+    interval = _interval_means(errors)
+    gain = expected * ((expected * errors).sum(0) / np.maximum(np.square(expected).sum(0), 1e-24))
+    fits = slope * time, interval, gain
+    left = [np.maximum(np.square(errors - fit).sum(0), 1e-9 * power + 1e-24) for fit in fits]
+    least = np.argmin(left, axis=0)
+    part = np.where(least == 0, slope * time, np.where(least == 1, interval, 0.0))
+    return slope * np.minimum(np.minimum(left[1], left[2]) / left[0], 1.0), part
+
+
+def _interval_means(errors: Array) -> Array:
+    """(S, A) means inside and outside of the interval that explain most of errors (S, A) with a mean of 0."""
+    count = len(errors)
+    edges = np.unique(np.linspace(0, count, EDGES).astype(int))
+    sums = np.concatenate([np.zeros((1, errors.shape[1])), errors.cumsum(0)])[edges]
+    first, last = np.triu_indices(len(edges), 1)
+    inside = edges[last] - edges[first]
+    outside = np.maximum(count - inside, 1)  # the sum of all is 0
+    total = sums[last] - sums[first]
+    best = (np.square(total) / (inside * outside)[:, None]).argmax(0)
+    steps, total = np.arange(count)[:, None], np.take_along_axis(total, best[None], 0)
+    is_inside = (steps >= edges[first[best]]) & (steps < edges[last[best]])
+    return np.where(is_inside, total / inside[best], -total / outside[best])
 
 
 def _clustered(terms: Array) -> Array:

@@ -373,13 +373,15 @@ def _moving(episode: Episode) -> Mask:
 
 
 def saturated(values: Array) -> Mask:
-    """(T,): readings at the largest magnitude of the axis, if it is reached more than once.
+    """(T,): readings at the largest magnitude, the smallest or the largest value, each if reached more than once.
 
     A single stretch of equal readings is a stuck axis.
     """
-    size = np.abs(values)
-    at = size == size.max(initial=0.0)
-    return at if np.diff(at, prepend=False).sum() > 2 else np.zeros(len(values), dtype=bool)
+    result = np.zeros(len(values), dtype=bool)
+    for series in (np.abs(values), values, -values) if len(values) else ():
+        at = series == series.max()
+        result |= at & (np.diff(at, prepend=False).sum() > 2)
+    return result
 
 
 def axis_index(axis: str) -> int:

@@ -171,6 +171,26 @@ def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
     return _with_readings(inputs, key, unbiased)
 
 
+def detrend(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
+    """Readings without the line over time that fits their errors from the expected ones in all affected episodes."""
+    if (model := _reading_model(key, inputs)) is None:
+        return None
+    compared = [model.compare(inputs.episodes[index]) for index in inputs.affected]
+    steps = np.concatenate([one.steps() for one in compared])
+    errors = np.concatenate([np.subtract(*one.pairs()) for one in compared])
+    if len(steps) < MIN_STEPS:
+        return None
+    (slope, offset), channels = np.polyfit(steps, errors, 1), list(model.channels)
+
+    def restored(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
+        result = values.copy()
+        own = values[:, channels] - offset - slope * np.arange(len(values))[:, None]
+        result[:, channels] = np.where(model.is_angle, wrapped(own), own)
+        return result
+
+    return _with_readings(inputs, key, restored)
+
+
 def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings without their mean error from the expected ones, and divided by their slope on these."""
 

@@ -24,7 +24,7 @@ from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
-from beliefscope.inspect.diagnosis.undo.readings import READINGS, advance, rearrange, scale, tare
+from beliefscope.inspect.diagnosis.undo.readings import READINGS, advance, detrend, rearrange, scale, tare
 from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo, without_sensor
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
@@ -284,6 +284,7 @@ BY_SUBJECT: dict[str, Callable[[str, RunInputs, Deviations], RunInputs | None]] 
     "rearrange": rearrange,
     "scale": scale,
     "tare": tare,
+    "detrend": detrend,
 }
 """Interventions that are followed by a modality or sensor."""
 

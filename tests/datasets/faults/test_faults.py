@@ -43,7 +43,7 @@ AFFECTED = {
     "force_gain": {"force"},
     "force_axes": {"force"},
     "contact_stuck": {"contact"},
-    **{f"sensor_{name}=torque": {"torque"} for name in ("bias", "gain", "noise", "frozen", "swapped")},
+    **{f"sensor_{name}=torque": {"torque"} for name in ("bias", "drift", "gain", "noise", "frozen", "swapped")},
     "control_delay": set(),
     "control_scale": set(),
 } | {name: {"image"} for name in FAULTS if name.startswith("image_")}

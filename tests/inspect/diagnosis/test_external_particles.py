@@ -255,7 +255,7 @@ def test_built_in_tasks_have_the_causes_of_the_catalog() -> None:
     for name in ("door", "push-field", "door-field"):
         assert causes_of(load_task(name)) == CAUSES
     own = {cause.name for cause in causes_of(TASK)} - {cause.name for cause in CAUSES}
-    mechanisms = ("stuck", "noise", "saturation", "bias", "gain", "delay", "sign")
+    mechanisms = ("stuck", "noise", "saturation", "bias", "drift", "gain", "delay", "sign")
     models = [f"model.{k}.{m}" for k in STD for m in ("bias", "overconfident", "underconfident", "broken")]
     sensors = [f"{key}.{mechanism}" for key in STD for mechanism in mechanisms]
     assert own == {

@@ -179,6 +179,7 @@ STILL = as_external(still, "still", WRENCH)
         ("sensor_gain=wrench:factor=0.5", "wrench.gain"),
         ("sensor_noise=wrench:std=1", "wrench.noise"),
         ("sensor_bias=wrench:offset=0.02", "wrench.bias"),
+        ("sensor_drift=wrench:rate=0.02", "wrench.drift"),
         ("sensor_gain=wrench:factor=-1", "wrench.sign"),
         ("sensor_swapped=wrench", "wrench.axes"),
         ("delay=haptics:steps=3", "wrench.delay"),
@@ -219,9 +220,13 @@ def test_wrong_channels_are_put_back() -> None:
 
 @pytest.mark.parametrize(
     ("name", "fault", "tolerance"),
-    [("tare wrench", "sensor_bias=wrench:offset=3", 0.2), ("scale wrench", "sensor_gain=wrench:factor=3", 0.2)],
+    [
+        ("tare wrench", "sensor_bias=wrench:offset=3", 0.2),
+        ("detrend wrench", "sensor_drift=wrench:rate=3", 0.2),
+        ("scale wrench", "sensor_gain=wrench:factor=3", 0.2),
+    ],
 )
-def test_biases_and_gains_are_undone_by_the_expected_readings(name: str, fault: str, tolerance: float) -> None:
+def test_biases_drifts_and_gains_are_undone_by_the_expected_readings(name: str, fault: str, tolerance: float) -> None:
     """Up to the mean error of an episode, in standard deviations of the readings; other episodes stay as they are."""
     profile = HealthyProfile("peg", len(record().rows), None, {}, record().reference, record().readings)
     episode = slide(50)

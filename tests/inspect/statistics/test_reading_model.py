@@ -140,6 +140,24 @@ def test_wrong_channels_show_in_their_own_statistics_only() -> None:
     assert biased["reading bias/gps x/all"] - clean["reading bias/gps x/all"] == pytest.approx(1.0, abs=1e-4)
 
 
+def test_a_drift_is_neither_a_gain_nor_noise_nor_a_bias_of_an_interval() -> None:
+    """It grows over the episode; a gain and an interval leave little of the slope over time that they cause."""
+    gps, noise = NEW.observations["gps"], models()[0].noise
+    times = np.arange(STEPS)[:, None] / STEPS
+
+    def of(readings: np.ndarray) -> dict[str, float]:
+        values = reading_statistics(with_readings(NEW, "gps", readings), models())
+        return {kind: values[f"reading {kind}/gps x/all"] for kind in ("bias", "drift", "gain", "noise")}
+
+    clean, drifting = of(gps), of(gps + 40.0 * noise * times)
+    assert drifting["drift"] - clean["drift"] == pytest.approx(40.0, abs=2.0)
+    assert drifting["bias"] - clean["bias"] == pytest.approx(20.0, abs=0.5), "its mean"
+    assert (drifting["gain"], drifting["noise"]) == pytest.approx((clean["gain"], clean["noise"]), abs=0.1)
+    assert abs(of(1.2 * gps)["drift"]) < 1.0 < 0.15 / noise[0], "the gain adds 0.15 m and more"
+    interval = (times > 0.5) & (times < 0.7)
+    assert abs(of(gps + 40.0 * noise * interval)["drift"]) < 2.0
+
+
 def test_absent_readings_do_not_count() -> None:
     task = replace(PLANE, masks={"gps": "fix"}, covariates={"contact": CONTACT, "fix": CONTACT})
     fix = (np.arange(STEPS) % 3 == 0).astype(np.float32)

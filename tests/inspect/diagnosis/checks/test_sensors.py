@@ -178,10 +178,12 @@ def test_other_statistics_do_not_change(task: str, faults: str, own: str) -> Non
             assert faulty[name] == pytest.approx(value, rel=1e-3, abs=2e-2, nan_ok=True), name
 
 
-def test_a_single_stretch_of_equal_readings_is_not_saturated() -> None:
+def test_saturated_readings_repeat_a_limit_in_several_stretches() -> None:
     stuck, limited = np.array([0.0, 1.0, 2.0, 2.0, 2.0]), np.array([0.0, 2.0, 2.0, 1.0, -2.0, 0.0])
     assert not saturated(stuck).any()
     np.testing.assert_array_equal(np.flatnonzero(saturated(limited)), [1, 2, 4])
+    np.testing.assert_array_equal(np.flatnonzero(saturated(np.array([2.0, 1.0, 3.0, 1.0, 1.0]))), [1, 3, 4])
+    assert not saturated(np.zeros(0)).any()
 
 
 def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[str, float]:
