@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from beliefscope.datasets import rotations
 from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.ingredient import Ingredient
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.text import capitalised
@@ -150,20 +151,6 @@ class MainError:
     def text(self, value: float, digits: int = 2) -> str:
         """A value as displayed: ``1.25 cm``."""
         return f"{self.factor * value:.{digits}f} {self.unit}".rstrip()
-
-
-@dataclass(frozen=True)
-class Ingredient:
-    """A source of variation between the episodes of a simulated task, which can be switched off.
-
-    Attributes:
-        meaning: one line, with units. ranges: parameter -> smallest and largest value, drawn uniformly per episode.
-        units: parameter -> SI unit; others have none. Data files do not contain them.
-    """
-
-    meaning: str
-    ranges: Mapping[str, tuple[float, float]]
-    units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
 
 def _in_metres(components: Iterable[Component]) -> tuple[Component, ...]:
@@ -339,6 +326,13 @@ class Task:
         for where in self.rotations:
             change[..., where] = rotations.difference(states[..., where], reference[..., where])
         return change
+
+    def moved(self, states: NDArray[Any], change: NDArray[Any]) -> Array:
+        """(..., n) states whose ``difference`` from these is the change; angles are not wrapped."""
+        result = np.array(states + change, dtype=np.float64)
+        for where in self.rotations:
+            result[..., where] = rotations.add(states[..., where], change[..., where])
+        return result
 
     def near(self, states: NDArray[Any], reference: NDArray[Any]) -> NDArray[Any]:
         """States (..., n) to display beside a reference: angles of the same turn, rotation vectors plus the difference.

@@ -14,8 +14,9 @@ import numpy as np
 
 from beliefscope.datasets.covariate import CONTACT, Covariate, Kind
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.ingredient import Ingredient
 from beliefscope.datasets.simulation.camera import Camera
-from beliefscope.datasets.task import Component, Ingredient, Task
+from beliefscope.datasets.task import Component, Task
 from beliefscope.datasets.text import plural
 
 FUNCTIONS = ("replay", "outline", "ridge_direction", "simulate")

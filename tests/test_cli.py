@@ -17,7 +17,7 @@ import pytest
 from beliefscope.app.cli.main import COMMANDS, cli, command_group, main
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.conclusion import command_line
+from beliefscope.inspect.diagnosis.next_action import command_line
 
 pytestmark = pytest.mark.slow
 

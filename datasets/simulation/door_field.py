@@ -11,6 +11,7 @@ from numpy.random import Generator
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.ingredient import Ingredient
 from beliefscope.datasets.simulation.door import CAMERA, DOOR, IMPEDANCE, door_model, draw_door, policy_name
 from beliefscope.datasets.simulation.door_physics import MAX_ANGLE, DoorPhysics
 from beliefscope.datasets.simulation.door_policies import POLICIES, AimError
@@ -27,7 +28,6 @@ from beliefscope.datasets.simulation.ingredients import (
     wrist,
 )
 from beliefscope.datasets.simulation.simulate import DT, Scene, first_free_start, simulate
-from beliefscope.datasets.task import Ingredient
 
 NUDGE_STEPS = 5  # duration of a nudge
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults import faults, image_faults
 from beliefscope.datasets.faults.fault import Fault
+from beliefscope.datasets.ingredient import Ingredient
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.panda import Sleeve
 from beliefscope.datasets.simulation.simulate import FORCE_BITS, POSITION_BITS, TORQUE_BITS, quantise
-from beliefscope.datasets.task import Ingredient, Task
+from beliefscope.datasets.task import Task
 
 Values = Mapping[str, Any]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.ingredient import Ingredient
 from beliefscope.datasets.simulation.ingredients import (
     SENSOR_INGREDIENTS,
     Draws,
@@ -44,7 +45,7 @@ from beliefscope.datasets.simulation.simulate import (
     first_free_start,
     simulate,
 )
-from beliefscope.datasets.task import Ingredient, Task
+from beliefscope.datasets.task import Task
 
 Vector = NDArray[np.float64]
 Physics = TypeVar("Physics", PuckPhysics, BlockPhysics)

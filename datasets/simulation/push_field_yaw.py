@@ -11,6 +11,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.ingredient import Ingredient
 from beliefscope.datasets.simulation.ingredients import draw, start_ingredient
 from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.push import HEIGHT, BlockPhysics, push_model
@@ -23,7 +24,7 @@ from beliefscope.datasets.simulation.push_field import (
     simulate_draws,
 )
 from beliefscope.datasets.simulation.simulate import first_free_start
-from beliefscope.datasets.task import Component, Ingredient
+from beliefscope.datasets.task import Component
 
 BLOCK = BlockPhysics()
 QUATERNION = slice(PUCK.stop + 1, PUCK.stop + 5)

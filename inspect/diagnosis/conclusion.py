@@ -9,15 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.task import display_name
-from beliefscope.datasets.text import capitalised
-from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.external.unavailable import UnavailableFilter
-from beliefscope.filters.finetuning.external import has_loss
-from beliefscope.filters.names import PRETRAINED, is_code
-from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnosis.case import (
     ALARM_RATE,
     Case,
@@ -31,7 +24,6 @@ from beliefscope.inspect.diagnosis.cause import (
     SHOWN,
     Candidate,
     Cause,
-    Command,
     Diagnosis,
     Evidence,
     matches,
@@ -41,6 +33,7 @@ from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
 from beliefscope.inspect.diagnosis.checks.sensors import covers_episode
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
+from beliefscope.inspect.diagnosis.next_action import CONVENTIONS, is_unused, next_action, search_action
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnosis.wrong_noise import too_small
@@ -71,8 +64,6 @@ WRONG_NEES = 10.0
 
 LENGTHS = 1.5
 """Largest ratio of the number of steps of an episode to those of the record that is not mentioned."""
-
-CONVENTIONS = "test the signs, scales and axes of its inputs: diagnostic Conventions of the inputs"
 
 
 def healthy(case: Case) -> Diagnosis:
@@ -198,10 +189,12 @@ def conclude(
     candidates = tuple(_candidate(affected, by_name[name], p, (effects or {}).get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    is_effect_known = effects is not None or (sure and is_unused(candidates[0].cause, case.inputs.checkpoint))
+    unused = sure and is_unused(candidates[0].cause, case.inputs.checkpoint)
+    is_effect_known = effects is not None or unused
     effect = (effects or {}).get(candidates[0].cause.name) if sure else None
     masked = is_effect_known and not is_visible(case.by_statistic, effect)
-    headline = _headline(affected, candidates, masked, len(case.rows))
+    is_known = unused or (effect is not None and effect.shows_healthy_run)
+    headline = _headline(affected, candidates, masked, len(case.rows), is_known)
     if candidates and effects is not None and isinstance(case.inputs.checkpoint, ExternalFilter):
         where = error_condition(affected.traces, case.inputs.checkpoint, candidates[0].cause)
         candidates = (replace(candidates[0], next=f"{candidates[0].next} {where}".strip()), *candidates[1:])
@@ -223,59 +216,6 @@ def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | No
     )
 
 
-def next_action(cause: Cause, checkpoint: Checkpoint) -> str:
-    """The next action of a cause; none for the filter if the cause is in a sensor that it does not use."""
-    if is_unused(cause, checkpoint):
-        sensor = display_name(cause.component)
-        return f"This filter does not use the {sensor} sensor and is unaffected; repair the sensor for other filters."
-    if cause.command is None:
-        return cause.next
-    if isinstance(checkpoint, ExternalFilter) and not (cause.command.name == "finetune" and _is_trainable(checkpoint)):
-        return cause.by_hand
-    return f"{cause.next}: `{command_line(cause.command, checkpoint)}`."
-
-
-def command_line(command: Command, checkpoint: Checkpoint) -> str:
-    """The command with its task, filter and data."""
-    words = [f"beliefscope {command.name} {checkpoint.task.name} --filter {_argument(checkpoint)}"]
-    if command.train and not isinstance(checkpoint, ExternalFilter):  # its loss selects what is trained
-        words.append(f"--train {command.train}")
-    words.append(command.options)
-    if "--data" not in command.options:
-        words.append(_data(checkpoint))
-    if command.name == "finetune":
-        words.append("-o tuned.safetensors")
-    return " ".join(filter(None, words))
-
-
-def _is_trainable(checkpoint: ExternalFilter) -> bool:
-    """Whether the filter has parameters and, if its file is known, a loss in it."""
-    source = checkpoint.source
-    if isinstance(checkpoint, UnavailableFilter) or (is_code(source) and not has_loss(source)):
-        return False
-    return any(True for _ in getattr(checkpoint.adapter.module, "parameters", tuple)())
-
-
-def _argument(checkpoint: Checkpoint) -> str:
-    """A checkpoint as the value of ``--filter``: the name of a pretrained one, else that of its file, or its source."""
-    if isinstance(checkpoint, ExternalFilter):
-        return checkpoint.source if ":" in checkpoint.source else "FILE.py:FUNCTION"  # of a filter of Python
-    path = checkpoint.path
-    return checkpoint.name if path is None or path.parent.resolve() == PRETRAINED.resolve() else path.name
-
-
-def _data(checkpoint: Checkpoint) -> str:
-    """The option for the data in a command; empty for a task with a sample set, which is the default."""
-    return "" if checkpoint.task.name in TASKS else "--data DATA"
-
-
-def is_unused(cause: Cause, checkpoint: Checkpoint) -> bool:
-    """Whether a cause is in a sensor that a filter does not use, neither as a modality nor in the controls."""
-    modality = next((m for m, keys in checkpoint.task.modalities.items() if cause.component in (m, *keys)), None)
-    changes_controls = matches(cause.consequences, "dynamics error//all")
-    return modality is not None and not changes_controls and modality not in modalities_of(checkpoint)
-
-
 def _evidence(case: Case, deviation: Deviation) -> Evidence:
     """A deviation and the episode that shows it most."""
     distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.grouped]
@@ -286,11 +226,15 @@ def _evidence(case: Case, deviation: Deviation) -> Evidence:
     return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step, time)
 
 
-def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int) -> str:
+def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int, is_known: bool) -> str:
     """The first cause, or two, with their probability; two that cannot be separated; or the largest deviation.
 
     Of deviations, those of the readings come first, as others follow from them. It names the next action unless the
-    first cause is sure. count: number of all episodes.
+    first cause is sure.
+
+    Args:
+        count: number of all episodes.
+        is_known: whether the same episodes without the fault are known, or the filter does not use the sensor.
     """
     if not candidates or not candidates[0].evidence or candidates[0].probability < SHOWN:
         sure = bool(candidates) and candidates[0].probability >= SURE
@@ -314,25 +258,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
         text += f"; and {_lower(second.cause.title)}, probability {probability_text(second.probability)}"
     if masked:
-        text += "; the filter is unaffected"
+        text += "; the filter is unaffected" if is_known else "; the errors of the filter are in the healthy range"
     return text if first.probability >= SURE else f"{text}; try: {first.next}"
-
-
-def search_action(checkpoint: Checkpoint, count: int, reports: bool = True) -> str:
-    """The next action without a probable cause.
-
-    count: number of all episodes. reports: whether the filter reports innovations or particles.
-    """
-    if count == 1:
-        return "Diagnose more episodes, such as all held-out ones."
-    external = isinstance(checkpoint, ExternalFilter)
-    if isinstance(checkpoint, UnavailableFilter):
-        return "Diagnose the filter itself, as an external filter (docs/own_filter.md), which shows its equations."
-    start = f"{capitalised(CONVENTIONS)}, or search" if external else "Search"
-    if external and not reports:
-        start = f"Return its predictions and innovations, which show faults of its equations, {CONVENTIONS}, or search"
-    command = command_line(Command("slices"), checkpoint)
-    return f"{start} for data slices with large errors, in the tab Failures or with `{command}`."
 
 
 def _lower(title: str) -> str:

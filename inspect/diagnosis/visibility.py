@@ -45,6 +45,17 @@ class Effect:
         """Whether errors are clearly larger after undoing the cause, which does not show the run without it."""
         return any(ratio < 1.0 / VISIBLE_ERROR for name, ratio in self.ratios.items() if name != NEES)
 
+    @property
+    def is_large(self) -> bool:
+        """Whether errors or, without the fault known, the NEES change by their limits."""
+        return any(_large(name, ratio) for name, ratio in self.ratios.items() if self.complete or name != NEES)
+
+    @property
+    def shows_healthy_run(self) -> bool:
+        """Whether the run without the fault is known: the undo is complete, or removing the sensor changes nothing."""
+        unused = bool(self.ratios) and all(1.0 / UNUSED < ratio < UNUSED for ratio in self.ratios.values())
+        return not self.failed and (self.complete or unused)
+
 
 def effect_ratios(before: Sequence[Trace], after: Sequence[Trace]) -> dict[str, float]:
     """Ratios of the root mean square errors by unit, and of the mean NEES, over the counted steps of all episodes.
@@ -80,12 +91,9 @@ def is_visible(deviations: Mapping[str, Deviation], effect: Effect | None) -> bo
         deviations: by statistic.
         effect: of undoing the fault; None if it was not undone.
     """
-    explained = False
-    if effect is not None and not effect.failed:
-        if any(_large(name, ratio) for name, ratio in effect.ratios.items() if effect.complete or name != NEES):
-            return True
-        unused = bool(effect.ratios) and all(1.0 / UNUSED < ratio < UNUSED for ratio in effect.ratios.values())
-        explained = effect.complete or unused
+    if effect is not None and not effect.failed and effect.is_large:
+        return True
+    explained = effect is not None and effect.shows_healthy_run
     return any(
         _large(name, d.value / d.healthy) and (d.alarm if explained else not d.low <= d.value <= d.high)
         for name, d in deviations.items()

@@ -52,8 +52,6 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         return f"filter {trace.filter} does not report covariances of its predictions and estimates"
     if not takes_start(checkpoint.adapter.module):
         return f"filter {trace.filter} does not start each call at a given belief"
-    if trace.task.rotations:
-        return "derivatives by rotations are not supported"
     return None
 
 
@@ -134,7 +132,7 @@ class RepeatedSteps:
         grown = np.concatenate([none, none[1:], unit, unit.sum(0, keepdims=True)])[:beliefs]
         grown = grown * np.sqrt(self.growth)[:, None]
         start = Gaussian(
-            torch.from_numpy((before[:, None] + shifts).reshape(-1, n)),
+            torch.from_numpy(self.task.moved(before[:, None], shifts).reshape(-1, n)),
             torch.from_numpy((covariance[:, None] + grown[..., None] * grown[..., None, :]).reshape(-1, n, n)),
         )
         episodes = [trace.episode.part(step + 1 - calls, step + 1) for step in steps for _ in range(shifts.shape[1])]

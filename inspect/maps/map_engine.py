@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beliefscope.datasets import rotations
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
@@ -302,11 +301,10 @@ class MapEngine:
         assert isinstance(self.checkpoint, ExternalFilter)
         ix, iy = plane.along
         x, y = plane.offsets(size)
-        states = np.tile(middle, (len(y), size, 1))
-        states[..., ix] += x
-        states[..., iy] += y[:, None]
-        for where in self.task.rotations:  # the axes of the map are body axes at its centre
-            states[..., where] = rotations.add(middle[where], states[..., where] - middle[where])
+        offsets = np.zeros((len(y), size, len(middle)))
+        offsets[..., ix] += x
+        offsets[..., iy] += y[:, None]
+        states = self.task.moved(middle, offsets)  # the axes of the map are body axes at its centre
         cells, count = states.reshape(-1, states.shape[-1]).astype(np.float32), len(self.trace.modalities)
         values = log_likelihood(self.checkpoint, self.trace.episode, step, cells, count)
         return values.reshape(-1, len(y), size)

@@ -125,7 +125,7 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         WEIGHTS,
         *([_wrong_sign(tuple(task.modalities))] if len(task.modalities) > 1 else []),
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
-        *(cause for modality in task.modalities for cause in _of_updates(modality)),
+        *(cause for modality in task.modalities for cause in _of_updates(modality, tuple(task.modalities))),
     )
 
 
@@ -169,13 +169,14 @@ def _with_true_starts(cause: Cause) -> Cause:
 
 
 def _in_predictions_of_run(cause: Cause) -> Cause:
+    others = f"{DYNAMICS}|process noise/*|measurement function/*"
     changed = {
+        "weights": f"{others}|correction slope/*|covariance update/*",
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
         "process_noise": _dynamics("bias", "error", "offset", "scatter", "spread"),
         "measurement_noise": f"{DYNAMICS}|process noise/*",
         "measurement": f"{_dynamics('bias', 'error', 'nis', 'offset', 'scatter', 'slope', 'spread')}|process noise/*",
     }
-    others = f"{DYNAMICS}|process noise/*|measurement function/*"
     # The labels are compared with updates of the belief, which mean nothing once the filter has lost the state.
     consequences = f"{cause.consequences}|{changed.get(cause.name.partition('.')[0], others)}|{LABELS}"
     # Predicted changes that are too small, such as those of a shorter time step, add too little noise as well.
@@ -253,9 +254,13 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
     )
 
 
-def _of_updates(modality: str) -> tuple[Cause, ...]:
-    """Causes in the updates with a modality: their innovations, gains and steps."""
+def _of_updates(modality: str, modalities: Sequence[str]) -> tuple[Cause, ...]:
+    """Causes in the updates with a modality: their innovations, gains and steps.
+
+    Without updates its innovations agree with their covariance, which grows; a correct gate rejects those that do not.
+    """
     name = display_name(modality)
+    others = "|".join(f"nis/{other}/*" for other in modalities if other != modality)
     return (
         Cause(
             f"updates.{modality}.gain",
@@ -283,8 +288,9 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"updates.{modality}.missing",
             f"Updates with {name} missing",
             (Symptom(f"updates/{modality}/*", -1),),
-            f"covariance update/*|measurement noise//*|{FILTER}",
+            f"covariance update/*|measurement noise//*|{FILTER.replace('nis/*', others)}",
             "Check the gate of the filter, and when it updates.",
+            lowers=f"nis/{modality}/*",
         ),
         Cause(
             f"updates.{modality}.absent",

@@ -57,6 +57,13 @@ CAUSES = (
         "Multiply the particle weights by the likelihood of every measurement model.",
     ),
     Cause(
+        "weights.repeats_likelihood",
+        "Particle weights count a likelihood more than once",
+        (Symptom("likelihood share/*", 1),),
+        FILTER,
+        "Multiply the particle weights once by the likelihood of every measurement model.",
+    ),
+    Cause(
         "fusion.shared_prior",
         "Prior counted more than once in the fusion",
         (Symptom("fusion mean/*", 1),),

@@ -39,6 +39,9 @@ DELAYED = (
 CONNECTION = "Check the connection of the sensor and the load of the computer that receives its messages."
 """Next action of lost readings."""
 
+TARE = "Tare the sensor, or register the frame of the labels with it: only other sensors tell which of them is wrong."
+"""Next action of a bias."""
+
 WARM = "Let the sensor warm up and tare it before each episode."
 """Next action of a drift."""
 
@@ -113,7 +116,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     rough = f"{scaled}|{of('roughness')}"
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor.", ""),
-        ("bias", "biased", bias, of(*BIASED, *delays), "Tare the sensor.", f"tare {key}|"),
+        ("bias", "biased", bias, of(*BIASED, *delays), TARE, f"tare {key}|"),
         ("drift", "drifting", drift, of(*BIASED, *delays), WARM, f"detrend {key}|"),
         ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor.", f"scale {key}|"),
     )

@@ -37,7 +37,8 @@ CAUSES = (
         "Resampling biased: offspring is not proportional to the weights",
         (Symptom("offspring/*", 1), Symptom("ancestors/*", 1, 0.5)),
         FILTER,
-        "Check the implementation of the resampling.",
+        "Check the implementation of the resampling: the ancestors, and that the weights after it are theirs.",
         "restore equations",
+        lowers="prior ess/*",
     ),
 )

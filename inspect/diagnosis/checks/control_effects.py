@@ -20,6 +20,9 @@ LEAST = 10
 LARGEST_STD = 1.0
 """Largest standard deviation of the slope of an episode; several episodes have a mean of less."""
 
+TWO = 2
+"""Number of values of a control that is a flag."""
+
 OWN = 0.05
 """Smallest part of an effect that does not follow from the state and the other controls, which explain the rest."""
 
@@ -32,14 +35,16 @@ def control_effects(
     It is -1 for a wrong sign in the dynamics, and 1/2 if the dynamics take twice the control. The predicted effect is
     the difference d of two predictions, with the control and with its median. The true changes (S, n) minus the second
     prediction are ``slope * d`` plus errors of other parts of the dynamics, linear in the state and the other controls,
-    plus noise. Absent where the control changes nothing, only as the state does, or too little, and for controls that
-    command a measured hand.
+    plus noise. Absent where the control changes nothing, only as the state does, or too little, for controls that
+    command a measured hand, and for those with two values, such as a closed gripper: the other value does not occur in
+    the same states, for which learned dynamics have no training data.
     """
     task, size = trace.task, trace.task.control_size
     if commands_hand(task):
         return {}
     state = np.column_stack([np.ones(len(trace)), monomials(trace.episode, False, 1)])[steps - 1]
     controls = trace.episode.controls[steps].astype(np.float64)
+    flags = [i for i in range(size) if len(np.unique(trace.episode.controls[:, i])) <= TWO]
     values = {}
     spacing = max(1, min(size, len(steps) // (state.shape[1] + size + 2 * LEAST)))  # controls take turns in a run
     for first in range(0, size, spacing):  # the same steps have the same random numbers in each run
@@ -51,7 +56,7 @@ def control_effects(
             return {}
         effect = measures.wrapped(task, predictions.change - without.change)
         rest = measures.wrapped(task, change - without.change)
-        for i in range(first, min(first + spacing, size)):
+        for i in (i for i in range(first, min(first + spacing, size)) if i not in flags):
             own = chosen[:, i]
             slopes = _slopes(rest[own], effect[own], np.column_stack([state, np.delete(controls, i, axis=1)])[own])
             for component, slope in zip(task.components, slopes, strict=True):

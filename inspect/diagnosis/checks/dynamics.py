@@ -108,7 +108,7 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
     starts = has_true_starts(checkpoint)
     ignores = starts and not uses_start(trace, checkpoint)
     ignored = {"ignored start//all": float(ignores)} if starts else {}
-    if belief is None or task.rotations:
+    if belief is None:
         return ignored
     change = task.difference(states[steps], states[steps - 1])
     predicted = task.difference(belief.mean[steps], trace.estimate_mean[steps - 1].astype(np.float64))

@@ -219,7 +219,8 @@ def _lost_weights(trace: Trace, log_weights: Array, prior: Array) -> dict[str, f
     """``lost weights//all``: share of steps without resampling whose weights (T, M) are not the next prior weights."""
     if trace.ancestors is None:
         return {}
-    spread = np.abs(log_weights - log_weights.mean(-1, keepdims=True)).mean(-1)[:-1]
+    with np.errstate(invalid="ignore"):  # some weights may be 0
+        spread = np.abs(log_weights - log_weights.mean(-1, keepdims=True)).mean(-1)[:-1]
     kept = (
         (trace.ancestors == np.arange(log_weights.shape[1])).all(-1)[:-1] & np.isfinite(spread) & (spread > NO_EVIDENCE)
     )

@@ -37,6 +37,14 @@ SEPARATE = 0.3
 """Smallest singular value of the errors of all channels over the particles, each of length 1, that separates them. Two
 distances along one line have the same error for all particles but for a factor."""
 
+SMALLEST_PART = 1e-2
+"""Smallest part of the errors over the particles, relative to the largest, that counts: four ranges in a plane have two
+parts, and what a learned likelihood does with the others is no measurement function."""
+
+DISPLACED = 0.5
+"""Offset of a likelihood, in standard deviations of the particles around the true state, from which its width there is
+not that at its maximum."""
+
 MOST_LATE = 3
 """Largest number of readings by which the used one is earlier."""
 
@@ -112,7 +120,7 @@ def _functions(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]
 
     ``late readings/MODALITY/all``: by how many readings z is earlier than that of the step.
     """
-    if trace.innovation is None or trace.task.rotations:
+    if trace.innovation is None:
         return {}
     count, means = len(trace.modalities), trace.predicted_mean
     if means is None:
@@ -208,7 +216,7 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
     to a full turn, of angles. Of modalities whose readings follow from the state and the controls of the step.
     """
     likelihood, particles = trace.log_likelihood, trace.particles
-    if likelihood is None or particles is None or trace.task.rotations:
+    if likelihood is None or particles is None:
         return {}
     by_key, values = {model.key: model for model in models}, {}
     every = np.s_[:: 1 + particles.shape[1] // PARTICLES]
@@ -236,7 +244,7 @@ def _likelihoods(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, floa
             for v in (columns, likelihood[steps, k][:, every, None].astype(float))
         )
         scale = np.maximum(np.abs(columns).max(1, keepdims=True), 1e-12)
-        fit = (np.linalg.pinv(columns / scale, rcond=1e-6) @ y / scale.mT)[..., 0]  # (S, 2 A): s b and s
+        fit = (np.linalg.pinv(columns / scale, rcond=SMALLEST_PART) @ y / scale.mT)[..., 0]  # (S, 2 A): s b and s
         count = e.shape[-1]
         power = np.median(fit[:, count:], axis=0)
         values[f"inverted likelihood/{modality}/all"] = float((power < INVERTED).any())
@@ -287,9 +295,10 @@ def _likelihoods_at_truth(trace: Trace) -> dict[str, float]:
     of the particles, in their standard deviations: 0 in a filter whose measurement function is right, whatever its
     noise.
 
-    ``likelihood width/MODALITY``: standard deviation of a Gaussian of the same curvature (``_width``).
+    ``likelihood width/MODALITY``: standard deviation of a Gaussian of the same curvature (``_width``); unless the
+    likelihood is ``DISPLACED``.
     """
-    if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
+    if trace.log_likelihood is None or trace.particles is None:
         return {}
     values: dict[str, float] = {}
     unit = np.maximum(trace.episode.states.astype(np.float64).std(0), 1e-9)
@@ -302,12 +311,15 @@ def _likelihoods_at_truth(trace: Trace) -> dict[str, float]:
         weights /= weights.sum(-1, keepdims=True)
         around = trace.task.difference(particles, particles[:, :1])  # angles have no mean
         std = around.std(1)
-        values[f"likelihood width/{modality}/all"] = _width(around / unit, likelihood)
         moved = np.einsum("tp,tpn->tn", weights, around) - around.mean(1)
-        for i, component in enumerate(trace.task.components):
-            if (known := std[:, i] > 0.0).sum() >= MIN_STEPS:
-                mean = float((moved[known, i] / std[known, i]).mean())
-                values[f"likelihood offset/{modality} {component.name}/all"] = mean
+        offsets = {
+            f"likelihood offset/{modality} {component.name}/all": float((moved[known, i] / std[known, i]).mean())
+            for i, component in enumerate(trace.task.components)
+            if (known := std[:, i] > 0.0).sum() >= MIN_STEPS
+        }
+        values |= offsets
+        if all(abs(offset) < DISPLACED for offset in offsets.values()):
+            values[f"likelihood width/{modality}/all"] = _width(around / unit, likelihood)
     return values
 
 
@@ -330,7 +342,7 @@ def _width(x: Array, likelihood: Array) -> float:
     columns = np.concatenate([x, -0.5 * np.square(x)], axis=-1)
     columns, y = (v - v.mean(1, keepdims=True) for v in (columns, y))
     scale = np.maximum(np.abs(columns).max(1, keepdims=True), 1e-12)
-    fit = (np.linalg.pinv(columns / scale, rcond=1e-6) @ y / scale.mT)[..., 0]
+    fit = (np.linalg.pinv(columns / scale, rcond=SMALLEST_PART) @ y / scale.mT)[..., 0]
     power = float(fit[:, x.shape[-1] :].sum(1).mean())
     return 1.0 / math.sqrt(max(power, FLAT**-2))
 
@@ -346,7 +358,7 @@ def _turns(trace: Trace, models: Sequence[ReadingModel]) -> dict[str, float]:
 
     Of the steps with particles on both sides of the angle at which readings jump by a turn.
     """
-    if trace.log_likelihood is None or trace.particles is None or trace.task.rotations:
+    if trace.log_likelihood is None or trace.particles is None:
         return {}
     likelihood, values = trace.log_likelihood.astype(np.float64), dict[str, float]()
     for k, modality in enumerate(trace.modalities):

@@ -24,8 +24,8 @@ START_STD, PRECISION = 1e-3, 1e-5
 """Smallest standard deviation of a belief at a true state, relative to that of the states and to their largest value,
 since beliefs may have single precision. What a prediction adds to it is the process noise."""
 
-LARGEST_STD = 0.1
-"""Largest one, relative to that of the states, of particles whose likelihoods are compared."""
+SMALLEST_SPREAD, LARGEST_STD = 1e-2, 0.1
+"""Smallest and largest one, relative to that of the states, of particles whose likelihoods are compared."""
 
 MOST_CALLS, MOST_PARTICLES = 60, 100_000
 """Largest number of calls of a filter of single trajectories, and of particles of all steps together."""
@@ -159,7 +159,7 @@ def with_particles_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace
         return trace
     states = trace.episode.states.astype(np.float64)
     variance = np.nanmedian(np.diagonal(trace.estimate_covariance, axis1=-2, axis2=-1), axis=0).astype(np.float64)
-    largest, smallest = LARGEST_STD * states.std(0), smallest_std(trace)
+    largest, smallest = LARGEST_STD * states.std(0), np.maximum(SMALLEST_SPREAD * states.std(0), smallest_std(trace))
     std = np.maximum(np.minimum(np.sqrt(np.maximum(np.nan_to_num(variance), 0.0)), largest), smallest)
     return _near_truth(trace, checkpoint, ("particles", "log_likelihood"), std)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import partial
 from itertools import permutations
 from typing import Any
@@ -14,67 +13,26 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import derived_controls
 from beliefscope.datasets.task import axis_name
-from beliefscope.inspect.diagnosis.checks.readings import delayed_errors
-from beliefscope.inspect.diagnosis.checks.sensors import biased_steps
 from beliefscope.inspect.diagnosis.checks.vectors import (
     CHANGE,
     FORCE,
     TORQUE,
     commands_hand,
-    free_motion,
     in_contact,
     lever,
 )
-from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo
+from beliefscope.inspect.diagnosis.undo.expected_readings import tare
+from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo, with_labels, with_readings
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
-from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
+from beliefscope.inspect.statistics.reading_model import CONTROL
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, wrapped
+from beliefscope.inspect.statistics.signals import MIN_STEPS
 
 CLEARLY = 2.0
 """Ratio of the force in contact to its 90 % quantile without contact."""
 
-SMALLEST_GAIN = 0.01
-"""Smallest slope of readings on the expected ones by which they are divided."""
-
 NUDGE = 1e-3
 """m: step of the difference quotient of the camera's map."""
-
-
-def _with_readings(
-    inputs: RunInputs, key: str, change: Callable[[NDArray[Any], Episode], NDArray[Any]]
-) -> RunInputs | None:
-    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes the episode.
-
-    Controls that derive from the readings are recomputed, as when faults are injected.
-    """
-    episodes = dict(inputs.episodes)
-    for index in inputs.affected:
-        episode = episodes[index]
-        if key == "control":
-            controls = change(episode.controls, episode).astype(np.float32)
-            episodes[index] = replace(episode, controls=controls)
-            continue
-        if key not in episode.observations:
-            return None
-        readings = episode.observations[key]
-        changed = change(readings.astype(np.float64), episode)
-        if readings.dtype == np.uint8:
-            changed = np.rint(changed).clip(0, 255)
-        observations = {**episode.observations, key: changed.astype(readings.dtype)}
-        episodes[index] = replace(episode, observations=observations, controls=derived_controls(episode, observations))
-    return replace(inputs, episodes=episodes)
-
-
-def _with_labels(inputs: RunInputs, change: Callable[[NDArray[Any]], NDArray[Any]]) -> RunInputs:
-    """Changed true states (T, n) in the affected episodes."""
-    episodes = {
-        index: replace(episode, states=change(episode.states).astype(np.float32))
-        if index in inputs.affected
-        else episode
-        for index, episode in inputs.episodes.items()
-    }
-    return replace(inputs, episodes=episodes)
 
 
 def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -99,12 +57,12 @@ def advance(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
         if not steps:
             return None
         if key == "labels":
-            return _with_labels(inputs, lambda values: _ahead(values, steps))
+            return with_labels(inputs, lambda values: _ahead(values, steps))
         steps_of = dict.fromkeys(inputs.checkpoint.task.modalities.get(key, (key,)), steps)
     result: RunInputs | None = inputs
     for name, count in steps_of.items():
         if result is not None:
-            result = _with_readings(result, name, lambda values, episode, count=count: _ahead(values, count))  # type: ignore[misc]
+            result = with_readings(result, name, lambda values, episode, count=count: _ahead(values, count))  # type: ignore[misc]
     return result
 
 
@@ -124,7 +82,7 @@ def realign_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
         height, width = images.shape[1:]
         return images[:, rows.clip(0, height - 1)][:, :, columns.clip(0, width - 1)]
 
-    return _with_readings(inputs, "image", back)
+    return with_readings(inputs, "image", back)
 
 
 def _shift(deviations: Deviations, axis: str) -> float | None:
@@ -144,93 +102,7 @@ def _shift(deviations: Deviations, axis: str) -> float | None:
 def expose_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Images of healthy brightness."""
     ratio = _ratio(deviations, "brightness/image/all")
-    return None if not ratio else _with_readings(inputs, "image", lambda images, episode: images / ratio)
-
-
-def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Force or torque without its excess level in free motion; that of some steps only is removed from these.
-
-    Other sensors without their mean error from the expected readings.
-    """
-    levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
-    if None in levels:
-        return _as_expected(key, inputs, lambda readings, expected: np.ones(readings.shape[1]))
-
-    def unbiased(readings: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        free = free_motion(episode) & episode.present(key)
-        for axis, level in enumerate(levels[: readings.shape[1]]):
-            assert level is not None
-            steps = biased_steps(episode, key, axis)
-            if steps is None:
-                readings[:, axis] -= level.value - level.healthy
-            else:
-                part = np.s_[steps[0] : steps[1] + 1]
-                readings[part, axis] -= np.median(readings[part, axis][free[part]]) - level.healthy
-        return readings
-
-    return _with_readings(inputs, key, unbiased)
-
-
-def detrend(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Readings without the line over time that fits their errors from the expected ones in all affected episodes."""
-    if (model := _reading_model(key, inputs)) is None:
-        return None
-    compared = [model.compare(inputs.episodes[index]) for index in inputs.affected]
-    steps = np.concatenate([one.steps() for one in compared])
-    errors = np.concatenate([np.subtract(*one.pairs()) for one in compared])
-    if len(steps) < MIN_STEPS:
-        return None
-    (slope, offset), channels = np.polyfit(steps, errors, 1), list(model.channels)
-
-    def restored(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        result = values.copy()
-        own = values[:, channels] - offset - slope * np.arange(len(values))[:, None]
-        result[:, channels] = np.where(model.is_angle, wrapped(own), own)
-        return result
-
-    return _with_readings(inputs, key, restored)
-
-
-def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Readings without their mean error from the expected ones, and divided by their slope on these."""
-
-    def slope(readings: Array, expected: Array) -> Array:
-        around = expected - expected.mean(0)
-        return np.asarray((around * readings).sum(0) / np.maximum(np.square(around).sum(0), 1e-24))
-
-    return _as_expected(key, inputs, slope)
-
-
-def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], Array]) -> RunInputs | None:
-    """Readings (z - c) / g, which agree with the expected ones in the mean of the affected episodes.
-
-    None without a model of the sensor, and for a gain of about 0.
-
-    Args:
-        gain_of: g (A,) from readings and expected readings (S, A).
-    """
-    if (model := _reading_model(key, inputs)) is None:
-        return None
-    pairs = (model.compare(inputs.episodes[index]).pairs() for index in inputs.affected)
-    readings, expected = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    gain = gain_of(readings, expected) if len(readings) >= MIN_STEPS else np.zeros(1)
-    if (np.abs(gain) < SMALLEST_GAIN).any():
-        return None
-    offset, channels = readings.mean(0) - gain * expected.mean(0), list(model.channels)
-
-    def restored(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        result = values.copy()
-        own = (values[:, channels] - offset) / gain
-        result[:, channels] = np.where(model.is_angle, wrapped(own), own)
-        return result
-
-    return _with_readings(inputs, key, restored)
-
-
-def _reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:
-    """The healthy record's model of a sensor; None if the labels explain none of its channels."""
-    readings = () if inputs.healthy is None else inputs.healthy.readings
-    return next((model for model in readings if model.key == key and model.channels), None)
+    return None if not ratio else with_readings(inputs, "image", lambda images, episode: images / ratio)
 
 
 def detrend_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -238,7 +110,7 @@ def detrend_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
     slope = [_excess(deviations, f"drift/force {axis}/free motion") for axis in "xyz"]
     if None in slope:
         return None
-    return _with_readings(
+    return with_readings(
         inputs, "force", lambda f, episode: f - np.array(slope)[: f.shape[1]] * episode.dt * np.arange(len(f))[:, None]
     )
 
@@ -247,12 +119,12 @@ def scale_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force of healthy size: from how much the hand yields to it or, where this is unknown, from its size."""
     ratios = [ratio for axis in "xyz" if (ratio := _ratio(deviations, f"compliance/force {axis}/all"))]
     gain = 1.0 / float(np.median(ratios)) if ratios else _ratio(deviations, "size/force/contact")
-    return None if not gain else _with_readings(inputs, "force", lambda force, episode: force / gain)
+    return None if not gain else with_readings(inputs, "force", lambda force, episode: force / gain)
 
 
 def negate_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force with the opposite sign."""
-    return _with_readings(inputs, "force", lambda force, episode: -force)
+    return with_readings(inputs, "force", lambda force, episode: -force)
 
 
 def permute_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -265,31 +137,7 @@ def permute_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
             force, torque = (observations[key].astype(np.float64)[at] for key in (FORCE, TORQUE))
             left += [lever(force[:, order], torque)[1] for order in orders]
     order = orders[int(left.argmin())]
-    return None if order == (0, 1, 2) else _with_readings(inputs, FORCE, lambda force, episode: force[:, order])
-
-
-def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Readings with the order and the signs of channels that best agree with the labels; None if they have them."""
-    if (model := _reading_model(key, inputs)) is None:
-        return None
-    from scipy.optimize import linear_sum_assignment  # takes most of a second
-
-    affected = (inputs.episodes[index] for index in inputs.affected)
-    total = np.sum([delayed_errors(model.compare(episode), episode.dt)[1] for episode in affected], axis=0)
-    if not np.isfinite(total).all():
-        return None
-    sources, channels = linear_sum_assignment(total.min(0))  # reading i is of channel j
-    signs = np.where(total.argmin(0)[sources, channels], -1.0, 1.0)
-    if (sources == channels).all() and (signs > 0.0).all():
-        return None
-    order = np.array(model.channels)
-
-    def arranged(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        result = values.copy()
-        result[:, order[channels]] = signs * values[:, order[sources]]
-        return result
-
-    return _with_readings(inputs, key, arranged)
+    return None if order == (0, 1, 2) else with_readings(inputs, FORCE, lambda force, episode: force[:, order])
 
 
 def restore_contact(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -303,7 +151,7 @@ def restore_contact(inputs: RunInputs, deviations: Deviations) -> RunInputs | No
         size = np.linalg.norm(episode.observations[FORCE].astype(np.float64) - zero, axis=1)
         return (size > CLEARLY * unflagged)[:, None]
 
-    return _with_readings(inputs, CONTACT, restored)
+    return with_readings(inputs, CONTACT, restored)
 
 
 def shift_hand(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -325,7 +173,7 @@ def shift_hand(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
         shift[:2] = -np.linalg.lstsq(nudged.T / NUDGE, np.array(pixels, dtype=np.float64), rcond=None)[0]
     else:
         return None
-    return _with_readings(inputs, HAND, lambda position, episode: position - shift[: position.shape[1]])
+    return with_readings(inputs, HAND, lambda position, episode: position - shift[: position.shape[1]])
 
 
 def _hand_camera(inputs: RunInputs) -> LandmarkFilter | None:
@@ -348,7 +196,7 @@ def shift_labels(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
             return None
         weights = [max(d.high - d.low, 1e-6) ** -2 for d in biases]
         shift[i] = np.average([d.value - d.healthy for d in biases], weights=weights)
-    return _with_labels(inputs, lambda states: states + shift)
+    return with_labels(inputs, lambda states: states + shift)
 
 
 def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -357,7 +205,7 @@ def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
     factors = np.array([_scale(deviations, channel, size) for channel in range(size)])
     if commands_hand(inputs.checkpoint.task):
         factors[CHANGE] = _ratio(deviations, "scale/control/all") or 1.0
-    return None if (factors == 1.0).all() else _with_readings(inputs, "control", lambda values, _: values / factors)
+    return None if (factors == 1.0).all() else with_readings(inputs, "control", lambda values, _: values / factors)
 
 
 def _scale(deviations: Deviations, channel: int, size: int) -> float:
@@ -374,7 +222,7 @@ def negate_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
     size = inputs.checkpoint.task.control_size
     opposed = (deviations.get(f"opposed/{axis_name('control', channel, size)}/all") for channel in range(size))
     signs = np.array([-1.0 if deviation is not None and deviation.alarm else 1.0 for deviation in opposed])
-    return None if (signs == 1.0).all() else _with_readings(inputs, "control", lambda values, _: values * signs)
+    return None if (signs == 1.0).all() else with_readings(inputs, "control", lambda values, _: values * signs)
 
 
 def _excess(deviations: Deviations, name: str) -> float | None:

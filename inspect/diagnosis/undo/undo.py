@@ -24,7 +24,8 @@ from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
-from beliefscope.inspect.diagnosis.undo.readings import READINGS, advance, detrend, rearrange, scale, tare
+from beliefscope.inspect.diagnosis.undo.expected_readings import detrend, rearrange, scale, tare
+from beliefscope.inspect.diagnosis.undo.readings import READINGS, advance
 from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo, without_sensor
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 

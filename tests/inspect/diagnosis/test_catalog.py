@@ -12,7 +12,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom, index_ranges, probability_text
 from beliefscope.inspect.diagnosis.checks.episode_statistics import with_scatter
-from beliefscope.inspect.diagnosis.conclusion import is_unused, next_action
+from beliefscope.inspect.diagnosis.next_action import is_unused, next_action
 from beliefscope.inspect.diagnosis.scoring import (
     Explanation,
     applicable,

@@ -179,6 +179,14 @@ def test_the_width_of_a_likelihood_is_proportional_to_its_standard_deviation() -
         assert far == pytest.approx(STD["far"] / size, rel=1e-3)
 
 
+def test_the_width_of_a_displaced_likelihood_is_unknown() -> None:
+    """Its curvature at the true state is not that at its maximum."""
+    filter_ = filter_of(Particles(offset=1.0))
+    values = model_statistics(bs.trace(filter_, [ride(0)], 0), filter_)
+    assert abs(values["likelihood offset/near x/all"]) > 0.5
+    assert {name for name in values if name.startswith("likelihood width/")} == {"likelihood width/far/all"}
+
+
 def test_moments_of_angles_are_those_of_their_differences() -> None:
     """Particles on both sides of half a turn: the estimate at the turn is right, their arithmetic mean, 0, is wrong."""
     task = replace(TASK, components=(bs.Component("x", "rad", wraps=True),))
@@ -212,6 +220,7 @@ def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
     [
         (Particles(count=8), "particles.few"),
         (Particles(powers={"far": 0.0}), "weights.ignores_likelihood"),
+        pytest.param(Particles(powers={"far": 2.0}), "weights.repeats_likelihood", marks=pytest.mark.long),
         (Particles(resample=False), "resampling.off"),
         (Particles(best_only=True), "particles.deprived"),
         (Particles(weighted=False), "estimate.mean"),

@@ -13,7 +13,7 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.external.load import ExternalFilter, as_external
 from beliefscope.inspect.diagnosis.catalog import causes_of
-from beliefscope.inspect.diagnosis.conclusion import next_action, search_action
+from beliefscope.inspect.diagnosis.next_action import next_action, search_action
 
 TASK = Task("peg", (Component("x", "m"),), {"wrench": (2,)}, {"touch": ("wrench",)}, 0, 0.1)
 

@@ -44,6 +44,15 @@ def test_visible(value: float, alarm: bool, undone: Effect | None, visible: bool
     assert is_visible(error(value, alarm), undone) is visible
 
 
+@pytest.mark.parametrize(
+    ("undone", "known"),
+    [(effect(1.0, True), True), (effect(0.5, True), False), (effect(1.0, False), True), (effect(0.9, False), False)],
+)
+def test_only_a_complete_undo_or_an_unused_sensor_shows_the_healthy_run(undone: Effect, known: bool) -> None:
+    """Without a sensor that it needs, a filter is worse, whether the fault affects it or not."""
+    assert undone.shows_healthy_run is known
+
+
 def test_errors_of_velocities_and_biases_count_as_well() -> None:
     name = "component error/speed/all"
     assert is_visible({name: Deviation(name, 1.5, 1.0, 0.9, 1.1, 0.01, True, 9.0)}, None)

@@ -75,6 +75,13 @@ def test_slopes_are_the_inverse_gains(gains: tuple[float, float]) -> None:
         assert [values[name] for name in names] == pytest.approx([1.0 / gain] * 2, abs=1e-3)
 
 
+def test_flags_have_no_effects() -> None:
+    """The other value of a control with two values may never occur in the same states."""
+    episode = drive(0, noise=0.0)
+    controls = np.column_stack([episode.controls[:, 0], episode.controls[:, 1] > 0.0])
+    assert effects(Mixed(1.0, 1.0), replace(episode, controls=controls)).keys() == set(NAMES[0])
+
+
 def test_an_effect_on_one_component_does_not_change_that_on_the_other() -> None:
     values = effects(Mixed((1.0, 1.0), (-1.0, 1.0)), drive(0, noise=0.0))
     expected = {name: 1.0 for names in NAMES for name in names} | {NAMES[0][1]: -1.0}
