@@ -26,10 +26,11 @@ CAUSES = (
     ),
     Cause(
         "resampling.off",
-        "Resampling off, or weights kept after it",
+        "Resampling off, or wrong weights after it",
         (Symptom("prior ess/*", -1),),
         f"fusion mean/*|fusion variance/*|{FILTER}",
-        "Resample at every step, and make all weights equal afterwards.",
+        "Resample at every step, and make all weights equal afterwards; after soft resampling, they are those of the "
+        "ancestors divided by the probabilities of the draws.",
         "restore equations",
     ),
     Cause(
