@@ -64,8 +64,9 @@ def causes_in(checkpoint: Checkpoint, estimates_only: bool = False) -> tuple[Cau
     elif estimates_only:
         causes = (*causes, *OF_ESTIMATES)
     if isinstance(checkpoint, ExternalFilter):
-        starts = has_true_starts(checkpoint)
-        return tuple(in_predictions(cause, starts) for cause in (*causes, *external_causes(checkpoint.task)))
+        starts, task = has_true_starts(checkpoint), checkpoint.task
+        sensors = {*task.observations, *task.modalities}
+        return tuple(in_predictions(cause, starts, sensors) for cause in (*causes, *external_causes(task)))
     return causes
 
 

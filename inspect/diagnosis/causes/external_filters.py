@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -141,17 +141,22 @@ def _wrong_sign(modalities: Sequence[str]) -> Cause:
     )
 
 
-def in_predictions(cause: Cause, has_true_starts: bool) -> Cause:
+def in_predictions(cause: Cause, has_true_starts: bool, sensors: Collection[str]) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates.
 
     Whether the offspring agrees with the weights depends on the resampling alone.
 
-    has_true_starts: most statistics of the dynamics are of predictions that start at true states, which other parts of
-    the filter, and the sensors, do not change.
+    Args:
+        has_true_starts: most statistics of the dynamics are of predictions that start at true states, which other parts
+            of the filter, and the sensors, do not change.
+        sensors: components of causes in sensors. Their symptoms are in the readings, which no equation changes, and a
+            wrong update moves the state before that by the next sensor, also in steps from true states.
     """
     cause = _in_predictions_of_run(cause)
     if has_true_starts:
         cause = _with_true_starts(cause)
+    if cause.component in sensors:
+        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|{MODELS}")
     return replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
 
 

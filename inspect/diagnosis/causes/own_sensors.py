@@ -20,11 +20,12 @@ KNOWN = ("image", "force", "torque", "effector_position", "contact")
 SYNCHRONISE = "Synchronise the clocks of the sensors."
 """Next action of a delay."""
 
-BIASED = ("level", "drift", "saturation", "contact lag", "reading bias", "reading drift")
+BIASED = ("level", "drift", "saturation", "contact lag", "reading bias")
 """Kinds of statistics of vector sensors that a bias changes."""
 
 DELAYED = (
     *BIASED,
+    "reading drift",
     "change",
     "size",
     "roughness",
@@ -44,9 +45,6 @@ TARE = "Tare the sensor, or register the frame of the labels with it: only other
 
 WARM = "Let the sensor warm up and tare it before each episode."
 """Next action of a drift."""
-
-GROWS = 0.25
-"""Prior of a drift: it is also a bias in the mean."""
 
 VECTOR = (
     ("stuck", "stuck", "stuck", "Restart the sensor and check its connection."),
@@ -107,7 +105,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     """
     of = partial(_patterns, key)
     delays = ("reading lag", "reading lag scatter")
-    scaled = of(*BIASED, *delays, "change", "size", "noise", "reading noise", "reading scatter")
+    scaled = of(*BIASED, "reading drift", *delays, "change", "size", "noise", "reading noise", "reading scatter")
     noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
     drift = (Symptom(of("reading drift"), 0),)
@@ -117,7 +115,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     entries = (
         ("noise", "noisy", noise, rough, "Check the cable and the filter of the sensor.", ""),
         ("bias", "biased", bias, of(*BIASED, *delays), TARE, f"tare {key}|"),
-        ("drift", "drifting", drift, of(*BIASED, *delays), WARM, f"detrend {key}|"),
+        ("drift", "drifting", drift, of(*BIASED, "reading scatter", *delays), WARM, f"detrend {key}|"),
         ("gain", "has a wrong gain", gain, scaled, "Check the unit and the gain of the sensor.", f"scale {key}|"),
     )
     return [
@@ -130,7 +128,6 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             f"{undo}drop {modality}",
             lowers=of("stuck") if mechanism == "noise" else "",
             raises=of("reading noise", "noise") if mechanism in ("bias", "drift") else "",
-            prior=GROWS if mechanism == "drift" else 0.0,
         )
         for mechanism, words, symptoms, changed, action, undo in entries
     ]

@@ -63,7 +63,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     noise``: standard deviation from this line, relative to the noise.
     ``inverted``: half the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then
     fit (``FITS``). ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged,
-    whatever their signs, for the best other channel.
+    whatever their signs, for the best other channel; or of one channel to those of a channel without a model.
     """
     values: dict[str, float] = {}
     for model in (model for model in models if model.channels):
@@ -79,7 +79,10 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         own = np.diagonal(least)
         exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
         inverted = _evidence(np.diagonal(errors[0]), np.diagonal(errors[1]), FITS)
-        count = readings_of(episode, model.key).shape[1]
+        all_readings = readings_of(episode, model.key)
+        others = np.delete(all_readings, model.channels, axis=1)
+        replaced = _evidence(own, _least_errors(compared, others, whole), FITS)
+        count = all_readings.shape[1]
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
             values[f"reading bias/{axis}/all"] = float(line["bias"][i] / model.noise[i])
@@ -87,8 +90,9 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
             values[f"reading gain/{axis}/all"] = float(line["gain"][i])
             values[f"reading noise/{axis}/all"] = float(line["noise"][i] / model.noise[i])
             values[f"inverted/{axis}/all"] = float(inverted[i])
-            if len(model.channels) > 1:
-                values[f"exchanged/{axis}/all"] = float(np.delete(exchanged[i], i).max())
+            if count > 1:
+                pairs = np.delete(exchanged[i], i)
+                values[f"exchanged/{axis}/all"] = float(max(replaced[i], pairs.max(initial=0.0)))
     return values
 
 
@@ -168,6 +172,17 @@ def _clustered(terms: Array) -> Array:
     """(A,) standard errors of sums of terms (S, A) with a mean of 0, which depend on each other within ``BLOCKS``."""
     starts = np.linspace(0, len(terms), BLOCKS, endpoint=False).astype(int)
     return np.asarray(np.sqrt(np.square(np.add.reduceat(terms, starts, axis=0)).sum(0)))
+
+
+def _least_errors(compared: ComparedReadings, others: Array, delay: int) -> Array:
+    """(A,) smallest mean square error of other readings (T, B) of either sign; infinite without any."""
+    steps = compared.steps(delay)
+    expected = compared.expected[steps - delay]
+    result = np.full(expected.shape[1], np.inf)
+    for signed in (others, -others) if len(steps) >= MIN_STEPS else ():
+        errors = np.square(compared.model.relative(signed[steps, :, None] - expected[:, None])).mean(0)
+        result = np.minimum(result, errors.min(0, initial=np.inf))
+    return result
 
 
 def _evidence(error: Array, other: Array, limit: float) -> Array:
