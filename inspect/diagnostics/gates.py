@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import percent, plural
@@ -16,12 +15,9 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import squared_innovations
+from beliefscope.inspect.statistics.innovations import TAIL, are_extreme, squared_innovations
 from beliefscope.inspect.statistics.intervals import mean_interval, too_few
 from beliefscope.inspect.trace import Trace
-
-TAIL = 0.001
-"""Probability of a larger innovation in a consistent filter below which an innovation is extreme."""
 
 EXCESS = 10.0
 """Smallest ratio of the number of accepted extreme innovations to its expectation at which a gate should have acted."""
@@ -207,7 +203,7 @@ def _modality(traces: Sequence[Trace], k: int, name: str) -> ModalityInnovations
     low = high = math.nan
     if too_few(len(traces)) is None and min(counts) > 0:
         _, low, high = (float(x) for x in mean_interval(np.array(sums), np.array(counts, np.float64)))
-    extreme = chdtrc(np.maximum(m, 1), value) < TAIL
+    extreme = are_extreme(value, m)
     gated = total > 0 and np.isfinite(used).all()
     return ModalityInnovations(
         modality=name,

@@ -53,7 +53,7 @@ KINDS = {
     "ignored start": ("independence of the belief at the start", False, 0.1),
     "late readings": ("number of readings by which the used ones{of} are late", False, 0.3),
     "innovation turns": ("share of innovations of about a full turn", False, 0.002),
-    "updates": ("share of steps with an accepted measurement", False, 0.02),
+    "updates": ("share of steps with an accepted measurement, or one that a correct gate rejects,", False, 0.02),
     "absent updates": ("share of steps without a reading that have a measurement", False, 0.02),
     "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
     "belief variance": ("mean log-variance of the estimate", False, 0.02),

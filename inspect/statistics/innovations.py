@@ -22,6 +22,9 @@ AnyArray = NDArray[np.floating[Any]]
 SAME_SIZE = 0.2
 """Largest difference of the log-determinants of covariances of about the same belief."""
 
+TAIL = 0.001
+"""Probability of a larger innovation in a consistent filter below which an innovation is extreme."""
+
 
 @dataclass(frozen=True)
 class Whiteness:
@@ -162,6 +165,11 @@ def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
     squared = np.einsum("tkm,tkm->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0])
     channels = used.sum(-1)
     return np.where((channels > 0) & valid, squared, np.nan), channels
+
+
+def are_extreme(squared: Array, channels: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether squared innovations with numbers of channels are larger than all but ``TAIL`` of a consistent filter."""
+    return np.asarray(chdtrc(np.maximum(channels, 1), squared) < TAIL)
 
 
 def nis_of(trace: Trace) -> Array | None:

@@ -125,7 +125,7 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         WEIGHTS,
         *([_wrong_sign(tuple(task.modalities))] if len(task.modalities) > 1 else []),
         *(cause for modality, keys in task.modalities.items() for cause in _of_measurement(modality, keys)),
-        *(cause for modality in task.modalities for cause in _of_updates(modality, tuple(task.modalities))),
+        *(cause for modality in task.modalities for cause in _of_updates(modality)),
     )
 
 
@@ -259,13 +259,9 @@ def _of_measurement(modality: str, keys: Sequence[str]) -> tuple[Cause, ...]:
     )
 
 
-def _of_updates(modality: str, modalities: Sequence[str]) -> tuple[Cause, ...]:
-    """Causes in the updates with a modality: their innovations, gains and steps.
-
-    Without updates its innovations agree with their covariance, which grows; a correct gate rejects those that do not.
-    """
+def _of_updates(modality: str) -> tuple[Cause, ...]:
+    """Causes in the updates with a modality: their innovations, gains and steps."""
     name = display_name(modality)
-    others = "|".join(f"nis/{other}/*" for other in modalities if other != modality)
     return (
         Cause(
             f"updates.{modality}.gain",
@@ -293,9 +289,8 @@ def _of_updates(modality: str, modalities: Sequence[str]) -> tuple[Cause, ...]:
             f"updates.{modality}.missing",
             f"Updates with {name} missing",
             (Symptom(f"updates/{modality}/*", -1),),
-            f"covariance update/*|measurement noise//*|{FILTER.replace('nis/*', others)}",
+            f"covariance update/*|measurement noise//*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
-            lowers=f"nis/{modality}/*",
         ),
         Cause(
             f"updates.{modality}.absent",

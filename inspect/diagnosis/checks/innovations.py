@@ -7,7 +7,13 @@ import math
 import numpy as np
 
 from beliefscope.inspect.diagnosis.checks.vectors import angle_channels
-from beliefscope.inspect.statistics.innovations import channel_names, innovations, prediction
+from beliefscope.inspect.statistics.innovations import (
+    are_extreme,
+    channel_names,
+    innovations,
+    prediction,
+    squared_innovations,
+)
 from beliefscope.inspect.statistics.measures import Array, Mask, absent, counted
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN
 from beliefscope.inspect.trace import Trace
@@ -24,8 +30,9 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
 
     ``innovation bias``, by channel: mean of nu, in standard deviations. ``innovation std``: geometric mean of the
     standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a channel
-    of angles. ``updates``: share of steps with an accepted innovation. ``absent updates``: share of the steps without a
-    reading of the modality that have one. ``measurement noise``: geometric mean of the
+    of angles. ``updates``: share of steps with an accepted innovation, or with one that a correct gate rejects
+    because the filter has lost the state. ``absent updates``: share of the steps without a reading of the modality that
+    have an accepted one. ``measurement noise``: geometric mean of the
     standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of all
     modalities, where the measurement noise of some is unknown.
     """
@@ -36,11 +43,13 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     used = np.isfinite(nu) & (variance > 0.0)
     deviation = np.sqrt(np.where(used, variance, np.nan))
     accepted = accepted_channels(trace, np.isfinite(nu), keep)
+    squared = squared_innovations(trace)
+    extreme = np.zeros(used.shape[:2], bool) if squared is None else are_extreme(*squared)[keep]
     values: dict[str, float] = {}
     names = channel_names(trace, pair[0])
     for k, modality in enumerate(trace.modalities):
         updated = np.asarray(accepted[:, k].any(-1))
-        values[f"updates/{modality}/all"] = float(updated.mean())
+        values[f"updates/{modality}/all"] = float((updated | extreme[:, k]).mean())
         if (without := absent(trace, modality)[keep]).any():
             values[f"absent updates/{modality}/all"] = float(updated[without].mean())
         channels = np.flatnonzero(used[:, k].sum(0) >= MIN_STEPS)
