@@ -40,6 +40,9 @@ DELAYED = (
 CONNECTION = "Check the connection of the sensor and the load of the computer that receives its messages."
 """Next action of lost readings."""
 
+SLOW = -0.1
+"""Prior of a drift: slow readings with a delay or a gain also drift."""
+
 TARE = "Tare the sensor, or register the frame of the labels with it: only other sensors tell which of them is wrong."
 """Next action of a bias."""
 
@@ -128,6 +131,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             f"{undo}drop {modality}",
             lowers=of("stuck") if mechanism == "noise" else "",
             raises=of("reading noise", "noise") if mechanism in ("bias", "drift") else "",
+            prior=SLOW if mechanism == "drift" else 0.0,
         )
         for mechanism, words, symptoms, changed, action, undo in entries
     ]

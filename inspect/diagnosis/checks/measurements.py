@@ -37,7 +37,7 @@ SEPARATE = 0.3
 """Smallest singular value of the errors of all channels over the particles, each of length 1, that separates them. Two
 distances along one line have the same error for all particles but for a factor."""
 
-SMALLEST_PART = 1e-2
+SMALLEST_PART = 5e-3
 """Smallest part of the errors over the particles, relative to the largest, that counts: four ranges in a plane have two
 parts, and what a learned likelihood does with the others is no measurement function."""
 

@@ -34,6 +34,9 @@ BLOCKS = 10
 EDGES = 151
 """Number of steps, evenly spaced, at which a bias may begin or end."""
 
+CLEARLY = 0.5
+"""Largest ratio of the squares that a bias in an interval leaves to those of a drift or a gain."""
+
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
 
@@ -137,9 +140,9 @@ def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict
 def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
     """(A,) slope of errors (S, A) with a mean of 0 by the times (S,), and the part (S, A) that is a drift or a bias.
 
-    A gain and a bias in an interval also change errors over time. The slope is shrunk by the ratio of the squares that
-    the better of these leaves to those that a line leaves. The part is that of the line or of the interval, if it
-    leaves least of the three.
+    A gain and a bias in an interval also change errors over time. The slope is shrunk by the likelihood ratio of the
+    better of these to a line, for ``BLOCKS`` pairs of independent errors. The part is that of the line, if it leaves
+    least of the three, or of the interval, which has more parameters, if it leaves clearly less (``CLEARLY``).
     """
     time = times[:, None]
     power = np.square(errors).sum(0)
@@ -148,9 +151,10 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
     gain = expected * ((expected * errors).sum(0) / np.maximum(np.square(expected).sum(0), 1e-24))
     fits = slope * time, interval, gain
     left = [np.maximum(np.square(errors - fit).sum(0), 1e-9 * power + 1e-24) for fit in fits]
-    least = np.argmin(left, axis=0)
-    part = np.where(least == 0, slope * time, np.where(least == 1, interval, 0.0))
-    return slope * np.minimum(np.minimum(left[1], left[2]) / left[0], 1.0), part
+    by_line, by_interval, by_gain = left
+    is_interval = by_interval < CLEARLY * np.minimum(by_line, by_gain)
+    part = np.where(is_interval, interval, np.where(by_line < by_gain, slope * time, 0.0))
+    return slope * np.minimum(np.minimum(by_interval, by_gain) / by_line, 1.0) ** BLOCKS, part
 
 
 def _interval_means(errors: Array) -> Array:

@@ -47,6 +47,9 @@ ROUGH = 0.5
 MIN_CONTACT = 3
 """Smallest number of steps in contact that show a delay."""
 
+JUMP = 4.0
+"""Smallest change to a limit, relative to the usual one of the readings, of an axis that is not saturated."""
+
 MIN_MOTION = 1e-3
 """m per step: the hand moves."""
 
@@ -375,12 +378,15 @@ def _moving(episode: Episode) -> Mask:
 def saturated(values: Array) -> Mask:
     """(T,): readings at the largest magnitude, the smallest or the largest value, each if reached more than once.
 
-    A single stretch of equal readings is a stuck axis.
+    A single stretch of equal readings is a stuck axis, and so is a smallest or largest value to which they jump.
     """
-    result = np.zeros(len(values), dtype=bool)
-    for series in (np.abs(values), values, -values) if len(values) else ():
+    result, changes = np.zeros(len(values), dtype=bool), np.abs(np.diff(values))
+    usual = float(np.median(changes[changes > 0.0])) if changes.any() else 0.0
+    for i, series in enumerate((np.abs(values), values, -values) if len(values) else ()):
         at = series == series.max()
-        result |= at & (np.diff(at, prepend=False).sum() > 2)
+        into = changes[at[1:] & ~at[:-1]]
+        jumps = i > 0 and len(into) > 0 and float(np.median(into)) > JUMP * usual
+        result |= at & (np.diff(at, prepend=False).sum() > 2) & (not jumps)
     return result
 
 

@@ -184,6 +184,10 @@ def test_saturated_readings_repeat_a_limit_in_several_stretches() -> None:
     np.testing.assert_array_equal(np.flatnonzero(saturated(limited)), [1, 2, 4])
     np.testing.assert_array_equal(np.flatnonzero(saturated(np.array([2.0, 1.0, 3.0, 1.0, 1.0]))), [1, 3, 4])
     assert not saturated(np.zeros(0)).any()
+    lost = np.sin(0.1 * np.arange(60)) + 2.0
+    lost[20:25] = lost[40:45] = 0.0
+    assert not saturated(lost).any(), "readings that jump to zero are lost"
+    assert saturated(np.maximum(np.sin(0.3 * np.arange(60)), -0.7)).sum() > 10
 
 
 def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[str, float]:
