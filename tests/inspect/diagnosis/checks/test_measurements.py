@@ -141,6 +141,18 @@ def test_likelihoods_that_grow_with_the_error_are_inverted() -> None:
     assert "measurement noise/radar/all" not in inverted
 
 
+def test_a_channel_that_a_likelihood_ignores_is_not_inverted() -> None:
+    """Its curvature has either sign: here that of a learned likelihood which changes from step to step."""
+    trace, rng = with_likelihoods(run(Boat()), 1.0, 0.0), np.random.default_rng(0)
+    distance = np.hypot(trace.particles[..., 0], trace.particles[..., 1])
+    error = (trace.episode.observations["radar"][:, :1] - distance) / models()[0].noise[0]
+    changed = trace.log_likelihood.copy()
+    signs = np.where(rng.random(len(trace)) < 0.6, 1.5, 0.0)[:, None]  # the sign changes at more than half of the steps
+    changed[:, 0] += 0.5 * signs * np.square(error)
+    values = measurement_model_statistics(replace(trace, log_likelihood=changed), models())
+    assert values["inverted likelihood/radar/all"] == 0.0
+
+
 def test_channels_that_the_particles_do_not_separate_have_the_same_error() -> None:
     """Particles on a line show how much the measurement function of the radar is wrong, not in which channel."""
     n = run(Boat()).estimate_mean.shape[1]

@@ -17,7 +17,7 @@ from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_
 from beliefscope.datasets.store import open_dataset
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.checks.sensors import biased_steps, localise, sensor_statistics
-from beliefscope.inspect.diagnosis.checks.vectors import free_motion, impedance_statistics, saturated
+from beliefscope.inspect.diagnosis.checks.vectors import free_motion, impedance_statistics
 from beliefscope.inspect.diagnosis.checks.windows import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
@@ -176,18 +176,6 @@ def test_other_statistics_do_not_change(task: str, faults: str, own: str) -> Non
     for name, value in clean.items():
         if not name.startswith(allowed):
             assert faulty[name] == pytest.approx(value, rel=1e-3, abs=2e-2, nan_ok=True), name
-
-
-def test_saturated_readings_repeat_a_limit_in_several_stretches() -> None:
-    stuck, limited = np.array([0.0, 1.0, 2.0, 2.0, 2.0]), np.array([0.0, 2.0, 2.0, 1.0, -2.0, 0.0])
-    assert not saturated(stuck).any()
-    np.testing.assert_array_equal(np.flatnonzero(saturated(limited)), [1, 2, 4])
-    np.testing.assert_array_equal(np.flatnonzero(saturated(np.array([2.0, 1.0, 3.0, 1.0, 1.0]))), [1, 3, 4])
-    assert not saturated(np.zeros(0)).any()
-    lost = np.sin(0.1 * np.arange(60)) + 2.0
-    lost[20:25] = lost[40:45] = 0.0
-    assert not saturated(lost).any(), "readings that jump to zero are lost"
-    assert saturated(np.maximum(np.sin(0.3 * np.arange(60)), -0.7)).sum() > 10
 
 
 def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[str, float]:
