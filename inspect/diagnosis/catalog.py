@@ -65,8 +65,8 @@ def causes_in(checkpoint: Checkpoint, estimates_only: bool = False) -> tuple[Cau
         causes = (*causes, *OF_ESTIMATES)
     if isinstance(checkpoint, ExternalFilter):
         starts, task = has_true_starts(checkpoint), checkpoint.task
-        sensors = {*task.observations, *task.modalities}
-        return tuple(in_predictions(cause, starts, sensors) for cause in (*causes, *external_causes(task)))
+        inputs = {*task.observations, *task.modalities, "labels"}
+        return tuple(in_predictions(cause, starts, inputs) for cause in (*causes, *external_causes(task)))
     return causes
 
 

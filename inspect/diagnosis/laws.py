@@ -24,18 +24,22 @@ PRECISION = 3.0
 
 
 class Law(NamedTuple):
-    """Value of a kind of statistic in a correct filter, and the largest deviation from it that is not mentioned."""
+    """Value of a kind of statistic in a correct filter, and the largest deviation from it that is not mentioned.
+
+    mistake: what a filter that breaks it does, with the modality in the place of ``{}``; empty to state the value.
+    """
 
     kind: str
     expected: float
     tolerance: float
+    mistake: str = ""
 
 
 LAWS = (
-    Law("lost weights", 0.0, 0.2),
-    Law("late readings", 0.0, 0.5),
-    Law("absent updates", 0.0, 0.2),
-    Law("inverted likelihood", 0.0, 0.5),
+    Law("lost weights", 0.0, 0.2, "Particle weights are not kept without resampling"),
+    Law("late readings", 0.0, 0.5, "Updates with {} use earlier readings"),
+    Law("absent updates", 0.0, 0.2, "The filter updates with {} where it has no reading"),
+    Law("inverted likelihood", 0.0, 0.5, "The likelihood of {} grows with the error of the reading"),
     Law("likelihood share", 1.0, 0.3),
     Law("estimate mean", 0.0, 0.2),
     Law("covariance update", 1.0, 0.2),
@@ -111,6 +115,8 @@ def _broken_law(case: Case) -> str:
                 broken[name] = distance, median
         if broken:
             name, (_, median) = max(broken.items(), key=lambda item: item[1][0])
+            if law.mistake:
+                return law.mistake.format(display_name(name.split("/")[1]))
             label = label_of(name, case.inputs.checkpoint.task).rstrip(",")
             return f"{capitalised(label)} is {median:.2g}, in a correct filter {law.expected:.0f}"
     return ""

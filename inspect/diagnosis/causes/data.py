@@ -26,7 +26,7 @@ CAUSES = (
             Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
         ),
         f"{OBJECT}|object match/*|{CONTACT_DISTANCE}|{LABELS}|{BY_LABELS}|{FILTER}|dynamics nis/*|lag/dynamics/*"
-        "|reading lag/*|reading bias/*|reading drift/*|reading gain/*|reading noise/*|reading scatter/*",
+        "|label shift/*|reading lag/*|reading bias/*|reading drift/*|reading gain/*|reading noise/*|reading scatter/*",
         "Synchronise the clock of the motion capture with the sensors.",
         "advance labels",
     ),

@@ -68,6 +68,9 @@ COVARIANCE = Cause(
 )
 """The update of the mean is correct, that of the covariance is not."""
 
+GATED = -0.2
+"""Prior of missing updates: most gates reject readings because of another fault."""
+
 WEIGHTS = Cause(
     "weights.lost",
     "Particle weights not kept without resampling",
@@ -141,7 +144,7 @@ def _wrong_sign(modalities: Sequence[str]) -> Cause:
     )
 
 
-def in_predictions(cause: Cause, has_true_starts: bool, sensors: Collection[str]) -> Cause:
+def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str]) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates.
 
     Whether the offspring agrees with the weights depends on the resampling alone.
@@ -149,13 +152,13 @@ def in_predictions(cause: Cause, has_true_starts: bool, sensors: Collection[str]
     Args:
         has_true_starts: most statistics of the dynamics are of predictions that start at true states, which other parts
             of the filter, and the sensors, do not change.
-        sensors: components of causes in sensors. Their symptoms are in the readings, which no equation changes, and a
-            wrong update moves the state before that by the next sensor, also in steps from true states.
+        inputs: components of causes in sensors and labels. Their symptoms are in the readings, which no equation
+            changes, and a wrong update moves the state before that by the next sensor, also in steps from true states.
     """
     cause = _in_predictions_of_run(cause)
     if has_true_starts:
         cause = _with_true_starts(cause)
-    if cause.component in sensors:
+    if cause.component in inputs:
         cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|{MODELS}")
     return replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
 
@@ -291,6 +294,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             (Symptom(f"updates/{modality}/*", -1),),
             f"covariance update/*|measurement noise//*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
+            prior=GATED,
         ),
         Cause(
             f"updates.{modality}.absent",

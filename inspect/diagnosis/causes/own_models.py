@@ -36,7 +36,7 @@ def _models(task: Task) -> tuple[Cause, ...]:
 
 def _labels(task: Task) -> tuple[Cause, ...]:
     """Labels of tasks without a measured hand: delayed behind all modalities and, if these cause changes, the controls;
-    or with an offset from all of them.
+    or with an offset from all of them, by the object in images or by the readings of two modalities.
 
     A faulty sensor can make a single modality appear early, so each of them counts.
     """
@@ -49,10 +49,15 @@ def _labels(task: Task) -> tuple[Cause, ...]:
     sensors = [Symptom(f"reading lag/{key}/*", -1, optional=True) for key in modelled_sensors(task)]
     (offset,) = (cause for cause in data.CAUSES if cause.name == "labels.offset")
     objects, *_, common = offset.symptoms
+    objects = replace(objects, otherwise=(Symptom("label shift/*"),))
     biases = [offset_of(modality, 0.3) for modality in task.modalities]
     return (
         replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls, *sensors)),
-        replace(offset, symptoms=(objects, replace(common, optional=True), *biases)),
+        replace(
+            offset,
+            symptoms=(objects, replace(common, optional=True), *biases),
+            consequences=f"{offset.consequences}|reading */*|measurement function/*|innovation spread/*",
+        ),
     )
 
 

@@ -20,6 +20,7 @@ from beliefscope.inspect.diagnosis.checks.images import (
     image_statistics,
     motion_statistics,
 )
+from beliefscope.inspect.diagnosis.checks.label_shift import label_shift_statistics
 from beliefscope.inspect.diagnosis.checks.readings import reading_statistics
 from beliefscope.inspect.diagnosis.checks.vectors import (
     angle_channels,
@@ -63,6 +64,7 @@ def sensor_statistics(
     values |= vector_statistics(episode) | law_statistics(episode)
     values |= contact_distance_statistics(episode, reference)
     values |= window_statistics(episode, reference) | reading_statistics(episode, readings)
+    values |= label_shift_statistics(episode, readings)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1
     return {name: np.nan if ambiguous and name.startswith("opposition/") else value for name, value in values.items()}

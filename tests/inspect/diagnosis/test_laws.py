@@ -31,13 +31,13 @@ def headline(statistics: dict[str, float], spread: float = 0.01, weighted: bool 
     [
         ({"dynamics effect/control/x": -1.0}, "True effect of control relative to the predicted one in x is -1, in a"),
         ({"likelihood offset/near x/all": -0.6}, "Offset of the particles by the likelihood, in their standard dev"),
-        ({"absent updates/near/all": 1.0}, "Share of steps without a reading that have a measurement of near is 1, "),
+        ({"absent updates/near/all": 1.0}, "The filter updates with near where it has no reading; "),
         ({"dynamics effect/control/x": 1.2, "lost weights//all": 0.1}, "Healthy: "),
         ({"dynamics effect/control/x": 0.1}, "True effect of control"),
         ({"dynamics effect/control/x": 0.1, "dynamics nis/x/all": 1.1}, "Healthy: "),  # a control that is noise
         ({"dynamics effect/control/x": 0.1, "dynamics nis/x/all": 9.0}, "True effect of control"),
         ({"dynamics effect/control/x": -1.0, "dynamics nis/x/all": 1.1}, "True effect of control"),
-        ({"dynamics effect/control/x": 0.4, "lost weights//all": 1.0}, "Share of steps without resampling that do"),
+        ({"dynamics effect/control/x": 0.4, "lost weights//all": 1.0}, "Particle weights are not kept without resampling; "),
     ],
 )
 def test_the_first_broken_law_is_the_headline(statistics: dict[str, float], start: str) -> None:
@@ -60,7 +60,7 @@ def test_updates_with_fusion_weights_are_no_kalman_updates() -> None:
 @pytest.mark.parametrize(
     ("filter_", "start"),
     [
-        (Particles(keeps_weights=False), "Share of steps without resampling that do not keep the weights is 1, "),
+        (Particles(keeps_weights=False), "Particle weights are not kept without resampling; "),
         pytest.param(Particles(offset=0.15), "Offset of the particles by the likelihood", marks=pytest.mark.long),
         pytest.param(Particles(), "Healthy", marks=pytest.mark.long),
         pytest.param(Cart(gain=-1.0), "True effect of control (", marks=pytest.mark.long),
