@@ -65,7 +65,9 @@ def causes_in(checkpoint: Checkpoint, estimates_only: bool = False) -> tuple[Cau
         causes = (*causes, *OF_ESTIMATES)
     if isinstance(checkpoint, ExternalFilter):
         starts, task = has_true_starts(checkpoint), checkpoint.task
-        inputs = {*task.observations, *task.modalities, "labels"}
+        groups = [*task.modalities.items(), *((key, (key,)) for key in task.observations)]
+        # Labels differ from a moved camera by the models of the other modalities.
+        inputs = {name for name, keys in groups if not {*keys} & {*task.images}} | {"labels"}
         return tuple(in_predictions(cause, starts, inputs) for cause in (*causes, *external_causes(task)))
     return causes
 

@@ -152,14 +152,14 @@ def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str])
     Args:
         has_true_starts: most statistics of the dynamics are of predictions that start at true states, which other parts
             of the filter, and the sensors, do not change.
-        inputs: components of causes in sensors and labels. Their symptoms are in the readings, which no equation
+        inputs: components of causes in vector sensors and labels. Their symptoms are in the readings, which no equation
             changes, and a wrong update moves the state before that by the next sensor, also in steps from true states.
     """
     cause = _in_predictions_of_run(cause)
     if has_true_starts:
         cause = _with_true_starts(cause)
     if cause.component in inputs:
-        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|{MODELS}")
+        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|innovation offset/*|innovation spread/*")
     return replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
 
 
