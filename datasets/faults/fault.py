@@ -50,6 +50,11 @@ class Span:
     first: int
     dt: float
 
+    @property
+    def elapsed(self) -> NDArray[np.float64]:
+        """(T,) s since the first active step; negative before it."""
+        return np.asarray(self.dt * (np.arange(len(self.at)) - self.first))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:

@@ -64,7 +64,7 @@ class ForceDrift(Fault):
     z: float = number_field(0.0, "N/s", "drift rate along z")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + axis_values(self, readings) * span.dt * (np.arange(len(readings)) - span.first)[:, None]
+        return readings + axis_values(self, readings) * span.elapsed[:, None]
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,7 @@ class SensorDrift(SensorFault):
     rate: float = number_field(0.1, "units of the sensor per second", "growth of the bias")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        since = span.dt * (np.arange(len(readings)) - span.first)
-        return readings + self.rate * since.reshape(-1, *(1,) * (readings.ndim - 1))
+        return readings + self.rate * span.elapsed.reshape(-1, *(1,) * (readings.ndim - 1))
 
 
 @dataclass(frozen=True)

@@ -58,17 +58,20 @@ class ComparedReadings:
         steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(self.present))]
         return steps[:: 1 + len(steps) // MAX_PAIRS]
 
-    def errors(self, delay: int = 0) -> Array:
-        """(2, A, A): mean square of reading i minus plus or minus expected reading j, of ``pairs``.
+    def errors(self, delay: int = 0, others: Array | None = None) -> Array:
+        """(2, B, A): mean square of reading i minus plus or minus expected reading j, of ``pairs``.
 
         Relative to the square of channel j's noise: about 1 if reading i is of channel j. NaN for too few steps.
+
+        Args:
+            others: (T, B) readings of other channels; default: those of the A channels of the model.
         """
         steps = self.steps(delay)
-        readings, expected = self.measured[steps], self.expected[steps - delay]
+        readings, expected = (self.measured if others is None else others)[steps], self.expected[steps - delay]
         if len(readings) < MIN_STEPS:
-            return np.full((2, readings.shape[1], readings.shape[1]), np.nan)
+            return np.full((2, readings.shape[1], expected.shape[1]), np.nan)
         signs = np.array([1.0, -1.0])[:, None, None, None]
-        difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, A, A)
+        difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, B, A)
         return np.asarray(np.square(self.model.relative(difference)).mean(1))
 
 

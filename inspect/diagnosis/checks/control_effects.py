@@ -49,6 +49,9 @@ def control_effects(
     spacing = max(1, min(size, len(steps) // (state.shape[1] + size + 2 * LEAST)))  # controls take turns in a run
     for first in range(0, size, spacing):  # the same steps have the same random numbers in each run
         channel = first + np.arange(len(steps)) % spacing
+        channels = [i for i in range(first, min(first + spacing, size)) if i not in flags]
+        if not channels:
+            continue
         chosen = channel[:, None] == np.arange(size)
         others = np.where(chosen, np.median(trace.episode.controls, axis=0), controls)
         without = predictions_by_calls(trace, checkpoint, steps, predictions.calls, others)
@@ -56,7 +59,7 @@ def control_effects(
             return {}
         effect = measures.wrapped(task, predictions.change - without.change)
         rest = measures.wrapped(task, change - without.change)
-        for i in (i for i in range(first, min(first + spacing, size)) if i not in flags):
+        for i in channels:
             own = chosen[:, i]
             slopes = _slopes(rest[own], effect[own], np.column_stack([state, np.delete(controls, i, axis=1)])[own])
             for component, slope in zip(task.components, slopes, strict=True):

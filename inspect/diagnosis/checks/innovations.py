@@ -43,7 +43,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     used = np.isfinite(nu) & (variance > 0.0)
     deviation = np.sqrt(np.where(used, variance, np.nan))
     accepted = accepted_channels(trace, np.isfinite(nu), keep)
-    squared = squared_innovations(trace)
+    squared = None if trace.accepted is None else squared_innovations(trace)
     extreme = np.zeros(used.shape[:2], bool) if squared is None else are_extreme(*squared)[keep]
     values: dict[str, float] = {}
     names = channel_names(trace, pair[0])

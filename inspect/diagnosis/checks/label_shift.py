@@ -21,10 +21,12 @@ def label_shift_statistics(episode: Episode, models: Sequence[ReadingModel]) -> 
 
     The shift of the position on the map has the least squared errors of all sensors together. The value is that of the
     modality with the second largest ratio, and at least 0: a bias of one sensor is no shift of the labels, which would
-    increase the errors of the other sensors. Absent unless two modalities have models.
+    increase the errors of the other sensors. Absent unless two modalities have models, and without a position.
     """
     task = episode.task
     components = [i for i in task.map_indices if task.components[i].unit in LENGTHS]
+    if not components:
+        return {}
     parts: dict[str, tuple[Array, Array]] = {}
     for model in (model for model in models if model.channels and model.key != CONTROL):
         modality = next((name for name, keys in task.modalities.items() if model.key in keys), "")
@@ -51,6 +53,6 @@ def _errors_and_slopes(episode: Episode, model: ReadingModel, components: Sequen
         moved = model.expected(replace(episode, states=(states + shift).astype(np.float32)))
         slopes.append((moved - compared.expected)[steps] / shift[i] / model.noise)
     errors = (compared.readings - compared.expected)[steps] / model.noise
-    all_slopes = np.stack(slopes, axis=-1) if slopes else np.empty((*errors.shape, 0))
+    all_slopes = np.stack(slopes, axis=-1)
     known = np.isfinite(errors) & np.isfinite(all_slopes).all(-1)
     return errors[known], all_slopes[known]

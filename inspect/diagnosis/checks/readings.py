@@ -84,7 +84,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         inverted = _evidence(np.diagonal(errors[0]), np.diagonal(errors[1]), FITS)
         all_readings = readings_of(episode, model.key)
         others = np.delete(all_readings, model.channels, axis=1)
-        replaced = _evidence(own, _least_errors(compared, others, whole), FITS)
+        replaced = _evidence(own, compared.errors(whole, others).min((0, 1), initial=np.inf), FITS)
         count = all_readings.shape[1]
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
@@ -176,17 +176,6 @@ def _clustered(terms: Array) -> Array:
     """(A,) standard errors of sums of terms (S, A) with a mean of 0, which depend on each other within ``BLOCKS``."""
     starts = np.linspace(0, len(terms), BLOCKS, endpoint=False).astype(int)
     return np.asarray(np.sqrt(np.square(np.add.reduceat(terms, starts, axis=0)).sum(0)))
-
-
-def _least_errors(compared: ComparedReadings, others: Array, delay: int) -> Array:
-    """(A,) smallest mean square error of other readings (T, B) of either sign; infinite without any."""
-    steps = compared.steps(delay)
-    expected = compared.expected[steps - delay]
-    result = np.full(expected.shape[1], np.inf)
-    for signed in (others, -others) if len(steps) >= MIN_STEPS else ():
-        errors = np.square(compared.model.relative(signed[steps, :, None] - expected[:, None])).mean(0)
-        result = np.minimum(result, errors.min(0, initial=np.inf))
-    return result
 
 
 def _evidence(error: Array, other: Array, limit: float) -> Array:

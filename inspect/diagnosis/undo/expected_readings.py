@@ -53,15 +53,8 @@ def detrend(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | 
     errors = np.concatenate([np.subtract(*one.pairs()) for one in compared])
     if len(steps) < MIN_STEPS:
         return None
-    (slope, offset), channels = np.polyfit(steps, errors, 1), list(model.channels)
-
-    def restored(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        result = values.copy()
-        own = values[:, channels] - offset - slope * np.arange(len(values))[:, None]
-        result[:, channels] = np.where(model.is_angle, wrapped(own), own)
-        return result
-
-    return with_readings(inputs, key, restored)
+    slope, offset = np.polyfit(steps, errors, 1)
+    return _with_channels(inputs, model, lambda own: own - offset - slope * np.arange(len(own))[:, None])
 
 
 def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -113,15 +106,20 @@ def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], 
     gain = gain_of(readings, expected) if len(readings) >= MIN_STEPS else np.zeros(1)
     if (np.abs(gain) < SMALLEST_GAIN).any():
         return None
-    offset, channels = readings.mean(0) - gain * expected.mean(0), list(model.channels)
+    offset = readings.mean(0) - gain * expected.mean(0)
+    return _with_channels(inputs, model, lambda own: (own - offset) / gain)
+
+
+def _with_channels(inputs: RunInputs, model: ReadingModel, change: Callable[[Array], Array]) -> RunInputs | None:
+    """Changed readings (T, A) of the channels of a sensor that have a model; angles are wrapped."""
+    channels = list(model.channels)
 
     def restored(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
-        result = values.copy()
-        own = (values[:, channels] - offset) / gain
+        result, own = values.copy(), change(values[:, channels])
         result[:, channels] = np.where(model.is_angle, wrapped(own), own)
         return result
 
-    return with_readings(inputs, key, restored)
+    return with_readings(inputs, model.key, restored)
 
 
 def _reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:

@@ -37,7 +37,10 @@ def headline(statistics: dict[str, float], spread: float = 0.01, weighted: bool 
         ({"dynamics effect/control/x": 0.1, "dynamics nis/x/all": 1.1}, "Healthy: "),  # a control that is noise
         ({"dynamics effect/control/x": 0.1, "dynamics nis/x/all": 9.0}, "True effect of control"),
         ({"dynamics effect/control/x": -1.0, "dynamics nis/x/all": 1.1}, "True effect of control"),
-        ({"dynamics effect/control/x": 0.4, "lost weights//all": 1.0}, "Particle weights are not kept without resampling; "),
+        (
+            {"dynamics effect/control/x": 0.4, "lost weights//all": 1.0},
+            "Particle weights are not kept without resampling; ",
+        ),
     ],
 )
 def test_the_first_broken_law_is_the_headline(statistics: dict[str, float], start: str) -> None:

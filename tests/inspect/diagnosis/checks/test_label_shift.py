@@ -72,6 +72,11 @@ def test_one_sensor_of_the_position_cannot_tell() -> None:
     assert label_shift_statistics(shifted(drive(100), (2.0, 0.0)), others[:1]) == {}
 
 
+def test_states_without_a_position_have_no_shift() -> None:
+    heated = replace(TASK, components=tuple(replace(component, unit="K") for component in TASK.components))
+    assert label_shift_statistics(replace(drive(100), task=heated), models()) == {}
+
+
 def test_the_cause_is_the_labels_and_not_each_of_the_sensors() -> None:
     deviations = [Deviation("label shift//all", 3.0, 0.0, 0.0, 0.1, 0.0, True, 20.0)]
     for key in ("gps", "radio"):
