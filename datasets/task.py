@@ -168,7 +168,7 @@ class Task:
         observations: observation key -> shape per step, e.g. ``{"image": (32, 32), "force": (3,)}``: (d,) a vector,
             (H, W) a gray and (H, W, 3) an RGB image.
         modalities: modality -> its observation keys. The built-in networks take one gray image, or vectors.
-        control_size: length of the control vector.
+        control_size: length of the control vector; 0 without controls.
         dt: seconds per step.
         map_components: the two components of the likelihood map (x to the right, y up), or one, whose map is a curve.
             ``main_error`` is the error in them. Default: the first two if they have the same unit, else the first.

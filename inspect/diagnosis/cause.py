@@ -203,11 +203,12 @@ class Diagnosis:
 
     Attributes:
         state: ``healthy``; ``fault``: the first cause is probable; ``unsure``: a fault, whose cause is not certain.
-        masked: whether a sensor is faulty and the filter is unaffected.
+        masked: whether there is a fault while the errors of the filter are in the healthy range.
         headline: one sentence.
         causes: most probable first; empty if healthy.
         deviations: largest ones, whatever their cause, also if healthy.
         provenance: task, filter, hash, episodes, healthy record, and what was compared and what was not.
+        unmeasured: what the diagnosis could not judge, and therefore does not call healthy.
     """
 
     state: Literal["healthy", "fault", "unsure"]
@@ -216,6 +217,10 @@ class Diagnosis:
     causes: tuple[Candidate, ...]
     deviations: tuple[Evidence, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def unmeasured(self) -> tuple[str, ...]:
+        return tuple(self.provenance.get("unmeasured", ()))
 
     @property
     def listed(self) -> tuple[Candidate, ...]:
@@ -239,7 +244,7 @@ class Diagnosis:
         The largest deviations take the place of causes if none is listed.
         """
         causes = self.listed
-        unmeasured = tuple((text,) for text in self.provenance.get("unmeasured", ()))
+        unmeasured = tuple((text,) for text in self.unmeasured)
         missing = [Table("Not measured in these episodes", ("sensor or statistic",), unmeasured)] if unmeasured else []
         if not causes:
             largest = [((), deviation) for deviation in self.deviations]
