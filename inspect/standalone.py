@@ -21,8 +21,10 @@ from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import modalities_of, standalone_evidence
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import part_of
+from beliefscope.inspect.traces.data import check_origin, standalone_provenance
 from beliefscope.inspect.traces.external_replay import run_alone
-from beliefscope.inspect.traces.run import assemble_trace, run_arrays
+from beliefscope.inspect.traces.run import assemble_trace, join_parts, run_parts
 
 
 def check_standalone(checkpoint: Checkpoint, modality: str) -> None:
@@ -57,18 +59,13 @@ def standalone_errors(
 ) -> list[measures.Array]:
     """Errors (T, K, n) of the standalone filter of each of the K input modalities, by trace; m and rad."""
     modalities = modalities_of(checkpoint)
-    runs = len(traces) * len(modalities)
-    errors = []
+    errors, runs = [], len(traces) * len(modalities)
     for i, trace in enumerate(traces):
-        alone = []
-        for k, modality in enumerate(modalities):
-
-            def share(done: float, index: int = i * len(modalities) + k) -> None:
-                if progress is not None:
-                    progress((index + done) / runs)
-
-            alone.append(measures.errors(standalone(checkpoint, trace, modality, share))[:, -1])
-        errors.append(np.stack(alone, axis=1))
+        alone = [
+            standalone(checkpoint, trace, modality, part_of(progress, i * len(modalities) + k, runs))
+            for k, modality in enumerate(modalities)
+        ]
+        errors.append(np.stack([measures.errors(run)[:, -1] for run in alone], axis=1))
     return errors
 
 
@@ -95,15 +92,13 @@ def standalone(
     check_standalone(checkpoint, modality)
     if isinstance(checkpoint, ExternalFilter):
         return run_alone(checkpoint, trace, modality, progress)
-    if trace.checkpoint_hash != checkpoint.hash:
-        raise BadInput(f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}")
+    check_origin(checkpoint, trace)
     filter_ = checkpoint.filter
     batch = Steps.from_episodes(filter_.task, [trace.episode]).episode(0)
     evidence = standalone_evidence(filter_, batch, filter_.encode(batch), modality)
     start, generator = first_belief(filter_, batch), torch.Generator().manual_seed(trace.seed)
     particles = int(trace.settings["particles"])
     kept = particles if trace.particles is None else trace.particles.shape[1]
-    arrays = run_arrays(checkpoint, [evidence], len(trace), start, generator, particles, kept, progress)
-    settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
-    provenance = {name: getattr(trace, name) for name in ("data_hash", "episode_index", "seed", "faults")}
-    return assemble_trace(checkpoint, trace.episode, start, arrays, **provenance, settings=settings)
+    parts = run_parts(checkpoint, [evidence], len(trace), start, generator, particles, kept, progress)
+    arrays = join_parts(parts, len(trace))
+    return assemble_trace(checkpoint, trace.episode, start, arrays, **standalone_provenance(trace, modality))

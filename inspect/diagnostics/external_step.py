@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import check_name
+from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.external.calls import dtype_of, inputs_of
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.external_replay import check_origin
+from beliefscope.inspect.traces.data import check_origin, check_step
 
 
 class ExternalStep:
@@ -29,10 +29,9 @@ class ExternalStep:
     def __init__(self, external: ExternalFilter, trace: Trace, step: int) -> None:
         """Raises BadInput if the trace is of another filter, or the filter cannot return to the state."""
         check_origin(external, trace)
-        if not 0 <= step < len(trace):
-            raise BadInput(f"step {step} is not in this trace: it has steps 0 to {len(trace) - 1}")
+        check_step(step, len(trace))
         task, self._external = trace.task, external
-        self._components = {component.name: i for i, component in enumerate(task.components)}
+        self._components = [component.name for component in task.components]
         self.modalities = tuple(task.modalities)
         readings = Steps.from_episodes(task, [trace.episode]).episode(0).observations
         series = [readings[name].float() for name in self.modalities]
@@ -49,14 +48,10 @@ class ExternalStep:
         self._random = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002 - the filter's generators
         before.close()  # restores the generators
 
-    def component(self, name: str) -> ExternalTarget:
+    def target(self, name: str) -> ExternalTarget:
         """Target function of a component of the estimate. Raises BadInput for another name."""
         check_name(f"target of filter {self._external.name!r}", name, self._components)
-        return ExternalTarget(self, self._components[name])
-
-    def by_modality(self, values: tuple[Tensor, ...]) -> Mapping[str, Array]:
-        """Modality -> its values, (1, ...) to (...)."""
-        return {name: value[0].detach().double().numpy() for name, value in zip(self.modalities, values, strict=True)}
+        return ExternalTarget(self, self._external.task, name)
 
     def estimates(self, *inputs: Tensor) -> Tensor:
         """(B, n) SI units: estimates of the step with other inputs, (B, ...) each, one after another."""
@@ -92,10 +87,11 @@ class ExternalStep:
 
 
 class ExternalTarget:
-    """Function of the inputs of a step: a component of the estimate, (B,)."""
+    """Function of the inputs of a step: a component of the estimate, (B,); the interface of ``Target``."""
 
-    def __init__(self, step: ExternalStep, component: int) -> None:
-        self._step, self._component = step, component
+    def __init__(self, step: ExternalStep, task: Task, name: str) -> None:
+        self.name, self._step, self._component = name, step, task.index(name)
+        self.unit, self.factor = task.components[self._component].conversion
 
     def __call__(self, *inputs: Tensor) -> Tensor:
         return self._step.estimates(*inputs)[:, self._component]

@@ -8,9 +8,10 @@ from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.calls import is_stepwise
@@ -18,10 +19,11 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.external_step import ExternalStep
-from beliefscope.inspect.diagnostics.single_step import SingleStep, channels_of
-from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table, Value
+from beliefscope.inspect.diagnostics.single_step import SingleStep, Target, channels_of
+from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.data import check_step
 from beliefscope.inspect.traces.replay import Replay
 
 MIN_CHANGE = 0.05
@@ -156,22 +158,17 @@ class Saliency(Diagnostic):
         return max(candidates)[1] if candidates else ""
 
     def tables(self) -> list[Table]:
-        unit = f" ({self.unit})" if self.unit else ""
-        sums: list[tuple[Value, ...]] = []
-        for attribution in self.attributions:
-            totals = [self.factor * values.sum() for values in attribution.integrated.values()]
-            change = self.factor * (self.value - attribution.value)
-            numbers = [*totals, sum(totals), change, 100.0 * attribution.gap]
-            sums.append((self._baseline(attribution), *map(_rounded, numbers), attribution.points))
-        tables = [
-            Table(
-                f"Integrated gradients of {self.target}{unit}, by modality",
-                ("baseline", *self.inputs, "sum", "change", "error (%)", "points"),
-                tuple(sums),
-            )
-        ]
-        tables = tables if self.attributions else []
-        rows: list[tuple[Value, ...]] = []
+        target, tables = with_unit(self.target, self.unit), []
+        if self.attributions:
+            sums = []
+            for attribution in self.attributions:
+                totals = [self.factor * values.sum() for values in attribution.integrated.values()]
+                change = self.factor * (self.value - attribution.value)
+                numbers = [*totals, sum(totals), change, 100.0 * attribution.gap]
+                sums.append((self._baseline(attribution), *map(_rounded, numbers), attribution.points))
+            heads = ("baseline", *self.inputs, "sum", "change", "error (%)", "points")
+            tables.append(Table(f"Integrated gradients of {target}, by modality", heads, sums))
+        rows = []
         for modality, channels in channels_of(self.task, self.inputs).items():
             for i, channel in enumerate(channels):
                 display_unit, factor = channel.conversion
@@ -182,9 +179,7 @@ class Saliency(Diagnostic):
         if rows:
             baselines = [f"relative to {attribution.baseline}" for attribution in self.attributions]
             head = ("modality", "channel", "unit", "value", "training mean", *baselines, "occlusion")
-            tables.append(
-                Table(f"Integrated gradients and occlusion of {self.target}{unit}, by channel", head, tuple(rows))
-            )
+            tables.append(Table(f"Integrated gradients and occlusion of {target}, by channel", head, rows))
         return tables
 
     def images(self) -> list[ImagePanel]:
@@ -228,30 +223,28 @@ def saliency(
     """
     report = progress or (lambda share: None)
     trace, step = _worst(traces, step)
+    single_step: ExternalStep | SingleStep
     if isinstance(checkpoint, ExternalFilter):
-        return _of_external(checkpoint, trace, target, step, window)
-    replay = Replay(checkpoint, trace, lambda share: report(0.2 * share))
-    replay.check_step(step)
-    single_step = SingleStep(replay, step, at)
+        single_step = ExternalStep(checkpoint, trace, step)
+    else:
+        single_step = SingleStep(Replay(checkpoint, trace, lambda share: report(0.2 * share)), step, at)
     sides = [side for values in single_step.inputs if values.ndim == 3 for side in values.shape[1:]]
-    _check_window(window, sides)
+    if not 1 <= window <= min(sides, default=window):
+        raise BadInput(f"window must be 1 to {min(sides)} pixels, the size of the image, not {window}")
     explained = single_step.target(target or _largest_error(trace, checkpoint, step))
     report(0.2)
-    means = single_step.baseline(black=False)
-    occlusion = occlude(explained, single_step.inputs, means, window)
+    occlusion = occlude(explained, single_step.inputs, single_step.means, window)
     report(0.3)
-    names = list(BASELINES) if sides else [MEAN]
     attributions = []
-    for i, name in enumerate(names):
-        baselines = single_step.baseline(black=name == "black")
-        integrated, points, gap = integrate(explained, single_step.inputs, baselines, MIN_CHANGE / explained.factor)
-        with torch.no_grad():
-            value = float(explained(*baselines))
-        attributions.append(Attribution(name, value, single_step.by_modality(integrated), points, gap))
-        report(0.3 + 0.7 * (i + 1) / len(names))
+    if isinstance(explained, Target):  # the steps of an external filter need not be differentiable
+        names = list(BASELINES) if sides else [MEAN]
+        for i, name in enumerate(names):
+            attributions.append(_attribution(explained, name))
+            report(0.3 + 0.7 * (i + 1) / len(names))
     with torch.no_grad():
         value = float(explained(*single_step.inputs))
     components = [c.name for c in checkpoint.task.components]
+    truth = trace.episode.states[step, components.index(explained.name)] if explained.name in components else None
     return Saliency(
         task=checkpoint.task,
         filter=trace.filter,
@@ -261,51 +254,28 @@ def saliency(
         unit=explained.unit,
         factor=explained.factor,
         value=value,
-        truth=float(trace.episode.states[step, components.index(explained.name)])
-        if explained.name in components
-        else None,
-        inputs=single_step.by_modality(single_step.inputs),
-        means=single_step.by_modality(means),
-        occlusion=single_step.by_modality(occlusion),
+        truth=None if truth is None else float(truth),
+        inputs=_by_modality(single_step, single_step.inputs),
+        means=_by_modality(single_step, single_step.means),
+        occlusion=_by_modality(single_step, occlusion),
         window=window,
         attributions=tuple(attributions),
     )
 
 
-def _of_external(external: ExternalFilter, trace: Trace, target: str | None, step: int, window: int) -> Saliency:
-    """Occlusion only: the steps of an external filter need not be differentiable."""
-    task, single_step = trace.task, ExternalStep(external, trace, step)
-    error = np.abs(measures.errors(trace)[:, -1])
-    relative = error[step] / np.maximum(np.sqrt(np.square(error).mean(0)), 1e-12)
-    component = task.components[int(np.nan_to_num(relative).argmax())] if target is None else None
-    name = target or (component.name if component else "")
-    explained = single_step.component(name)
-    sides = [side for values in single_step.inputs if values.ndim == 3 for side in values.shape[1:]]
-    _check_window(window, sides)
-    index = task.index(name)
-    unit, factor = task.components[index].conversion
-    return Saliency(
-        task=task,
-        filter=trace.filter,
-        episode=trace.episode_index,
-        step=step,
-        target=name,
-        unit=unit,
-        factor=factor,
-        value=float(explained(*single_step.inputs)),
-        truth=float(trace.episode.states[step, index]),
-        inputs=single_step.by_modality(single_step.inputs),
-        means=single_step.by_modality(single_step.means),
-        occlusion=single_step.by_modality(occlude(explained, single_step.inputs, single_step.means, window)),
-        window=window,
-        attributions=(),
-    )
+def _attribution(explained: Target, name: str) -> Attribution:
+    """Integrated gradients from the baseline of this name."""
+    step = explained.step
+    baselines = step.baseline(black=name == "black")
+    integrated, points, gap = integrate(explained, step.inputs, baselines, MIN_CHANGE / explained.factor)
+    with torch.no_grad():
+        value = float(explained(*baselines))
+    return Attribution(name, value, _by_modality(step, integrated), points, gap)
 
 
-def _check_window(window: int, sides: Sequence[int]) -> None:
-    """Raise BadInput for a window that is larger than an image."""
-    if not 1 <= window <= min(sides, default=window):
-        raise BadInput(f"window must be 1 to {min(sides)} pixels, the size of the image, not {window}")
+def _by_modality(step: ExternalStep | SingleStep, values: tuple[Tensor, ...]) -> Mapping[str, Array]:
+    """Modality -> its values, (1, ...) to (...)."""
+    return {name: value[0].detach().double().numpy() for name, value in zip(step.modalities, values, strict=True)}
 
 
 def _worst(traces: Sequence[Trace], step: int | None) -> tuple[Trace, int]:
@@ -313,8 +283,7 @@ def _worst(traces: Sequence[Trace], step: int | None) -> tuple[Trace, int]:
     if step is not None:
         candidates = [trace for trace in traces if 0 <= step < len(trace)]
         if not candidates:
-            longest = max(map(len, traces))
-            raise BadInput(f"step {step} is not in this trace: it has steps 0 to {longest - 1}")
+            check_step(step, max(map(len, traces)))
         return max(candidates, key=lambda trace: measures.main_error(trace)[step, -1]), step
     scores = [np.where(measures.counted(trace), measures.main_error(trace)[:, -1], -1.0) for trace in traces]
     worst = int(np.argmax([score.max() for score in scores]))
@@ -322,10 +291,13 @@ def _worst(traces: Sequence[Trace], step: int | None) -> tuple[Trace, int]:
 
 
 def _largest_error(trace: Trace, checkpoint: Checkpoint, step: int) -> str:
-    """The component of the fused estimate with the largest error in training standard deviations."""
-    _, std = checkpoint.filter.statistics.mean_std("state")
-    error = np.abs(measures.errors(trace)[step, -1]) / std.numpy()
-    return checkpoint.task.components[int(error.argmax())].name
+    """The component of the fused estimate with the largest error, in training standard deviations or by its RMSE."""
+    error = np.abs(measures.errors(trace)[:, -1])
+    if not isinstance(checkpoint, ExternalFilter):
+        _, std = checkpoint.filter.statistics.mean_std("state")
+        return checkpoint.task.components[int((error[step] / std.numpy()).argmax())].name
+    relative = error[step] / np.maximum(np.sqrt(np.square(error).mean(0)), 1e-12)
+    return checkpoint.task.components[int(np.nan_to_num(relative).argmax())].name
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:

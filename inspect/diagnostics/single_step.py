@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +18,6 @@ from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.filters.models.sequence import SequenceModel
 from beliefscope.filters.subsets import input_modalities
-from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.traces.replay import Intervention, Replay, repeat_belief
 
 
@@ -95,9 +94,10 @@ class SingleStep:
             for name, values in zip(self.modalities, self.inputs, strict=True)
         )
 
-    def by_modality(self, values: tuple[Tensor, ...]) -> Mapping[str, Array]:
-        """Modality -> its values, (1, ...) to (...)."""
-        return {name: value[0].detach().double().numpy() for name, value in zip(self.modalities, values, strict=True)}
+    @property
+    def means(self) -> tuple[Tensor, ...]:
+        """Training means of the inputs."""
+        return self.baseline(black=False)
 
     def run(self, *inputs: Tensor) -> tuple[StepTrace, Evidence]:
         """Run the step with other inputs, (B, ...) each, and equal random numbers."""

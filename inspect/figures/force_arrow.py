@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.inspect.figures.scene_shapes import Array
+from beliefscope.inspect.maps.plane import round_up
 from beliefscope.inspect.trace import Trace
 
 RING_DISTANCE = 0.05  # m between the rings
@@ -69,10 +70,7 @@ class DrawnForce:
 
 def ring_spacing(largest: float) -> float:
     """The smallest 1, 2 or 5 times a power of ten, N, for which the largest force has at most ``MAX_RINGS`` rings."""
-    if largest <= 0.0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(largest / MAX_RINGS))
-    return float(next(power * k for k in (1, 2, 5, 10) if power * k * MAX_RINGS >= largest * (1 - 1e-9)))
+    return round_up(largest / MAX_RINGS) if largest > 0.0 else 1.0
 
 
 def _turned(direction: Array) -> Array:

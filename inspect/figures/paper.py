@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
@@ -19,12 +18,21 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, StepAxis, draw_bands, draw_legend, legend_height
+from beliefscope.inspect.diagnostics.plotting import (
+    STYLE,
+    WIDTH,
+    StepAxis,
+    draw_bands,
+    draw_legend,
+    legend_height,
+    new_figure,
+)
 from beliefscope.inspect.maps.map_engine import FINE, LikelihoodMap, MapEngine, Quantity
 from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.data import check_step
 
 STATES = {False: "free motion", True: "contact"}
 """Contact states in panel order."""
@@ -68,8 +76,7 @@ def steps_by_contact(episode: Episode, index: int, selection: Sequence[int] = ()
     counted = np.arange(len(episode)) >= episode.task.first_counted(len(episode))
     steps: dict[bool, int] = {}
     for step in selection:
-        if not 0 <= step < len(episode):
-            raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(episode) - 1}")
+        check_step(step, len(episode), "episode")
         state = bool(contact[step])
         if state in steps:
             where = f"are both in {STATES[state]!r}: select one per state" if with_contact else "are two: select one"
@@ -125,8 +132,7 @@ def maps_figure(
     rows = -(-len(layout) // columns)
     with rc_context(STYLE):
         width = WIDTH * (columns + 0.25) / (PER_ROW + 0.25)
-        figure = Figure(figsize=(width, 2.65 * rows), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(figsize=(width, 2.65 * rows), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for i, (axes, panel) in enumerate(zip(grid.flat, layout, strict=False)):
             image = _draw_map(axes, checkpoint.task, trace, panel, maps[panel.contact])
@@ -240,8 +246,7 @@ def weights_figure(trace: Trace) -> Figure:
         drawn = [*trace.modalities_with_posterior, "fused"]
         legends = 2.0 * legend_height([*map(measures.layer_label, drawn), "truth"])
         height = 1.35 * (len(task.map_indices) + len(columns)) + 0.4 + legends
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(figsize=(WIDTH, height), layout="constrained")
         charts = figure.subplots(len(task.map_indices) + len(columns), 1, sharex=True)
         for axes, i in zip(charts, task.map_indices, strict=False):
             _draw_estimates(axes, trace, i)

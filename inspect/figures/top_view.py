@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon, Rectangle
@@ -24,7 +23,7 @@ from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
 from beliefscope.datasets.task import Task, with_unit
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, new_figure
 from beliefscope.inspect.maps.map_engine import LikelihoodMap
 from beliefscope.inspect.palette import COLOURS, colour, colour_table
 from beliefscope.inspect.statistics import measures
@@ -62,8 +61,7 @@ def draw_step(trace: Trace, step: int, map_: LikelihoodMap | None = None) -> Fig
     task = trace.task
     footprints = scene_footprints(trace, task, step)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH if footprints else HEIGHT + 0.9, HEIGHT), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(figsize=(WIDTH if footprints else HEIGHT + 0.9, HEIGHT), layout="constrained")
         if footprints:
             scene, belief = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
             _draw_scene(scene, footprints, trace, task, step, map_)

@@ -27,6 +27,7 @@ from beliefscope.inspect.maps.map_statistics import has_layer_weights, layer_wei
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.maps.plane import OTHERS, Others, Plane, describe_others, other_components, plane_of
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.data import check_origin, check_step
 
 Doubles = NDArray[np.float64]
 
@@ -111,10 +112,7 @@ class MapEngine:
         """Raises BadInput if the filter has no maps (``no_maps``), or if the trace is from another checkpoint."""
         if why := no_maps(checkpoint, trace):
             raise BadInput(why)
-        if trace.checkpoint_hash != checkpoint.hash:
-            raise BadInput(
-                f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"
-            )
+        check_origin(checkpoint, trace)
         self.checkpoint = checkpoint
         self.trace = trace
         self.task = checkpoint.task
@@ -183,8 +181,7 @@ class MapEngine:
         if quantity not in self.quantities:
             raise BadInput(no_maps(self.checkpoint, self.trace, quantity) or "")
         trace = self.trace
-        if not 0 <= step < len(trace):
-            raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(trace) - 1}")
+        check_step(step, len(trace), "episode")
         if not 2 <= size <= LARGEST:
             raise BadInput(f"a map has 2 to {LARGEST} cells per side, not {size}")
         if angle is not None and not math.isfinite(angle):

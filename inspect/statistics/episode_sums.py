@@ -27,6 +27,7 @@ from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.training.encoder_cache import Images, Tables, cached_encoders, index_images
 from beliefscope.inspect.statistics.calibration import LEVELS, gaussian_level
 from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.traces.batch import part_of
 
 SMALLEST = 1e-9
 """m, rad: lower limit of errors before taking the logarithm."""
@@ -186,7 +187,7 @@ def _sum_block(
             run = _runner(filter_, faulty[faults], batch, images, tables, particles, seed)
             for only in dict.fromkeys(slices[s].only for s in fault_slices):
                 run_slices = [s for s in fault_slices if slices[s].only == only]
-                columns = _columns(task, *run(slices[run_slices[0]], _scaled_progress(progress, done, total)))
+                columns = _columns(task, *run(slices[run_slices[0]], part_of(progress, done, total)))
                 for s in run_slices:
                     sums[:, f, s] = _sum_steps(columns[first:], slices[s].mask(batch)[first:])
                 distance[faults, only][:, f] = np.sqrt(columns[..., n + 1]).T
@@ -278,7 +279,3 @@ def _columns(task: Task, e: Array, covariance: Tensor) -> Array:
 def _sum_steps(columns: Array, mask: Tensor) -> Array:
     """(N, Q): sums of columns (T, N, Q) over the steps of the mask (T, N)."""
     return np.where(mask.numpy()[..., None], columns, 0.0).sum(0)
-
-
-def _scaled_progress(progress: Progress, done: int, total: int) -> Progress:
-    return None if progress is None else lambda share: progress((done + share) / total)

@@ -51,7 +51,7 @@ def trace_all(
     done = 0
     if isinstance(checkpoint, ExternalFilter):
         for index in indices:
-            share = _part(progress, done, 1, len(indices))
+            share = part_of(progress, done, len(indices))
             if restart:
                 yield trace_with_restarts(checkpoint, data[index], index, seed, faults, share)
             else:
@@ -64,7 +64,7 @@ def trace_all(
             checkpoint.check_task(episode)
             lengths.setdefault(len(episode), []).append(index)
         for _, members in sorted(lengths.items()):
-            share = _part(progress, done, len(members), len(indices))
+            share = part_of(progress, done, len(indices), len(members))
             selected = {index: episodes[index] for index in members}
             yield from _run_together(checkpoint, selected, seed, particles, faults, share)
             done += len(members)
@@ -115,7 +115,8 @@ def _run_together(
         )
 
 
-def _part(progress: Progress | None, done: int, size: int, total: int) -> Progress | None:
+def part_of(progress: Progress | None, done: int, total: int, size: int = 1) -> Progress | None:
+    """The progress of the next part of this size of a whole; None without one."""
     return None if progress is None else lambda share: progress((done + share * size) / total)
 
 

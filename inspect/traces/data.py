@@ -14,10 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.notebook_html import html_paragraph, html_table
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.text import plural
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.resampling import effective_sample_size
 
 Array = NDArray[np.float32]
@@ -159,6 +161,32 @@ ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type) and "Mapp
 
 STATIC = ("start_mean", "start_covariance")
 """Arrays of a trace without a step axis."""
+
+PROVENANCE = ("data_hash", "episode_index", "seed", "faults", "settings")
+"""Fields of a trace that identify its run, beside those of the filter."""
+
+
+def provenance_of(trace: Trace) -> dict[str, Any]:
+    """The values of ``PROVENANCE``."""
+    return {name: getattr(trace, name) for name in PROVENANCE}
+
+
+def standalone_provenance(trace: Trace, modality: str) -> dict[str, Any]:
+    """``provenance_of`` a standalone run of a modality, in which the weights of interventions play no part."""
+    settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
+    return provenance_of(trace) | {"settings": settings}
+
+
+def check_origin(checkpoint: Checkpoint, trace: Trace) -> None:
+    """Raise BadInput for a trace of another filter."""
+    if trace.checkpoint_hash != checkpoint.hash:
+        raise BadInput(f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}")
+
+
+def check_step(step: int, steps: int, of: str = "trace") -> None:
+    """Raise BadInput for a step that is not among the steps of a trace or episode."""
+    if not 0 <= step < steps:
+        raise BadInput(f"step {step} is not in this {of}: it has steps 0 to {steps - 1}")
 
 
 def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:

@@ -16,13 +16,11 @@ from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.traces.data import ARRAYS, Trace
+from beliefscope.inspect.traces.data import Trace, check_origin, provenance_of, standalone_provenance
 from beliefscope.inspect.traces.external import run_external
-from beliefscope.inspect.traces.replay import Intervention, Replay, equal
+from beliefscope.inspect.traces.replay import Intervention, Replay, have_equal_arrays
 
 Progress = Callable[[float], None] | None
-
-PROVENANCE = ("data_hash", "episode_index", "seed", "faults", "settings")
 
 
 def open_replay(checkpoint: Checkpoint, trace: Trace, progress: Progress = None) -> Replay | ExternalReplay:
@@ -47,14 +45,8 @@ class ExternalReplay:
         self._state: Any = None
         with suppress(BadInput):  # a filter without snapshots must return to its state in initialize_beliefs
             self._state = external.snapshot()
-        provenance = {name: getattr(trace, name) for name in PROVENANCE}
-        self.original = _run(external, trace.episode, provenance, progress)
-        self.exact = all(equal(getattr(trace, name), getattr(self.original, name)) for name in ARRAYS)
-
-    def check_step(self, step: int) -> None:
-        """Raise BadInput for a step outside the trace."""
-        if not 0 <= step < len(self.original):
-            raise BadInput(f"step {step} is not in this trace: it has steps 0 to {len(self.original) - 1}")
+        self.original = _run(external, trace.episode, provenance_of(trace), progress)
+        self.exact = have_equal_arrays(trace, self.original)
 
     def with_intervention(self, intervention: Intervention) -> Trace:
         """Trace of the run with an intervention, with the original's initial state and random numbers, as ``Replay``.
@@ -67,23 +59,15 @@ class ExternalReplay:
         original = self.original
         intervention.check(self._external, len(original))
         episode = intervention.timed_faults.apply(original.episode, original.seed)
-        interventions = [*original.settings.get("edits", []), intervention.to_json()]
-        provenance = {name: getattr(original, name) for name in PROVENANCE} | {
-            "faults": original.faults + intervention.timed_faults,
-            "settings": {**original.settings, "edits": interventions},
-        }
         if self._state is not None:
             self._external.restore(self._state)
-        return _run(self._external, episode, provenance)
+        return _run(self._external, episode, intervention.provenance_after(original))
 
 
 def run_alone(external: ExternalFilter, trace: Trace, modality: str, progress: Progress = None) -> Trace:
     """Trace of the filter over the trace's episode with one modality only. Raises BadInput as ``standalone``."""
     check_origin(external, trace)
-    settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
-    return _run(
-        external, trace.episode, {name: getattr(trace, name) for name in PROVENANCE} | {"settings": settings}, progress
-    )
+    return _run(external, trace.episode, standalone_provenance(trace, modality), progress)
 
 
 def run_with(
@@ -93,12 +77,6 @@ def run_with(
     episode = with_only(trace.episode, modalities, external.adapter.absent)
     values, _ = external.run([episode], trace.seed, start=start)
     return np.asarray(values["estimate_mean"][:, 0].double().numpy())
-
-
-def check_origin(external: ExternalFilter, trace: Trace) -> None:
-    """Raises BadInput for a trace of another filter."""
-    if trace.checkpoint_hash != external.hash:
-        raise BadInput(f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {external.hash[:12]}")
 
 
 @torch.no_grad()

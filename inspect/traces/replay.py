@@ -23,7 +23,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import WEIGHTED
 from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import standalone_evidence
-from beliefscope.inspect.traces.data import ARRAYS, Trace
+from beliefscope.inspect.traces.data import ARRAYS, Trace, check_origin, check_step, provenance_of
 from beliefscope.inspect.traces.run import assemble_trace, step_arrays, with_fewer_particles
 
 
@@ -92,8 +92,7 @@ class Intervention:
 
     def check(self, checkpoint: Checkpoint, steps: int) -> None:
         """Raise BadInput if the intervention does not fit a filter and an episode of that many steps."""
-        if self.first >= steps:
-            raise BadInput(f"step {self.first} is not in this episode: it has steps 0 to {steps - 1}")
+        check_step(self.first, steps, "episode")
         if self.to > steps:
             raise BadInput(f"step {self.to} is after the last step of this episode, {steps - 1}")
         self.timed_faults.check(checkpoint.task)
@@ -114,6 +113,12 @@ class Intervention:
         total = sum(self.weights.values())
         if len(self.weights) == len(names) and total < 1.0 - 1e-6:
             raise BadInput(f"weights of all modalities sum to {total:g}; they must sum to 1")
+
+    def provenance_after(self, original: Trace) -> dict[str, Any]:
+        """``provenance_of`` a run with a further intervention, this one."""
+        edits = [*original.settings.get("edits", []), self.to_json()]
+        faults = original.faults + self.timed_faults
+        return provenance_of(original) | {"faults": faults, "settings": {**original.settings, "edits": edits}}
 
     def mask(self, steps: int) -> NDArray[np.bool_]:
         """(T,) mask of the steps of the intervention."""
@@ -174,10 +179,7 @@ class Replay:
     @torch.no_grad()
     def __init__(self, checkpoint: Checkpoint, trace: Trace, progress: Callable[[float], None] | None = None) -> None:
         """Raises BadInput if the trace is from another checkpoint. progress: called with the completed fraction."""
-        if trace.checkpoint_hash != checkpoint.hash:
-            raise BadInput(
-                f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"
-            )
+        check_origin(checkpoint, trace)
         filter_ = checkpoint.filter
         self.checkpoint = checkpoint
         self.batch = Steps.from_episodes(filter_.task, [trace.episode]).episode(0)
@@ -200,16 +202,9 @@ class Replay:
             self.steps.append(step)
             if progress is not None:
                 progress((t + 1) / len(trace))
-        names = ("data_hash", "episode_index", "seed", "faults", "settings")
-        self._provenance = {name: getattr(trace, name) for name in names}
         self._kept = 0 if trace.particles is None else trace.particles.shape[1]
-        self.original = self._trace(trace.episode, self.evidence, self.steps, self._provenance)
-        self.exact = all(equal(getattr(trace, name), getattr(self.original, name)) for name in ARRAYS)
-
-    def check_step(self, step: int) -> None:
-        """Raise BadInput for a step outside the trace."""
-        if not 0 <= step < len(self.beliefs):
-            raise BadInput(f"step {step} is not in this trace: it has steps 0 to {len(self.beliefs) - 1}")
+        self.original = self._trace(trace.episode, self.evidence, self.steps, provenance_of(trace))
+        self.exact = have_equal_arrays(trace, self.original)
 
     def generator(self, step: int, kind: type[torch.Generator] = torch.Generator) -> torch.Generator:
         """A generator in the original run's state before a step."""
@@ -238,18 +233,14 @@ class Replay:
             evidence = filter_.encode(batch)
             if self._standalone:
                 evidence = standalone_evidence(filter_, batch, evidence, self._standalone)
-        interventions = [*original.settings.get("edits", []), intervention.to_json()]
-        for values in interventions:
+        provenance = intervention.provenance_after(original)
+        for values in provenance["settings"]["edits"]:
             evidence = self.apply_weights(evidence, Intervention.from_json(values))
         belief, generator = self.beliefs[intervention.first], self.generator(intervention.first)
         steps = self.steps[: intervention.first]
         for t in range(intervention.first, len(self.beliefs)):
             belief, step = filter_.step(belief, evidence[t], generator)
             steps.append(step)
-        provenance = self._provenance | {
-            "faults": original.faults + intervention.timed_faults,
-            "settings": {**original.settings, "edits": interventions},
-        }
         return self._trace(episode, evidence, steps, provenance)
 
     def _trace(
@@ -287,8 +278,7 @@ def repeat_belief(belief: Belief, count: int) -> Belief:
     return type(belief)(*(tensor.expand(count, *tensor.shape[1:]) for tensor in tensors))
 
 
-def equal(a: NDArray[Any] | None, b: NDArray[Any] | None) -> bool:
-    """Whether two arrays of a trace have the same values, NaN included, or are both missing."""
-    if a is None or b is None:
-        return a is b
-    return np.array_equal(a, b, equal_nan=True)
+def have_equal_arrays(first: Trace, second: Trace) -> bool:
+    """Whether two traces have the same arrays with the same values, NaN included."""
+    pairs = [(getattr(first, name), getattr(second, name)) for name in ARRAYS]
+    return all(a is b if a is None or b is None else np.array_equal(a, b, equal_nan=True) for a, b in pairs)

@@ -65,17 +65,9 @@ def trace(
     if isinstance(checkpoint, ExternalFilter):
         return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
     run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
-    arrays = run_arrays(
-        checkpoint,
-        encoded(run.filter, run.episode),
-        len(episode),
-        run.start,
-        run.generator(),
-        particles,
-        particles_kept,
-        progress,
-    )
-    return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
+    blocks, total = encoded(run.filter, run.episode), len(episode)
+    parts = run_parts(checkpoint, blocks, total, run.start, run.generator(), particles, particles_kept, progress)
+    return assemble_trace(checkpoint, run.episode, run.start, join_parts(parts, total), **run.provenance)
 
 
 @torch.no_grad()
@@ -161,25 +153,11 @@ def _batch(filter_: Filter, episode: Episode) -> Batch:
 
 
 @one_thread()  # the tensors of one trajectory are too small for several
-def run_arrays(
-    checkpoint: Checkpoint,
-    blocks: Iterable[Evidence],
-    total: int,
-    start: Gaussian,
-    generator: torch.Generator,
-    particles: int,
-    particles_kept: int = PARTICLES_KEPT,
-    progress: Callable[[float], None] | None = None,
-) -> dict[str, Tensor]:
-    """Run a filter over consecutive evidence with N = 1; the arrays (T, ...) of its trace.
-
-    Args:
-        total: T.
-        progress: called with the completed fraction, 0..1.
-    """
+def join_parts(parts: Iterable[dict[str, Tensor]], total: int) -> dict[str, Tensor]:
+    """The arrays (T, ...) of a trace from those of ``run_parts``, which run in one thread. total: T."""
     arrays: dict[str, Tensor] = {}
     done = 0
-    for part in run_parts(checkpoint, blocks, total, start, generator, particles, particles_kept, progress):
+    for part in parts:
         first, done = done, done + len(part["estimate_mean"])
         if done - first == total:
             return part
@@ -200,7 +178,11 @@ def run_parts(
     particles_kept: int,
     progress: Callable[[float], None] | None,
 ) -> Iterator[dict[str, Tensor]]:
-    """Yields the arrays (T, ...) of consecutive blocks of steps. Arguments as for ``run_arrays``.
+    """Run a filter over consecutive evidence with N = 1; yields the arrays of its trace by block of steps.
+
+    Args:
+        total: number of all steps.
+        progress: called with the completed fraction, 0..1.
 
     Raises BadInput for ``particles_kept`` below 1.
     """
