@@ -33,7 +33,7 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
         for name in metrics.get(key, {})
     ]
     rows += [(name, _number(metrics[name]), "", "") for name in ("nll", "nees", "coverage95")]
-    tables = [Table(title, ("measure", "filter", *metrics["baselines"]), tuple(rows))]
+    tables = [Table(title, ("measure", "filter", *metrics["baselines"]), rows)]
     errors = {
         label.format(name): (metrics[key][name] or {}).get("rmse", {})
         for name in metrics.get("standalone", {})
@@ -44,7 +44,7 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
         rows = [(f"rmse {name}", *(_number(rmse.get(name)) for rmse in errors.values())) for name in metrics["rmse"]]
         failing = [name for name, alone in metrics["standalone"].items() if alone is None]
         note = f"The filter fails with {' and with '.join(map(display_name, failing))} only." if failing else ""
-        tables.append(Table("Modalities", ("measure", *errors), tuple(rows), note))
+        tables.append(Table("Modalities", ("measure", *errors), rows, note))
     return tables
 
 

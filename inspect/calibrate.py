@@ -75,18 +75,14 @@ class CalibrationReport(Diagnostic):
             (layer, c.scale, c.ellipsoid, *(units[name][1] * c.distances[name] for name in names))
             for layer, c in self.calibration.layers.items()
         ]
-        columns = (
-            "layer",
-            "covariance x",
-            "ellipsoid sigma",
-            *(f"{display_name(n)} {units[n][0]}".rstrip() for n in names),
-        )
+        distances = (f"{display_name(n)} {units[n][0]}".rstrip() for n in names)
+        columns = ("layer", "covariance x", "ellipsoid sigma", *distances)
         regions = tuple(dict.fromkeys(c.region for c in self.coverage))
         cells = {(c.layer, c.phase, c.region): f"{100 * c.share:.1f}{_interval(c)}" for c in self.coverage}
         keys = dict.fromkeys((c.layer, c.phase, c.episodes) for c in self.coverage)
-        lines = tuple((*key, *(cells.get((*key[:2], region)) for region in regions)) for key in keys)
+        lines = [(*key, *(cells.get((*key[:2], region)) for region in regions)) for key in keys]
         return [
-            Table(f"Calibration from {plural(self.calibration.episodes, 'episode')}", columns, tuple(rows)),
+            Table(f"Calibration from {plural(self.calibration.episodes, 'episode')}", columns, rows),
             Table(
                 f"Coverage % of {percent(self.calibration.level, 'g')} regions",
                 ("layer", "phase", "episodes", *map(display_name, regions)),

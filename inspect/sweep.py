@@ -235,7 +235,9 @@ def summary(trace: Trace) -> Iterator[Row]:
     error = measures.errors(trace)[:, -1]
     squared = {key: values.numpy() for key, values in squares(trace.task, torch.from_numpy(error)).items()}
     main, components = trace.task.main_error.key, [component.key for component in trace.task.components]
-    columns = {"nees": measures.nees(trace)[:, -1]} | _probabilities(trace, error.shape[-1])
+    columns = {"nees": measures.nees(trace)[:, -1], "nll": measures.nll(trace)[:, -1]}
+    squared_sigmas, limit = error.shape[-1] * columns["nees"], chdtri(error.shape[-1], 0.05)
+    columns["coverage95"] = np.where(np.isnan(squared_sigmas), np.nan, squared_sigmas <= limit)
     if trace.effective_sample_size is not None and trace.particle_count:
         columns["ess"] = trace.effective_sample_size / trace.particle_count
     for kind, weights in (("beta", trace.weights), ("weight", trace.effective_weights)):
@@ -272,17 +274,6 @@ def summary(trace: Trace) -> Iterator[Row]:
             "worst_time": None if episode.time is None else float(episode.time[at]),
             **{key: float(np.mean(values[mask])) for key, values in columns.items()},
         }
-
-
-def _probabilities(trace: Trace, n: int) -> dict[str, measures.Array]:
-    """(T,) of each step: negative log-likelihood of the truth, and whether it is in the 95 % ellipsoid."""
-    if not trace.has_covariance:
-        missing = np.full(len(trace), math.nan)
-        return {"nll": missing, "coverage95": missing}
-    squared = n * measures.nees(trace)[:, -1]
-    determinant = np.linalg.slogdet(measures.covariances(trace)[:, -1])[1]
-    nll = 0.5 * (squared + determinant + n * math.log(2.0 * math.pi))
-    return {"nll": nll, "coverage95": np.where(np.isnan(squared), np.nan, squared <= chdtri(n, 0.05))}
 
 
 def find_checkpoints(patterns: Iterable[str]) -> tuple[Path, ...]:

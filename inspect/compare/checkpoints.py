@@ -123,73 +123,42 @@ class CheckpointComparison(Diagnostic):
         errors, beliefs = ([d for d in self.differences if d.is_error is kind] for kind in (True, False))
         by_slice = ("slice", "measure", "unit", "before", "after")
         by_change = ("slice", "measure", "before -> after", "change", "95 % interval")
-        slices = Table(
-            "Slices",
-            ("slice", "faults", "phase", "only", "episodes", "steps"),
-            tuple(map(_slice_row, self.slices)),
-        )
+        error_rows = [(*_numbers(d), *map(_percent, (d.effect, d.low, d.high)), d.outcome) for d in errors]
+        belief_rows = [(*_numbers(d), *(round(x, 4) for x in (d.effect, d.low, d.high)), d.outcome) for d in beliefs]
         return [
             *(
-                Table(title, by_change, tuple(rows[:MAX_ROWS]), CHANGE_NOTE)
+                Table(title, by_change, rows[:MAX_ROWS], CHANGE_NOTE)
                 for title, changes in (("Improvements", self.improvements()), ("Regressions", self.regressions()))
                 if (rows := [(d.slice, _title(d), *_change_texts(d)) for d in changes])
             ),
-            Table(
-                "Errors by slice (RMSE)",
-                (*by_slice, "change %", "low %", "high %", "result"),
-                tuple((*_numbers(d), *(_percent(x) for x in (d.effect, d.low, d.high)), d.outcome) for d in errors),
-            ),
-            Table(
-                "Beliefs by slice",
-                (*by_slice, "effect", "low", "high", "result"),
-                tuple((*_numbers(d), *(_rounded(x) for x in (d.effect, d.low, d.high)), d.outcome) for d in beliefs),
-                EFFECT_NOTE,
-            ),
+            Table("Errors by slice (RMSE)", (*by_slice, "change %", "low %", "high %", "result"), error_rows),
+            Table("Beliefs by slice", (*by_slice, "effect", "low", "high", "result"), belief_rows, EFFECT_NOTE),
             self.event_table(),
             *([self.module_table()] if self.modules else []),
-            slices,
+            Table.from_rows("Slices", [*map(_slice_row, self.slices)]),
         ]
 
     def module_table(self) -> Table:
         """One row per changed or outermost frozen module."""
-        columns = (
-            "module",
-            "class",
-            "parameters",
-            "gradient",
-            "weights changed %",
-            "output drift %",
-            "frozen",
-            "SHA-256",
-        )
         names = {m.name for m in self.modules if not m.unchanged and m.name.count(".") < DEPTH} | {*self.frozen}
-        rows = (_module_row(m) for m in self.modules if m.name in names)
-        return Table("Modules", columns, tuple(rows))
+        return Table.from_rows("Modules", [_module_row(m) for m in self.modules if m.name in names])
 
     def event_table(self) -> Table:
         """One row per regressed event."""
         timed = any(m.time is not None for m in self.events)
         time = ("time (s)",) if timed else ()
         contact = ("contact",) if any(size.slice.contact is not None for size in self.slices) else ()
-        columns: tuple[str, ...] = ("slice", "episode", "step", *time, "from", "to", *contact)
         unit, factor = self.conversion
-        columns += tuple(with_unit(name, unit) for name in ("before", "after", "increase"))
-        rows = tuple(
+        errors = (with_unit(name, unit) for name in ("before", "after", "increase"))
+        rows = [
             (
-                m.slice,
-                m.episode,
-                m.step,
-                *((m.time,) if timed else ()),
-                m.first,
-                m.last,
+                *(m.slice, m.episode, m.step, *((m.time,) if timed else ()), m.first, m.last),
                 *(("yes" if m.contact else "no",) if contact else ()),
-                factor * m.before,
-                factor * m.after,
-                factor * (m.after - m.before),
+                *(factor * m.before, factor * m.after, factor * (m.after - m.before)),
             )
             for m in self.events
-        )
-        return Table("Regressed events", columns, rows)
+        ]
+        return Table("Regressed events", ("slice", "episode", "step", *time, "from", "to", *contact, *errors), rows)
 
     def plots(self) -> list[Plot]:
         """Main error by slice; calibration of the first slice and of the slice that changed most."""
@@ -367,25 +336,33 @@ def _numbers(d: Difference) -> tuple[Value, ...]:
     return d.slice, _title(d), unit, before, after
 
 
-def _percent(effect: float) -> float | None:
-    return round(100.0 * math.expm1(min(effect, 30.0)), 2) if math.isfinite(effect) else None
+def _percent(effect: float) -> float:
+    return round(100.0 * math.expm1(min(effect, 30.0)), 2)
 
 
-def _rounded(effect: float) -> float | None:
-    return round(effect, 4) if math.isfinite(effect) else None
-
-
-def _slice_row(size: SliceSize) -> tuple[Value, ...]:
+def _slice_row(size: SliceSize) -> dict[str, Value]:
     slice_ = size.slice
-    phase = "all" if slice_.contact is None else "contact" if slice_.contact else "free motion"
-    return slice_.name, str(slice_.faults), phase, " + ".join(slice_.only), size.episodes, size.steps
+    return {
+        "slice": slice_.name,
+        "faults": str(slice_.faults),
+        "phase": "all" if slice_.contact is None else "contact" if slice_.contact else "free motion",
+        "only": " + ".join(slice_.only),
+        "episodes": size.episodes,
+        "steps": size.steps,
+    }
 
 
-def _module_row(m: ModuleChange) -> tuple[Value, ...]:
-    changed, drift = (None if math.isnan(x) else 100.0 * x for x in (m.weights, m.drift))
-    gradient = None if math.isnan(m.gradient) else m.gradient
-    hashes = m.hashes[0][:12] if m.unchanged else " -> ".join(digest[:12] for digest in m.hashes)
-    return m.name, m.kind, m.parameters, gradient, changed, drift, "yes" if m.unchanged else "", hashes
+def _module_row(m: ModuleChange) -> dict[str, Value]:
+    return {
+        "module": m.name,
+        "class": m.kind,
+        "parameters": m.parameters,
+        "gradient": m.gradient,
+        "weights changed %": 100.0 * m.weights,
+        "output drift %": 100.0 * m.drift,
+        "frozen": "yes" if m.unchanged else "",
+        "SHA-256": m.hashes[0][:12] if m.unchanged else " -> ".join(digest[:12] for digest in m.hashes),
+    }
 
 
 def write_comparison(folder: Path, document: Mapping[str, Any], text: str, figure: Figure) -> None:

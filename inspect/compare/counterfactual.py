@@ -161,39 +161,41 @@ class Counterfactual(Diagnostic):
     def tables(self) -> list[Table]:
         main = self.task.main_error
         spans = {"intervention": self.during, "after": slice(self.to, None), "all": slice(None)}
-        rows: list[tuple[Value, ...]] = []
-        for name, span in spans.items():
-            if not len(self.error[span]):
-                continue
-            values = (
-                main.factor * self.error[span].mean(),
-                main.factor * self.counterfactual_error[span].mean(),
-                main.factor * self.distance[span].mean(),
-            )
-            rows.append((name, *map(float, values), _number(self.divergence[span].mean())))
         names = (f"{name}, {main.unit}".rstrip(", ") for name in ("error", "error with intervention", "distance"))
-        columns = ("steps", *names, "divergence, nats")
-        tables = [Table("Mean over steps", columns, tuple(rows))]
-        peaks = tuple(
-            (name, largest, unit, step, *(() if self.time is None else (float(self.time[step]),)))
+        means = [
+            (
+                name,
+                *(main.factor * e[span].mean() for e in (self.error, self.counterfactual_error, self.distance)),
+                _finite(self.divergence[span].mean()),
+            )
+            for name, span in spans.items()
+            if len(self.error[span])
+        ]
+        peaks = [
+            {"component": name, "difference": largest, "unit": unit, "step": step}
+            | ({} if self.time is None else {"time (s)": self.time[step]})
             for name, (largest, step, unit) in self._peaks().items()
-        )
-        heads = ("component", "difference", "unit", "step", *(() if self.time is None else ("time (s)",)))
-        tables.append(Table("Largest difference of the estimates", heads, peaks))
-        if self.modalities:
-            tables.append(self._modality_table())
-        return tables
+        ]
+        return [
+            Table("Mean over steps", ("steps", *names, "divergence, nats"), means),
+            Table.from_rows("Largest difference of the estimates", peaks),
+            *([Table.from_rows("Mean during the intervention", self._of_modalities())] if self.modalities else []),
+        ]
 
-    def _modality_table(self) -> Table:
+    def _of_modalities(self) -> list[dict[str, Value]]:
+        """Rows of a table."""
         main = self.task.main_error
-        columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}".rstrip(", "))
-        change = main.factor * self.modality_distance[self.during].mean(0)
-        rows: list[tuple[Value, ...]] = [(m, float(change[k])) for k, m in enumerate(self.modalities)]
+        columns = {f"change of its update, {main.unit}".rstrip(", "): main.factor * self.modality_distance}
         if self.effective_weights is not None and self.counterfactual_weights is not None:
-            columns = (*columns, "effective weight", "effective weight with intervention")
-            both = (self.effective_weights[self.during].mean(0), self.counterfactual_weights[self.during].mean(0))
-            rows = [(*row, float(both[0][k]), float(both[1][k])) for k, row in enumerate(rows)]
-        return Table("Mean during the intervention", columns, tuple(rows))
+            columns |= {
+                "effective weight": self.effective_weights,
+                "effective weight with intervention": self.counterfactual_weights,
+            }
+        means = {name: values[self.during].mean(0) for name, values in columns.items()}
+        return [
+            {"modality": m, **{name: values[k] for name, values in means.items()}}
+            for k, m in enumerate(self.modalities)
+        ]
 
     def curves(self) -> list[Curve]:
         chart = "Distance between original and counterfactual estimates"
@@ -307,5 +309,5 @@ def _recovery_step(sigmas: Array, to: int) -> int | None:
     return step if step < len(sigmas) else None
 
 
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

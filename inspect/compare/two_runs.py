@@ -21,13 +21,13 @@ from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics.measures import (
     Array,
     blackout,
-    covariances,
     display_units,
     errors,
     layer_label,
     main_error,
     means,
     nees,
+    nll,
     phases,
 )
 from beliefscope.inspect.trace import Trace
@@ -167,7 +167,7 @@ class Comparison(Diagnostic):
                     for k, m in enumerate(self.modalities)
                 ]
         columns = ("phase (steps)", "measure", *self.names, "difference", "difference, %")
-        return [Table("By phase", columns, tuple(rows))]
+        return [Table("By phase", columns, rows)]
 
     def curves(self) -> list[Curve]:
         task = self.task
@@ -242,7 +242,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
     error = np.stack([errors(run)[:, -1] for run in runs], axis=-1)
     on_map = np.stack([main_error(run)[:, -1] for run in runs], axis=-1)
     nees_at = np.stack([nees(run)[:, -1] for run in runs], axis=-1)
-    nll = np.stack([_nll(run) for run in runs], axis=-1)
+    nll_at = np.stack([nll(run)[:, -1] for run in runs], axis=-1)
     share = None
     weights = [run.effective_weights.mean(-1, dtype=np.float64) for run in runs if run.effective_weights is not None]
     if len(weights) == 2 and this.modalities == other.modalities:
@@ -260,7 +260,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         rmse=by_phase(lambda mask: np.sqrt(np.square(error[mask]).mean(0))),
         position=by_phase(lambda mask: np.sqrt(np.square(on_map[mask]).mean(0))),
         nees=by_phase(lambda mask: nees_at[mask].mean(0)),
-        nll=by_phase(lambda mask: nll[mask].mean(0)),
+        nll=by_phase(lambda mask: nll_at[mask].mean(0)),
         effective_weights=None if share is None else by_phase(lambda mask: share[mask].mean(0)),
         distance=distance[:, -1],
         modality_distance=distance[:, :-1],
@@ -278,15 +278,6 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
 def _layers(run: Trace, shared: tuple[str, ...]) -> Array:
     """(T, K + 1, n): single-modality updates of the shared modalities, then the fused estimate."""
     return means(run)[:, [*(run.modalities.index(name) for name in shared), -1]]
-
-
-def _nll(run: Trace) -> Array:
-    """(T,) ``-ln N(x; m, S)`` of the true state x under the fused belief, nats; NaN without a covariance."""
-    if not run.has_covariance:
-        return np.full(len(run), np.nan)
-    n = run.estimate_mean.shape[-1]
-    volume = np.linalg.slogdet(covariances(run)[:, -1]).logabsdet
-    return 0.5 * (n * nees(run)[:, -1] + volume + n * math.log(2.0 * math.pi))
 
 
 def _names(this: Trace, other: Trace) -> tuple[str, str]:

@@ -14,12 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import find_profile
 from beliefscope.inspect.diagnostics.views import Views
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.measures import Mask
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.data import check_origin
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,6 +52,37 @@ class Diagnostic(Views):
         from beliefscope.inspect.diagnostics.plotting import draw_figure  # matplotlib is slow to import
 
         return draw_figure(self, time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunDiagnostic(Diagnostic):
+    """Result over traces of one filter, whose curves have bands of phases.
+
+    Attributes:
+        task, filter, trajectories: of the traces, and their number.
+        contact, blackout: (T,) masks of a single trace; (0,) for several, which have no curves.
+    """
+
+    task: Task
+    filter: str
+    trajectories: int
+    contact: Mask
+    blackout: Mask
+
+    def bands(self) -> dict[str, Mask]:
+        return {"contact": self.contact, "blackout": self.blackout} if len(self.contact) else {}
+
+
+def fields_of(traces: Sequence[Trace]) -> dict[str, Any]:
+    """The fields of a ``RunDiagnostic``."""
+    first, keep = traces[0], drawn_steps(traces)
+    masks = {"contact": first.episode.contact.astype(bool)[:keep], "blackout": measures.blackout(first)[:keep]}
+    return {"task": first.task, "filter": first.filter, "trajectories": len(traces), **masks}
+
+
+def drawn_steps(traces: Sequence[Trace]) -> int:
+    """Number of steps with curves: all of a single trace, 0 for several."""
+    return len(traces[0]) if len(traces) == 1 else 0
 
 
 @dataclass(frozen=True)
@@ -114,14 +149,14 @@ class Entry:
 
     def refusal(self, trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         """One-line reason why the diagnostic cannot be computed, or None."""
-        if self.needs != "trace":
-            if checkpoint is None or isinstance(checkpoint, UnavailableFilter):
-                return f"{self.name} needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
-            if checkpoint.hash != trace.checkpoint_hash:
-                return f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"
         try:
+            if self.needs != "trace":
+                if checkpoint is None or isinstance(checkpoint, UnavailableFilter):
+                    how = "its checkpoint, or --filter FILE.py:FUNCTION"
+                    return f"{self.name} needs the filter, not only its trace: {how}"
+                check_origin(checkpoint, trace)
             return self.why_not(trace, checkpoint)
-        except BadInput as error:  # an external filter lacks the requested property
+        except BadInput as error:  # also if an external filter lacks the requested property
             return str(error)
 
     def __call__(self, traces: Sequence[Trace], checkpoint: Checkpoint | None = None, **options: Any) -> Diagnostic:

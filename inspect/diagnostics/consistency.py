@@ -9,18 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task, display_name, with_unit
+from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import capitalised, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
-from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import NO_RECORD, Entry, RunDiagnostic, drawn_steps, fields_of
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
 from beliefscope.inspect.diagnostics.layer_consistency import LayerConsistency, inconsistency, number
-from beliefscope.inspect.diagnostics.views import Curve, Line, Plot, Table, Value
+from beliefscope.inspect.diagnostics.views import Curve, Line, Plot, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
     LEVELS,
@@ -32,40 +33,30 @@ from beliefscope.inspect.statistics.calibration import (
 )
 from beliefscope.inspect.statistics.innovations import Whiteness, autocorrelations, nis_of, whiteness_of
 from beliefscope.inspect.statistics.intervals import LEVEL, mean_interval, nees_limit, too_few
+from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ALL, FUSED = "all", "fused"
 
 
 @dataclass(frozen=True)
-class Consistency(Diagnostic):
+class Consistency(RunDiagnostic):
     """Result of ``consistency``.
 
     Attributes:
-        task, filter: names.
-        trajectories: number of traces.
         by_layer: all layers in all phases with steps.
         whiteness: by modality and component; Kalman filters only.
         levels: (P,) levels of the calibration curves.
         nees, nis: (T, L), (T, K) NEES / n and NIS / n by step of a single trace; (0, L), (0, K) for several.
-        contact, blackout: (T,) masks of a single trace.
         healthy: comparison with the filter's healthy record, if it has one.
         indefinite: number of counted steps of all traces whose fused covariance is not positive definite.
     """
 
-    task: Task
-    filter: str
-    trajectories: int
     by_layer: tuple[LayerConsistency, ...]
     whiteness: tuple[Whiteness, ...]
     levels: Array
     nees: Array
     nis: Array
-    contact: Mask
-    blackout: Mask
     healthy: Comparison | None = None
     indefinite: int = 0
 
@@ -151,44 +142,36 @@ class Consistency(Diagnostic):
         return f"{text}."
 
     def tables(self) -> list[Table]:
-        task = self.task
-        units, scale = measures.display_units(task)
-        rows: list[tuple[Value, ...]] = []
-        error_rows: list[tuple[Value, ...]] = []
+        rows: list[dict[str, Any]] = []
+        errors: list[dict[str, Any]] = []
         for entry in self.by_layer:
             low, high = entry.interval
             limits = f"at least {_bound(low)}" if math.isinf(high) else f"{_bound(low)} to {_bound(high)}"
-            interval = "" if math.isnan(low) else limits
-            nis = None if math.isnan(entry.nis) else entry.nis
-            head = (measures.layer_label(entry.layer), entry.phase)
-            values = (entry.trajectories, entry.steps, entry.nees, interval, nis, entry.coverage95)
-            rows.append((*head, *values, entry.miscalibration, entry.nll, entry.assessment))
-            components = zip(entry.rmse * scale, entry.sharpness * scale, entry.crps * scale, strict=True)
-            error_rows.append((*head, *(float(value) for component in components for value in component)))
-        columns = ("layer", "phase", "episodes", "steps", "NEES/n", "95 % interval", "NIS/n", "95 % coverage")
-        tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "result"), tuple(rows))]
-        names = [
-            f"{with_unit(c.label, unit)}: {quantity}"
-            for c, unit in zip(task.components, units, strict=True)
-            for quantity in ERROR_QUANTITIES
+            head = {"layer": measures.layer_label(entry.layer), "phase": entry.phase}
+            sizes = {"episodes": entry.trajectories, "steps": entry.steps}
+            nees = {"NEES/n": entry.nees, "95 % interval": "" if math.isnan(low) else limits, "NIS/n": entry.nis}
+            calibration = {"95 % coverage": entry.coverage95, "miscalibration": entry.miscalibration}
+            rows.append(head | sizes | nees | calibration | {"NLL (nats)": entry.nll, "result": entry.assessment})
+            quantities = {"RMSE": entry.rmse, "predicted": entry.sharpness, "CRPS": entry.crps}
+            errors.append(head | measures.by_component(self.task, quantities))
+        tables = [
+            Table.from_rows("Consistency", rows),
+            Table.from_rows("Errors and predicted standard deviations", errors),
         ]
-        title = "Errors and predicted standard deviations"
-        tables.append(Table(title, ("layer", "phase", *names), tuple(error_rows)))
         if self.whiteness:
-            tests = tuple(
-                (t.modality, display_name(t.component), t.autocorrelation, *t.ends, t.statistic, t.p_value)
+            tests = [
+                {
+                    "modality": t.modality,
+                    "component": display_name(t.component),
+                    "autocorrelation at lag 1": t.autocorrelation,
+                    "95 % from": t.low,
+                    "to": t.high,
+                    "Ljung-Box Q": t.statistic,
+                    "p-value if white": t.p_value,
+                }
                 for t in self.whiteness
-            )
-            heads = (
-                "modality",
-                "component",
-                "autocorrelation at lag 1",
-                "95 % from",
-                "to",
-                "Ljung-Box Q",
-                "p-value if white",
-            )
-            tables.append(Table("Whiteness of the innovations", heads, tests))
+            ]
+            tables.append(Table.from_rows("Whiteness of the innovations", tests))
         return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:
@@ -209,9 +192,6 @@ class Consistency(Diagnostic):
             for k, layer in enumerate(names)
         ]
 
-    def bands(self) -> dict[str, Mask]:
-        return {"contact": self.contact, "blackout": self.blackout} if len(self.nees) else {}
-
     def plots(self) -> list[Plot]:
         plots = []
         for phase in self.phases:
@@ -227,8 +207,6 @@ class Consistency(Diagnostic):
 
 INDEFINITE = 1e-3
 """Eigenvalue of a correlation matrix below zero that is not rounding."""
-
-ERROR_QUANTITIES = ("RMSE", "predicted", "CRPS")
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
@@ -255,19 +233,14 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
     for k, layer, phase, where in cells:
         steps = {name: values[where, k] for name, values in pooled.items()}
         by_layer.append(_summarise(layer, phase, owner[where], steps, len(cells)))
-    keep = len(first) if len(traces) == 1 else 0
-    has_nis = nis_of(first) is not None
+    keep, has_nis = drawn_steps(traces), nis_of(first) is not None
     return Consistency(
-        task=first.task,
-        filter=first.filter,
-        trajectories=len(traces),
+        **fields_of(traces),
         by_layer=tuple(by_layer),
         whiteness=tuple(test for test in whiteness_of(traces) if any(test.modality == e.layer for e in by_layer)),
         levels=LEVELS,
         nees=pooled["nees"][:keep],
         nis=pooled["nis"][:keep, : len(first.modalities) if has_nis else 0],
-        contact=first.episode.contact.astype(bool)[:keep],
-        blackout=measures.blackout(first)[:keep],
         healthy=healthy,
         indefinite=sum(
             int(_is_indefinite(trace.estimate_covariance[measures.counted(trace)].astype(float)).sum())
@@ -299,7 +272,7 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
         for phase, mask in phases.items()
     }
     if nis is not None and ALL in phases:
-        values |= {f"nis/{m}/{ALL}": _known_mean(nis[phases[ALL], k]) for k, m in enumerate(trace.modalities)}
+        values |= {f"nis/{m}/{ALL}": measures.known_mean(nis[phases[ALL], k]) for k, m in enumerate(trace.modalities)}
     values |= {f"autocorrelation/{m} {c}/{ALL}": r for (m, c), r in autocorrelations(trace).items()}
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
@@ -326,10 +299,8 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
             from_mean = measures.wrapped(task, deviation - error[:, k, None])
             level[:, k] = particle_level(from_mean, weights[:, k], error[:, k], covariance[:, k])
             crps[:, k] = particle_crps(np.swapaxes(deviation, 1, 2), weights[:, k, None])
-    with np.errstate(invalid="ignore"):  # covariances of a filter that has none are NaN
-        volume = np.linalg.slogdet(covariance)[1]
-    nll = 0.5 * (n * nees + volume + n * math.log(2.0 * math.pi))
-    return {"error": error, "variance": variance, "nees": nees, "nis": nis, "level": level, "nll": nll, "crps": crps}
+    beliefs = {"variance": variance, "nees": nees, "nis": nis, "nll": measures.nll(trace)}
+    return {"error": error, **beliefs, "level": level, "crps": crps}
 
 
 def _summarise(
@@ -353,7 +324,7 @@ def _summarise(
         nees=nees,
         interval=intervals[0],
         adjusted=intervals[1],
-        nis=_known_mean(steps["nis"]),
+        nis=measures.known_mean(steps["nis"]),
         coverage95=float((level <= 0.95).mean()),
         calibration=curve,
         miscalibration=float(np.abs(curve - LEVELS).mean()),
@@ -362,12 +333,6 @@ def _summarise(
         sharpness=np.sqrt(np.maximum(steps["variance"].mean(0), 0.0)),
         crps=steps["crps"].mean(0),
     )
-
-
-def _known_mean(values: Array) -> float:
-    """Mean of the values that are not NaN; NaN without any."""
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else math.nan
 
 
 def _sentence(text: str) -> str:

@@ -146,11 +146,9 @@ class Conventions(Diagnostic):
         for i in np.argsort(-self.share.max(1)):
             numbers = np.stack([self.share[i], self.low[i], self.high[i], self.omitted[i]], axis=1)
             displayed = (numbers if has_intervals else numbers[:, [0, 3]]).ravel()
-            values = (None if np.isnan(v) else 100.0 * float(v) for v in displayed)
-            rows.append((self.changes[i].text, *values, self.changes[i].faults))
+            rows.append((self.changes[i].text, *(100.0 * displayed), self.changes[i].faults))
         note = "Intervals of 95 % for all of them together. Inject the fault to see the run with the change."
-        columns = ("with", *heads, "fault injection")
-        return [Table("Errors with other conventions", columns, tuple(rows), note)]
+        return [Table("Errors with other conventions", ("with", *heads, "fault injection"), rows, note)]
 
     def plots(self) -> list[Plot]:
         """The changes that remove most; bars below -100 %, of errors that more than double, are cut off."""

@@ -110,19 +110,20 @@ class Ensemble(Diagnostic):
         return f"{text} (correlation {best.correlation:.2f})."
 
     def tables(self) -> list[Table]:
-        units, scale = measures.display_units(self.task)
-        rows = tuple(
-            (
-                *(display_name(c.component), unit, c.spread * factor, c.error * factor, c.ratio, c.correlation),
-                *(100.0 * c.outside, 100.0 * c.collapsed),
-            )
-            for c, unit, factor in zip(self.components, units, scale, strict=True)
-        )
-        columns = (
-            *("component", "unit", "spread", "RMSE", "RMSE/spread", "spread-error correlation"),
-            *("outside (% of steps)", "collapsed (% of steps)"),
-        )
-        return [Table(f"Spread and skill, {plural(self.members, 'member')}", columns, rows)]
+        rows = [
+            {
+                "component": display_name(c.component),
+                "unit": unit,
+                "spread": c.spread * factor,
+                "RMSE": c.error * factor,
+                "RMSE/spread": c.ratio,
+                "spread-error correlation": c.correlation,
+                "outside (% of steps)": 100.0 * c.outside,
+                "collapsed (% of steps)": 100.0 * c.collapsed,
+            }
+            for c, unit, factor in zip(self.components, *measures.display_units(self.task), strict=True)
+        ]
+        return [Table.from_rows(f"Spread and skill, {plural(self.members, 'member')}", rows)]
 
     def plots(self) -> list[Plot]:
         bins = len(self.components[0].ranks)

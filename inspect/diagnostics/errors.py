@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Mask
 from beliefscope.inspect.statistics.outages import (
@@ -122,59 +122,47 @@ class Errors(Diagnostic):
         return f"{scale * value:{'.3g' if scale * value < 1000.0 else '.0f'}} {unit}".rstrip()
 
     def tables(self) -> list[Table]:
-        units, factors = measures.display_units(self.task)
         unit, scale = self._unit
-        names = [with_unit(c.label, u) for c, u in zip(self.task.components, units, strict=True)]
-        heads = [f"{name}: {quantity}" for name in names for quantity in ("RMSE", "bias")]
-        rows: list[tuple[Value, ...]] = [
-            (
-                *(g.name, g.steps, scale * g.position, 100.0 * g.share),
-                *(float(v) for pair in zip(g.rmse * factors, g.bias * factors, strict=True) for v in pair),
-            )
+        rows = [
+            {
+                "group": g.name,
+                "steps": g.steps,
+                with_unit(f"{self.task.main_error.name} RMSE", unit): scale * g.position,
+                "squared error (%)": 100.0 * g.share,
+                **measures.by_component(self.task, {"RMSE": g.rmse, "bias": g.bias}),
+            }
             for g in self.groups
         ]
-        columns = ("group", "steps", with_unit(f"{self.task.main_error.name} RMSE", unit), "squared error (%)", *heads)
-        tables = [Table("Errors by group", columns, tuple(rows))]
+        tables = [Table.from_rows("Errors by group", rows)]
         if self.outages:
-            columns = (
-                *(
-                    "sensor",
-                    "outages",
-                    "steps (%)",
-                    "longest (s)",
-                    with_unit("before", unit),
-                    with_unit("during", unit),
-                ),
-                *(with_unit("at the end", unit), "squared error (%)", "recovery (s)", "not recovered"),
-            )
-            numbers = tuple(
-                (
-                    *(o.modality, o.count, 100.0 * o.steps, o.longest),
-                    *(_known(scale * value) for value in (o.before, o.during, o.end)),
-                    *(100.0 * o.share, _known(o.recovery), o.unrecovered),
-                )
+            outages = [
+                {
+                    "sensor": o.modality,
+                    "outages": o.count,
+                    "steps (%)": 100.0 * o.steps,
+                    "longest (s)": o.longest,
+                    with_unit("before", unit): scale * o.before,
+                    with_unit("during", unit): scale * o.during,
+                    with_unit("at the end", unit): scale * o.end,
+                    "squared error (%)": 100.0 * o.share,
+                    "recovery (s)": o.recovery,
+                    "not recovered": o.unrecovered,
+                }
                 for o in self.outages
-            )
-            tables.append(Table("Outages", columns, numbers))
+            ]
+            tables.append(Table.from_rows("Outages", outages))
             columns = ("sensor", "duration (s)", "outages", "steps (%)", with_unit("RMSE", unit), "squared error (%)")
-            tables.append(Table("Outages by duration", columns, tuple(self._durations())))
+            durations = [
+                (o.modality, c.text, c.count, 100.0 * c.steps, scale * math.sqrt(c.square), 100.0 * c.share)
+                for o in self.outages
+                for c in o.classes
+            ]
+            tables.append(Table("Outages by duration", columns, durations))
         if self.readings:
-            columns = (
-                "observation",
-                with_unit("RMSE of its readings", unit),
-                with_unit("RMSE of the estimate there", unit),
-            )
-            numbers = tuple((key, scale * a, scale * b) for key, (a, b) in self.readings.items())
-            tables.append(Table("Estimate and raw readings", columns, numbers))
+            names = (with_unit(f"RMSE of {what}", unit) for what in ("its readings", "the estimate there"))
+            numbers = [(key, scale * a, scale * b) for key, (a, b) in self.readings.items()]
+            tables.append(Table("Estimate and raw readings", ("observation", *names), numbers))
         return tables
-
-    def _durations(self) -> Iterator[tuple[Value, ...]]:
-        """Rows of the classes of outages."""
-        for outage in self.outages:
-            for c in outage.classes:
-                text = f"over {c.low:g}" if math.isinf(c.high) else f"{c.low:g} to {c.high:g}"
-                rmse = self._unit[1] * math.sqrt(c.square)
-                yield outage.modality, text, c.count, 100.0 * c.steps, rmse, 100.0 * c.share
 
     def curves(self) -> list[Curve]:
         unit, scale = self._unit
@@ -183,10 +171,6 @@ class Errors(Diagnostic):
 
     def bands(self) -> dict[str, Mask]:
         return {"outage": np.any(list(self.missing.values()), axis=0)} if self.missing else {}
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import Entry, RunDiagnostic, drawn_steps, fields_of
 from beliefscope.inspect.diagnostics.fusion_gaps import Reason, reasons_of
 from beliefscope.inspect.diagnostics.standalone_modalities import why_not
-from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.standalone import removal_note, standalone_errors
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife, too_few
@@ -62,32 +62,24 @@ class PhaseEfficiency:
 
 
 @dataclass(frozen=True)
-class FusionEfficiency(Diagnostic):
+class FusionEfficiency(RunDiagnostic):
     """Result of ``fusion_efficiency``; K modalities, T steps of a single trace (0 for several).
 
     Attributes:
-        task, filter: of the traces.
         modalities: K names.
-        trajectories: number of traces.
         phases: efficiencies by phase.
         reasons: all measured reasons for a gap, contributing or not.
         fused, best: (T,) m, position errors of the filter and of the best combination.
         standalone: (T, K) m, position errors of the standalone filters.
-        contact, blackout: (T,) masks.
         note: ``removal_note`` of the filter.
     """
 
-    task: Task
-    filter: str
     modalities: tuple[str, ...]
-    trajectories: int
     phases: tuple[PhaseEfficiency, ...]
     reasons: tuple[Reason, ...]
     fused: Array
     best: Array
     standalone: Array
-    contact: Mask
-    blackout: Mask
     note: str = ""
 
     @property
@@ -127,31 +119,27 @@ class FusionEfficiency(Diagnostic):
         return f", {ratio:.2f} times that of the {display_name(self.modalities[best])}-only filter: fusion gains {gain}"
 
     def tables(self) -> list[Table]:
-        rows: list[tuple[Value, ...]] = []
-        for entry in self.phases:
-            for q, name, factor in measures.quantities(self.task):
-                lengths = (entry.fused[q], *entry.standalone[:, q], entry.best[q], entry.independent[q])
-                ratios = (entry.correlation[q], entry.efficiency[q], entry.low[q], entry.high[q])
-                values = [*(float(factor * length) for length in lengths), *map(float, ratios)]
-                numbers = [value if math.isfinite(value) else None for value in values]
-                rows.append((entry.phase, entry.steps, name, *numbers))
-        heads = [
-            "fused",
-            *(f"{display_name(name)} standalone" for name in self.modalities),
-            "best combination",
-            "if uncorrelated",
+        standalone = [f"{display_name(name)} standalone" for name in self.modalities]
+        rows = [
+            {
+                "phase": entry.phase,
+                "steps": entry.steps,
+                "quantity": name,
+                "fused": factor * entry.fused[q],
+                **dict(zip(standalone, factor * entry.standalone[:, q], strict=True)),
+                "best combination": factor * entry.best[q],
+                "if uncorrelated": factor * entry.independent[q],
+                "correlation": entry.correlation[q],
+                "efficiency": entry.efficiency[q],
+                "95 % from": entry.low[q],
+                "to": entry.high[q],
+            }
+            for entry in self.phases
+            for q, name, factor in measures.quantities(self.task)
         ]
-        columns = ("phase", "steps", "quantity", *heads, "correlation", "efficiency", "95 % from", "to")
-        tables = [Table("Errors of fusion and of the best combination", columns, tuple(rows))]
-        if self.reasons:
-            tables.append(
-                Table(
-                    "Reasons for a gap",
-                    ("reason", "modality", "quantity", "ideal", "value", "95 % from", "to", "significant"),
-                    tuple(reason.row() for reason in self.reasons),
-                )
-            )
-        return tables
+        tables = [Table.from_rows("Errors of fusion and of the best combination", rows)]
+        reasons = [reason.row() for reason in self.reasons]
+        return [*tables, *([Table.from_rows("Reasons for a gap", reasons)] if reasons else [])]
 
     def curves(self) -> list[Curve]:
         if not len(self.fused):
@@ -164,9 +152,6 @@ class FusionEfficiency(Diagnostic):
         ]
         best = Curve("best combination", main.factor * self.best, chart, main.unit, "truth")
         return [Curve("fused", main.factor * self.fused, chart, main.unit, "fused"), *alone, best]
-
-    def bands(self) -> dict[str, Mask]:
-        return {"contact": self.contact, "blackout": self.blackout} if len(self.fused) else {}
 
 
 def fusion_efficiency(
@@ -185,15 +170,13 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
     groups = [measures.group_masks(trace) for trace in traces]
     moments = np.stack([_moments(e, mask, where) for e, mask in zip(errors, groups, strict=True)])
     steps = np.stack([mask.sum(-1) for mask in groups])
-    keep = len(first) if len(traces) == 1 else 0
+    keep = drawn_steps(traces)
     weights = unbiased_weights(moments[0, 0, :, 1:, 1:])[measures.group_index(first)]  # (T, K), of the position
     best = np.einsum("tk,tkn->tn", weights, errors[0][:, 1:])
     position = np.linalg.norm(errors[0][..., where], axis=-1)[:keep]
     return FusionEfficiency(
-        task=first.task,
-        filter=first.filter,
+        **fields_of(traces),
         modalities=modalities_of(checkpoint),
-        trajectories=len(traces),
         phases=tuple(
             _phase(name, moments, steps, list(members))
             for name, members in GROUPS.items()
@@ -204,8 +187,6 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
         fused=position[:, 0],
         best=np.linalg.norm(best[..., where], axis=-1)[:keep],
         standalone=position[:, 1:],
-        contact=first.episode.contact.astype(bool)[:keep],
-        blackout=measures.blackout(first)[:keep],
         note=removal_note(checkpoint),
     )
 

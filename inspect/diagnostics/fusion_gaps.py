@@ -58,11 +58,12 @@ class Reason:
     contributes: bool
     headline: str
 
-    def row(self) -> tuple[Value, ...]:
+    def row(self) -> dict[str, Value]:
         """As a row of a table."""
-        interval = (None, None) if math.isnan(self.low) else (self.low, self.high)
+        reason: dict[str, Value] = {"reason": self.name, "modality": self.modality, "quantity": self.quantity}
+        values: dict[str, Value] = {"ideal": self.ideal, "value": self.value, "95 % from": self.low, "to": self.high}
         verdict = "unknown" if math.isnan(self.low) else "yes" if self.contributes else "no"
-        return (self.name, self.modality, self.quantity, self.ideal, self.value, *interval, verdict)
+        return reason | values | {"significant": verdict}
 
 
 def reasons_of(traces: Sequence[Trace], checkpoint: Checkpoint) -> tuple[Reason, ...]:

@@ -15,7 +15,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import TAIL, are_extreme, squared_innovations
+from beliefscope.inspect.statistics.innovations import TAIL, are_extreme, nis_of, squared_innovations
 from beliefscope.inspect.statistics.intervals import mean_interval, too_few
 from beliefscope.inspect.trace import Trace
 
@@ -129,21 +129,22 @@ class Innovations(Diagnostic):
         )
 
     def tables(self) -> list[Table]:
-        columns = (
-            *("measurement", "steps", "channels", "NIS/m", "95 % from", "to", "beyond 99.9 %"),
-            *("accepted (%)", "longest rejection (steps)", "gate"),
-        )
-        rows = tuple(
-            (
-                *(display_name(e.modality), e.measurements, e.channels, e.nis),
-                *((None, None) if math.isnan(e.low) else (e.low, e.high)),
-                e.extreme,
-                *((None, None) if math.isnan(e.accepted) else (100.0 * e.accepted, e.longest)),
-                e.gate or "none",
-            )
+        rows = [
+            {
+                "measurement": display_name(e.modality),
+                "steps": e.measurements,
+                "channels": e.channels,
+                "NIS/m": e.nis,
+                "95 % from": e.low,
+                "to": e.high,
+                "beyond 99.9 %": e.extreme,
+                "accepted (%)": 100.0 * e.accepted,
+                "longest rejection (steps)": None if math.isnan(e.accepted) else e.longest,
+                "gate": e.gate or "none",
+            }
             for e in self.modalities
-        )
-        return [Table("Innovations of the measurements", columns, rows)]
+        ]
+        return [Table.from_rows("Innovations of the measurements", rows)]
 
     def curves(self) -> list[Curve]:
         title = "Innovation in predicted standard deviations (root of NIS/m)"
@@ -171,15 +172,9 @@ def innovations_of(traces: Sequence[Trace]) -> Innovations:
         filter=first.filter,
         trajectories=len(traces),
         modalities=tuple(_modality(traces, k, name) for k, name in enumerate(first.modalities)),
-        nis=_nis(first)[:keep],
+        nis=np.asarray(nis_of(first))[:keep],
         rejected=rejected[:keep],
     )
-
-
-def _nis(trace: Trace) -> Array:
-    pair = squared_innovations(trace)
-    assert pair is not None
-    return np.asarray(pair[0] / np.maximum(pair[1], 1))
 
 
 def _modality(traces: Sequence[Trace], k: int, name: str) -> ModalityInnovations:

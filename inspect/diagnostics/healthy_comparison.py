@@ -19,7 +19,7 @@ from beliefscope.datasets.task import Task, with_unit
 from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.unavailable import UnavailableFilter
-from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile, profile_document
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, profile_document
 from beliefscope.inspect.diagnostics.statistic_kinds import (
     KINDS,
     LEVER,
@@ -28,7 +28,7 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
     label_of,
     unit_of,
 )
-from beliefscope.inspect.diagnostics.views import Table
+from beliefscope.inspect.diagnostics.views import Array, Table
 
 SIGNIFICANCE = 0.01
 """Probability of an alarm of one diagnostic for healthy episodes."""
@@ -167,15 +167,14 @@ class Comparison:
         """One row per statistic."""
         verdict = "alarm" if self.trajectories > 1 else "unusual"
         columns = ("statistic", "value", "healthy", "95 % range from", "to", "p-value", verdict)
-        rows = tuple(
+        rows = [
             (
                 with_unit(d.label, d.conversion[0]),
                 *(d.conversion[1] * value for value in (d.value, d.healthy, d.low, d.high)),
-                d.p_value,
-                "yes" if d.alarm else "",
+                *(d.p_value, "yes" if d.alarm else ""),
             )
             for d in self.deviations
-        )
+        ]
         return Table("Comparison with the healthy record", columns, rows)
 
 

@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
@@ -22,8 +21,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.names import PRETRAINED
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference
-
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.signals import Array
 
 FORMAT = 3
 """Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 has other ``MEASURED_ANEW``."""

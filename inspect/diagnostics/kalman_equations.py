@@ -137,14 +137,11 @@ class KalmanEquations(Diagnostic):
 
     def tables(self) -> list[Table]:
         components, units = self.task.components, {c.name: c.conversion for c in self.task.vector_channels()}
+        modalities = [display_name(name) for name in self.modalities]
+        measurements = zip(modalities, self.measurement, self.columns.T, self.slopes, strict=True)
         rows = [
             ("dynamics", None, *map(_percent, self.dynamics), None, None),
-            *(
-                (display_name(name), _percent(error), *map(_percent, columns), _number(slope))
-                for name, error, columns, slope in zip(
-                    self.modalities, self.measurement, self.columns.T, self.slopes, strict=True
-                )
-            ),
+            *((name, _percent(error), *map(_percent, columns), slope) for name, error, columns, slope in measurements),
         ]
         names = (f"{display_name(component.name)}, %" for component in components)
         heads = ("Jacobian of", "error, %", *names, "together, %", "slope of corrections")
@@ -155,10 +152,6 @@ class KalmanEquations(Diagnostic):
             "them. A factor f in a Jacobian has the error |f² - 1|; exact ones have less than 2 %. "
             "Corrections have a slope of about 1; if it is -1, their sign is wrong."
         )
-        updates = tuple(
-            (display_name(name), _percent(covariance), _percent(correction))
-            for name, covariance, correction in zip(self.modalities, self.covariance, self.correction, strict=True)
-        )
         noise = [
             (f"process, {display_name(c.name)}", value, c.conversion)
             for c, value in zip(components, self.process_noise, strict=True)
@@ -167,24 +160,19 @@ class KalmanEquations(Diagnostic):
             for name, channels, values in zip(self.modalities, self.channels, self.measurement_noise, strict=True)
             for channel, value in zip(channels, values, strict=True)
         ]
-        known = tuple(
-            (name, float(factor * value), unit) for name, value, (unit, factor) in noise if not np.isnan(value)
-        )
-        tables = [Table("Jacobians against finite differences", heads, tuple(rows), note)]
-        if self.modalities:
+        known = [(name, factor * value, unit) for name, value, (unit, factor) in noise if not np.isnan(value)]
+        tables = [Table("Jacobians against finite differences", heads, rows, note)]
+        if modalities:
             heads = ("steps with", "covariance error, %", "mean error, %")
-            tables.append(Table("Updates against K = P Hᵀ S⁻¹", heads, updates))
+            updates = zip(modalities, map(_percent, self.covariance), map(_percent, self.correction), strict=True)
+            tables.append(Table("Updates against K = P Hᵀ S⁻¹", heads, list(updates)))
         note = "Q = P - F P Fᵀ per step, and R = S - H P Hᵀ. Readings have the units of the task's channels."
         heads = ("noise", "standard deviation", "unit")
         return [*tables, Table("Noise that the covariances contain", heads, known, note)]
 
 
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
-
-
-def _percent(value: float) -> float | None:
-    return _number(round(100.0 * value, 2))
+def _percent(value: float) -> float:
+    return round(100.0 * value, 2)
 
 
 def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:

@@ -5,13 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from beliefscope.inspect.statistics.intervals import too_few
-from beliefscope.inspect.statistics.measures import MIN_STEPS
-
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.measures import MIN_STEPS, Array
 
 CONSISTENT = "consistent"
 

@@ -13,18 +13,19 @@ from beliefscope.datasets.task import Task, with_unit
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.views import Curve, Table, Value
+from beliefscope.inspect.diagnostics.views import Curve, Table
 from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES
-from beliefscope.inspect.statistics.measures import blackout, pooled_phases, trace_indices
+from beliefscope.inspect.statistics.measures import Array, Mask, blackout, pooled_phases, trace_indices
 from beliefscope.inspect.trace import Trace
-
-Mask = NDArray[np.bool_]
 
 NOUNS = {"flat": "flat", "round": "a round peak", "ridge": "a ridge", "ring": "a ring"}
 """Shape -> description."""
+
+SHARES = tuple(f"{shape} (% of steps)" for shape in SHAPES)
+"""Columns of the shares of ``SHAPES``."""
 
 MIN_TRAJECTORIES, RESAMPLES = 5, 2000
 """Minimum number of episodes for an interval; bootstrap samples."""
@@ -133,41 +134,38 @@ class MapSurvey(Diagnostic):
         return f"{median:.1f}° (95 % interval {low:.1f}° to {high:.1f}°)"
 
     def tables(self) -> list[Table]:
-        n, length, (area, factor) = self.numbers, self._length, area_unit(self.task, self.components)
-        rows: list[tuple[Value, ...]] = []
-        fused = len(n.layers) - 1
-        for i, layer in enumerate(n.layers):
+        rows = []
+        for i, layer in enumerate(self.numbers.layers):
+            columns = (self._shape_columns(i) if self.has_shapes else {}) | self._region_columns(i)
             for phase, mask in self.phases.items():
-                if not mask.any():
-                    continue
-                shapes = (
-                    np.degrees(n.deviation[:, i]),
-                    n.elongation[:, i],
-                    *(100.0 * (n.shape[:, i] == k) for k in range(len(SHAPES))),
-                    length[1] * np.where(n.shape[:, i] == SHAPES.index("ring"), n.ring_radius[:, i], np.nan),
-                )
-                values = (
-                    *(shapes if self.has_shapes else ()),
-                    factor * n.area50[:, i],
-                    factor * n.area95[:, i],
-                    n.entropy[:, i] + np.log(factor),
-                    n.truth[:, i],
-                    n.divergence[:, i, fused],
-                    n.overlap[:, i, fused],
-                )
-                # Of a shape, the part of the steps; the radius is the median over rings.
-                parts = range(2, 2 + len(SHAPES)) if self.has_shapes else ()
-                medians = [
-                    round(float((np.mean if k in parts else _median)(value[mask])), 3) for k, value in enumerate(values)
-                ]
-                rows.append((layer, phase, int(mask.sum()), *(v if np.isfinite(v) else None for v in medians)))
-        named = (*(f"{shape} (% of steps)" for shape in SHAPES), with_unit("ring radius", length[0]))
-        directions = ("off expected ridge (deg)", "elongation", *named) if self.has_shapes else ()
-        columns = ("map", "phase", "steps", *directions)
-        regions = (with_unit(f"{share} % {self._region}", area) for share in (50, 95))
-        more = (*regions, f"entropy (nats, per {area or 'unit'})", "ln p(true state) / max")
-        last = ("KL to fused (nats)", "overlap with fused")
-        return [Table(f"{self.title}. Medians over steps", (*columns, *more, *last), tuple(rows))]
+                if mask.any():
+                    # Of a shape, the part of the steps; the radius is the median over rings.
+                    medians = {
+                        name: round(float((np.mean if name in SHARES else _median)(values[mask])), 3)
+                        for name, values in columns.items()
+                    }
+                    rows.append({"map": layer, "phase": phase, "steps": int(mask.sum())} | medians)
+        return [Table.from_rows(f"{self.title}. Medians over steps", rows)]
+
+    def _shape_columns(self, i: int) -> dict[str, Array]:
+        """Name -> values (B,) of a layer's shape and direction."""
+        n, (unit, factor) = self.numbers, self._length
+        shares = {name: 100.0 * (n.shape[:, i] == k) for k, name in enumerate(SHARES)}
+        radius = np.where(n.shape[:, i] == SHAPES.index("ring"), n.ring_radius[:, i], np.nan)
+        directions = {"off expected ridge (deg)": np.degrees(n.deviation[:, i]), "elongation": n.elongation[:, i]}
+        return directions | shares | {with_unit("ring radius", unit): factor * radius}
+
+    def _region_columns(self, i: int) -> dict[str, Array]:
+        """Name -> values (B,) of a layer's regions, and of its comparison with the truth and the fused map."""
+        n, (unit, factor) = self.numbers, area_unit(self.task, self.components)
+        return {
+            with_unit(f"50 % {self._region}", unit): factor * n.area50[:, i],
+            with_unit(f"95 % {self._region}", unit): factor * n.area95[:, i],
+            f"entropy (nats, per {unit or 'unit'})": n.entropy[:, i] + np.log(factor),
+            "ln p(true state) / max": n.truth[:, i],
+            "KL to fused (nats)": n.divergence[:, i, -1],
+            "overlap with fused": n.overlap[:, i, -1],
+        }
 
     def curves(self) -> list[Curve]:
         if self.trajectories > 1:
@@ -193,13 +191,13 @@ def _text(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}".rstrip()
 
 
-def _median(values: NDArray[np.float64]) -> float:
+def _median(values: Array) -> float:
     """Median without NaN; NaN if there is no value."""
     values = values[~np.isnan(values)]
     return float(np.median(values)) if len(values) else np.nan
 
 
-def median_interval(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> tuple[float, float, float]:
+def median_interval(values: Array, trajectory: NDArray[np.int64]) -> tuple[float, float, float]:
     """Median of S values with its 95 % interval, by bootstrap over the episodes (S,) that they belong to.
 
     Expanded percentile interval (Hesterberg, "What Teachers Should Know About the Bootstrap", 2015): the level is that

@@ -15,13 +15,11 @@ from beliefscope.filters.covariance_floor import with_floor
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.ensemble import has_equal_weights
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
-from beliefscope.inspect.diagnostics.views import Curve, Table, Value
+from beliefscope.inspect.diagnostics.views import Curve, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import particle_level
+from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 DEGENERATE = 0.1
 """Ratio of effective sample size to particles below which a particle set is degenerate."""
@@ -150,36 +148,24 @@ class ParticleHealth(Diagnostic):
         return " ".join(parts)
 
     def tables(self) -> list[Table]:
-        rows: list[tuple[Value, ...]] = [
-            (
-                entry.phase,
-                entry.steps,
-                entry.effective,
-                entry.smallest,
-                100.0 * entry.degenerate,
-                entry.largest,
-                entry.ancestors,
-                100.0 * entry.resampled,
-                100.0 * entry.several_modes,
-                100.0 * entry.outside,
-                *map(float, entry.evidence),
-            )
+        evidence = [f"evidence of {modality} (nats)" for modality in self.modalities]
+        rows = [
+            {
+                "phase": entry.phase,
+                "steps": entry.steps,
+                "ESS (median)": entry.effective,
+                "ESS (minimum)": entry.smallest,
+                f"ESS below {percent(DEGENERATE)} (% of steps)": 100.0 * entry.degenerate,
+                "largest weight (median)": entry.largest,
+                "with offspring (median)": entry.ancestors,
+                "resampled (% of steps)": 100.0 * entry.resampled,
+                "multimodal (% of steps)": 100.0 * entry.several_modes,
+                "true state outside (% of steps)": 100.0 * entry.outside,
+                **dict(zip(evidence, entry.evidence, strict=True)),
+            }
             for entry in self.phases
         ]
-        columns = (
-            "phase",
-            "steps",
-            "ESS (median)",
-            "ESS (minimum)",
-            f"ESS below {percent(DEGENERATE)} (% of steps)",
-            "largest weight (median)",
-            "with offspring (median)",
-            "resampled (% of steps)",
-            "multimodal (% of steps)",
-            "true state outside (% of steps)",
-            *(f"evidence of {modality} (nats)" for modality in self.modalities),
-        )
-        tables = [Table(f"Particle health, {plural(self.particles, 'particle')}", columns, tuple(rows))]
+        tables = [Table.from_rows(f"Particle health, {plural(self.particles, 'particle')}", rows)]
         return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:

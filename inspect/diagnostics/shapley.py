@@ -5,30 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import rollout
 from beliefscope.filters.subsets import modalities_of, subset_evidence
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.diagnostics.base import Entry, RunDiagnostic, drawn_steps, fields_of
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.standalone import removal_note
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, too_few
+from beliefscope.inspect.statistics.measures import Mask
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.external_replay import check_origin, run_with
+from beliefscope.inspect.traces.batch import part_of
+from beliefscope.inspect.traces.data import check_origin
+from beliefscope.inspect.traces.external_replay import run_with
 from beliefscope.inspect.traces.replay import Replay
-
-Mask = NDArray[np.bool_]
 
 MAX_MODALITIES = 6
 """K modalities have 2^K subsets, with one run each."""
@@ -61,13 +62,12 @@ class PhaseValues:
 
 
 @dataclass(frozen=True)
-class Shapley(Diagnostic):
+class Shapley(RunDiagnostic):
     """Result of ``shapley``; K modalities, n components, T steps of a single trace (0 for several); m and rad.
 
     Attributes:
-        task, filter, kind: of the traces.
+        kind: of the filter.
         modalities: K names.
-        trajectories: number of traces.
         offset: initial error of the runs in standard deviations of the initial belief.
         at_truth: whether the runs start at the true state.
         subsets: 2^K subsets of modalities, the empty one first and the complete one last.
@@ -75,15 +75,11 @@ class Shapley(Diagnostic):
         position_error: (T, 2^K) position error of each subset.
         position_values: (T, K) Shapley values of the position error.
         estimate_values: (T, K, n) Shapley values of the estimate.
-        contact, blackout: (T,) masks.
         note: ``removal_note`` of the filter.
     """
 
-    task: Task
-    filter: str
     kind: str
     modalities: tuple[str, ...]
-    trajectories: int
     offset: float
     at_truth: bool
     subsets: tuple[tuple[str, ...], ...]
@@ -91,8 +87,6 @@ class Shapley(Diagnostic):
     position_error: Array
     position_values: Array
     estimate_values: Array
-    contact: Mask
-    blackout: Mask
     note: str = ""
 
     @property
@@ -144,37 +138,26 @@ class Shapley(Diagnostic):
             for i, subset in enumerate(self.subsets)
             if len(subset) in (0, 1, len(self.modalities) - 1, len(self.subsets[-1]))
         ]
-        value_rows: list[tuple[Value, ...]] = []
-        subset_rows: list[tuple[Value, ...]] = []
+        names = [display_name(modality) for modality in self.modalities]
+        has_intervals = self.trajectories >= MIN_TRAJECTORIES
+        values: list[dict[str, Any]] = []
+        by_subset: list[dict[str, Any]] = []
         for phase in self.phases:
             for q, title, factor in measures.quantities(self.task):
                 rmse, phi, low, high = (
                     factor * getattr(phase, name)[:, q] for name in ("rmse", "shapley", "low", "high")
                 )
-                ends = [number for pair in zip(low, high, strict=True) for number in pair if self._has_intervals]
-                numbers = [None if math.isnan(v) else float(v) for v in (rmse[0], *phi, rmse[-1], *ends)]
-                value_rows.append((phase.phase, phase.steps, title, *numbers))
-                subset_rows.append((phase.phase, phase.steps, title, *map(float, rmse[listed])))
-        interval_names = [
-            f"{display_name(m)}: 95 % {end}" for m in self.modalities for end in ("from", "to") if self._has_intervals
-        ]
-        head = ("phase", "steps", "RMSE of")
+                head = {"phase": phase.phase, "steps": phase.steps, "RMSE of": title}
+                contributions = dict(zip(names, phi, strict=True))
+                row = head | {self.baseline: rmse[0]} | contributions | {"all modalities": rmse[-1]}
+                for name, first, last in zip(names, low, high, strict=True) if has_intervals else ():
+                    row |= {f"{name}: 95 % from": first, f"{name}: 95 % to": last}
+                values.append(row)
+                by_subset.append(head | {self._title(self.subsets[i]): rmse[i] for i in listed})
         return [
-            Table(
-                "Shapley values of the RMSE",
-                (*head, self.baseline, *map(display_name, self.modalities), "all modalities", *interval_names),
-                tuple(value_rows),
-            ),
-            Table(
-                "RMSE by subset of modalities",
-                (*head, *(self._title(self.subsets[i]) for i in listed)),
-                tuple(subset_rows),
-            ),
+            Table.from_rows("Shapley values of the RMSE", values),
+            Table.from_rows("RMSE by subset of modalities", by_subset),
         ]
-
-    @property
-    def _has_intervals(self) -> bool:
-        return self.trajectories >= MIN_TRAJECTORIES
 
     def curves(self) -> list[Curve]:
         if not len(self.position_values):
@@ -200,9 +183,6 @@ class Shapley(Diagnostic):
                 for k, name in enumerate(self.modalities)
             ]
         return curves
-
-    def bands(self) -> dict[str, Mask]:
-        return {"contact": self.contact, "blackout": self.blackout} if len(self.position_values) else {}
 
 
 def members(count: int) -> Mask:
@@ -299,21 +279,13 @@ def shapley(
     weights = shapley_weights(len(modalities))
     errors = []
     for i, trace in enumerate(traces):
-
-        def share(done: float, i: int = i) -> None:
-            if progress is not None:
-                progress((i + done) / len(traces))
-
-        estimates = run_subsets(checkpoint, trace, offset, share)
+        estimates = run_subsets(checkpoint, trace, offset, part_of(progress, i, len(traces)))
         errors.append(task.difference(estimates, trace.episode.states[:, None]))
-    position = [task.main_error.norm(error) for error in errors]
-    keep = len(first) if len(traces) == 1 else 0
+    position, keep = [task.main_error.norm(error) for error in errors], drawn_steps(traces)
     return Shapley(
-        task=task,
-        filter=first.filter,
+        **fields_of(traces),
         kind=first.kind,
         modalities=modalities,
-        trajectories=len(traces),
         offset=offset,
         at_truth=not offset and all(measures.starts_at_truth(trace) for trace in traces),
         subsets=tuple(tuple(np.array(modalities)[has].tolist()) for has in members(len(modalities))),
@@ -322,8 +294,6 @@ def shapley(
         position_values=position[0][:keep] @ weights.T,
         # The true state cancels between subsets, so values of the error equal those of the estimate.
         estimate_values=np.einsum("ks,tsn->tkn", weights, errors[0][:keep]),
-        contact=first.episode.contact.astype(bool)[:keep],
-        blackout=measures.blackout(first)[:keep],
         note=removal_note(checkpoint),
     )
 

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import modalities_of
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.diagnostics.base import Entry, RunDiagnostic, drawn_steps, fields_of
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.standalone import removal_note, standalone_errors
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife, too_few
-from beliefscope.inspect.statistics.measures import Mask
 from beliefscope.inspect.trace import Trace
 
 
@@ -50,30 +49,22 @@ class PhaseErrors:
 
 
 @dataclass(frozen=True)
-class StandaloneModalities(Diagnostic):
+class StandaloneModalities(RunDiagnostic):
     """Result of ``standalone_modalities``; K modalities, n components, T steps of a single trace (0 for several).
 
     Attributes:
-        task, filter: of the traces.
         modalities: K names.
-        trajectories: number of traces.
         phases: errors by phase.
         fused: (T,) m, position error of the filter.
         updates, standalone: (T, K) m, position errors of the updates and of the standalone filters.
-        contact, blackout: (T,) masks.
         note: ``removal_note`` of the filter.
     """
 
-    task: Task
-    filter: str
     modalities: tuple[str, ...]
-    trajectories: int
     phases: tuple[PhaseErrors, ...]
     fused: Array
     updates: Array
     standalone: Array
-    contact: Mask
-    blackout: Mask
     note: str = ""
 
     @property
@@ -104,34 +95,20 @@ class StandaloneModalities(Diagnostic):
         return " ".join(sentences)
 
     def tables(self) -> list[Table]:
-        rows: list[tuple[Value, ...]] = []
+        rows, ratios = [], []
         for entry in self.phases:
             for q, name, factor in measures.quantities(self.task):
-                pairs = zip(entry.updates[:, q], entry.standalone[:, q], strict=True)
-                values = [float(factor * value) for value in (entry.fused[q], *(v for pair in pairs for v in pair))]
-                numbers = [None if math.isnan(value) else value for value in values]
-                rows.append((entry.phase, entry.steps, name, *numbers))
-        heads = [
-            head
-            for name in self.modalities
-            for head in (measures.layer_label(name), f"{display_name(name)} standalone")
-        ]
-        ratios: list[tuple[Value, ...]] = [
-            (entry.phase, entry.steps, name, *(None if math.isnan(v) else float(v) for v in values))
-            for entry in self.phases
-            for name, *values in zip(
-                map(display_name, self.modalities), entry.ratio, entry.low, entry.high, strict=True
-            )
-        ]
+                row = {"phase": entry.phase, "steps": entry.steps, "quantity": name, "fused": factor * entry.fused[q]}
+                for k, modality in enumerate(self.modalities):
+                    row[measures.layer_label(modality)] = factor * entry.updates[k, q]
+                    row[f"{display_name(modality)} standalone"] = factor * entry.standalone[k, q]
+                rows.append(row)
+            for name, *values in zip(self.modalities, entry.ratio, entry.low, entry.high, strict=True):
+                ratios.append((entry.phase, entry.steps, display_name(name), *values))
+        title = f"Fused / standalone, {self.task.main_error.name} RMSE"
         return [
-            Table(
-                "RMSE of updates and standalone filters", ("phase", "steps", "quantity", "fused", *heads), tuple(rows)
-            ),
-            Table(
-                f"Fused / standalone, {self.task.main_error.name} RMSE",
-                ("phase", "steps", "standalone modality", "ratio", "95 % from", "to"),
-                tuple(ratios),
-            ),
+            Table.from_rows("RMSE of updates and standalone filters", rows),
+            Table(title, ("phase", "steps", "standalone modality", "ratio", "95 % from", "to"), ratios),
         ]
 
     def curves(self) -> list[Curve]:
@@ -145,9 +122,6 @@ class StandaloneModalities(Diagnostic):
                 curves.append(Curve(measures.layer_label(name), scale * self.updates[:, k], chart, unit, name))
             curves.append(Curve(f"{display_name(name)} standalone", scale * self.standalone[:, k], chart, unit, name))
         return curves
-
-    def bands(self) -> dict[str, Mask]:
-        return {"contact": self.contact, "blackout": self.blackout} if len(self.fused) else {}
 
 
 def of_standalone_run(trace: Trace) -> str | None:
@@ -169,22 +143,17 @@ def standalone_modalities(
     traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
 ) -> StandaloneModalities:
     """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
-    first, modalities = traces[0], modalities_of(checkpoint)
+    modalities = modalities_of(checkpoint)
     alone = standalone_errors(traces, checkpoint, progress)
     errors = [_with_position(trace, modalities, values) for trace, values in zip(traces, alone, strict=True)]
-    keep = len(first) if len(traces) == 1 else 0
-    position = errors[0][:keep, :, 0]
+    position = errors[0][: drawn_steps(traces), :, 0]
     return StandaloneModalities(
-        task=first.task,
-        filter=first.filter,
+        **fields_of(traces),
         modalities=modalities,
-        trajectories=len(traces),
         phases=_phases(traces, errors, len(modalities)),
         fused=position[:, 0],
         updates=position[:, 1 : 1 + len(modalities)],
         standalone=position[:, 1 + len(modalities) :],
-        contact=first.episode.contact.astype(bool)[:keep],
-        blackout=measures.blackout(first)[:keep],
         note=removal_note(checkpoint),
     )
 

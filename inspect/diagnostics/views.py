@@ -30,15 +30,25 @@ VIEWS = ("tables", "curves", "bands", "plots", "images")
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values, None where a value is not available. Column names include the unit.
+    """Rows of values, None where a value is not available, such as NaN. Column names include the unit.
 
     note: explains columns, below the table.
     """
 
     title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Value, ...], ...]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
     note: str = ""
+
+    def __post_init__(self) -> None:
+        """Tuples of Python's values."""
+        object.__setattr__(self, "columns", tuple(self.columns))
+        object.__setattr__(self, "rows", tuple(tuple(map(_plain, row)) for row in self.rows))
+
+    @classmethod
+    def from_rows(cls, title: str, rows: Sequence[Mapping[str, Any]], note: str = "") -> Table:
+        """Rows of column -> value; the columns are those of the first one."""
+        return cls(title, tuple(rows[0] if rows else ()), [tuple(row.values()) for row in rows], note)
 
     def __str__(self) -> str:
         """The table as text."""
@@ -156,6 +166,11 @@ class Views(ABC):
     def views(self) -> dict[str, Any]:
         """Verdict and all ``VIEWS`` as JSON values."""
         return {"verdict": self.verdict, **{name: as_json(getattr(self, name)()) for name in VIEWS}}
+
+
+def _plain(value: Any) -> Value:
+    plain: Value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and math.isnan(plain) else plain
 
 
 def html_result(headline: str, tables: Sequence[Table]) -> str:

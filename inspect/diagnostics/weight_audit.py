@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task, display_name, with_unit
+from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import NO_RECORD, Entry, RunDiagnostic, drawn_steps, fields_of
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
-from beliefscope.inspect.diagnostics.views import Curve, Table, Value
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.diagnostics.weight_steps import (
     Correlation,
     add_constant,
@@ -31,9 +30,6 @@ from beliefscope.inspect.diagnostics.weight_steps import (
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import too_few
 from beliefscope.inspect.trace import Trace
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_REGRET = 0.05
 """Relative decrease of the error above which better weights would help."""
@@ -80,37 +76,29 @@ class PhaseWeights:
 
 
 @dataclass(frozen=True)
-class WeightAudit(Diagnostic):
+class WeightAudit(RunDiagnostic):
     """Result of ``audit``.
 
     Attributes:
-        task, filter: names.
         modalities: K names.
-        trajectories: number of traces.
         phases: means by phase.
         correlations: correlations with contact, blackout and the oracle.
         beta, effective_weights, oracle: (T, K, W) by step of a single trace, (0, K, W) for several; beta is None
             without a weight model.
         regret: (T, W) m, rad: decrease of the error with the oracle's weights by component; of the position error for
             a scalar weight.
-        contact, blackout: (T,) masks.
         excess: relative excess of the position error over that with the best constant weights by phase, and its 95 %
             interval over episodes; NaN for too few of them.
         healthy: comparison with the filter's healthy record, if it has one.
     """
 
-    task: Task
-    filter: str
     modalities: tuple[str, ...]
-    trajectories: int
     phases: tuple[PhaseWeights, ...]
     correlations: tuple[Correlation, ...]
     beta: Array | None
     effective_weights: Array
     oracle: Array
     regret: Array
-    contact: Mask
-    blackout: Mask
     excess: tuple[float, float, float]
     healthy: Comparison | None = None
 
@@ -200,44 +188,37 @@ class WeightAudit(Diagnostic):
         return self.modalities[:1] if len(self.modalities) == 2 else self.modalities
 
     def tables(self) -> list[Table]:
-        means: list[tuple[Value, ...]] = []
-        errors: list[tuple[Value, ...]] = []
+        unimodal = [measures.layer_label(modality) for modality in self.modalities]
+        means, errors = [], []
         for entry in self.phases:
             for w, column in enumerate(self._columns):
-                weights = [getattr(entry, s)[k, w] for k in range(len(self.modalities)) for s in self._sources]
-                means.append((entry.phase, entry.steps, column or "all", *map(float, weights)))
+                weights = {
+                    f"{display_name(modality)}: {LABELS[source]}": getattr(entry, source)[k, w]
+                    for k, modality in enumerate(self.modalities)
+                    for source in self._sources
+                }
+                means.append({"phase": entry.phase, "steps": entry.steps, "component": column or "all"} | weights)
             for q, name, factor in measures.quantities(self.task):
-                values = (entry.fused[q], entry.hindsight[q], entry.regret[q], entry.constant[q], *entry.unimodal[:, q])
-                numbers = (None if math.isnan(value) else float(factor * value) for value in values)
-                errors.append((entry.phase, name, *numbers))
-        heads = [
-            f"{display_name(modality)}: {LABELS[source]}" for modality in self.modalities for source in self._sources
-        ]
-        unimodal = [measures.layer_label(modality) for modality in self.modalities]
-        tables = [
-            Table("Mean weights", ("phase", "steps", "component", *heads), tuple(means)),
-            Table(
-                "RMSE",
-                (
-                    "phase",
-                    "quantity",
-                    "fused",
-                    "with the oracle's weights",
-                    "regret",
-                    "with constant weights",
-                    *unimodal,
-                ),
-                tuple(errors),
-            ),
-        ]
+                errors.append(
+                    {
+                        "phase": entry.phase,
+                        "quantity": name,
+                        "fused": factor * entry.fused[q],
+                        "with the oracle's weights": factor * entry.hindsight[q],
+                        "regret": factor * entry.regret[q],
+                        "with constant weights": factor * entry.constant[q],
+                        **dict(zip(unimodal, factor * entry.unimodal[:, q], strict=True)),
+                    }
+                )
+        tables = [Table.from_rows("Mean weights", means), Table.from_rows("RMSE", errors)]
         rows = [
-            (c.modality, LABELS[c.weight], display_name(c.component or "all"), c.other, c.value, *_interval(c))
+            (c.modality, LABELS[c.weight], display_name(c.component or "all"), c.other, c.value, c.low, c.high)
             for c in self.correlations
             if math.isfinite(c.value) and c.modality in self._independent and c.weight in self._sources
         ]
         if rows:
-            heads = ["modality", "weight", "component", "with", "r", "95 % from", "to"]
-            tables.append(Table("Correlations of the weights", tuple(heads), tuple(rows)))
+            heads = ("modality", "weight", "component", "with", "r", "95 % from", "to")
+            tables.append(Table("Correlations of the weights", heads, rows))
         return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:
@@ -260,9 +241,6 @@ class WeightAudit(Diagnostic):
         # Curves of one chart must be consecutive: components with equal units share a chart.
         return curves + sorted(regrets, key=lambda curve: curve.unit)
 
-    def bands(self) -> dict[str, Mask]:
-        return {"contact": self.contact, "blackout": self.blackout} if len(self.oracle) else {}
-
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
@@ -280,7 +258,6 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightAudit:
     """Audit the weights of one filter over one or more episodes."""
-    first = traces[0]
     step_values = add_constant([weight_steps(trace) for trace in traces], traces)
     pooled = {name: np.concatenate([steps[name] for steps in step_values]) for name in step_values[0]}
     index = measures.trace_indices(traces)
@@ -296,20 +273,16 @@ def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightA
             phases.append(
                 PhaseWeights(phase=phase, trajectories=trajectories, steps=int(where.sum()), **weights, **rmse)
             )
-    keep = len(first) if len(traces) == 1 else 0
+    keep = drawn_steps(traces)
     return WeightAudit(
-        task=first.task,
-        filter=first.filter,
-        modalities=first.modalities,
-        trajectories=len(traces),
+        **fields_of(traces),
+        modalities=traces[0].modalities,
         phases=tuple(phases),
         correlations=tuple(weight_correlations(traces, step_values)),
         beta=pooled["beta"][:keep] if "beta" in pooled else None,
         effective_weights=pooled["effective_weights"][:keep],
         oracle=pooled["oracle"][:keep],
         regret=pooled["regret"][:keep],
-        contact=first.episode.contact.astype(bool)[:keep],
-        blackout=measures.blackout(first)[:keep],
         excess=excess_error(traces, step_values),
         healthy=healthy,
     )
@@ -321,10 +294,6 @@ def _description(correlation: Correlation) -> str:
         "" if math.isnan(correlation.low) else f" (95 % interval {correlation.low:.2f} to {correlation.high:.2f})"
     )
     return f"{correlation.value:.2f} with {OTHERS[correlation.other]}{where}{interval}"
-
-
-def _interval(correlation: Correlation) -> tuple[Value, Value]:
-    return (None, None) if math.isnan(correlation.low) else (correlation.low, correlation.high)
 
 
 ENTRY = Entry(

@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import correlate, correlation_sums, jackknife
+from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.oracle import constant_weights, oracle_weights
 from beliefscope.inspect.trace import Trace
-
-Array = NDArray[np.float64]
 
 NEGLIGIBLE = 0.01
 """In the unit for display: its square is added to mean squared errors in ratios, so that errors below 0.1 mm are not

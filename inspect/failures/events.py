@@ -20,7 +20,7 @@ from beliefscope.filters.engine import Engine
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
 from beliefscope.inspect.failures.step_scores import RECENT, ROUNDING, Survey
 from beliefscope.inspect.failures.survey import ScoredRuns, fields_of_runs, find_score, survey_of
-from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, layer_label
+from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, known_mean, layer_label
 
 HIGH = 0.9
 """Quantile of the scores of all steps above which a step is part of an event."""
@@ -168,21 +168,20 @@ class Failures(ScoredRuns):
     def phase_table(self) -> Table:
         """One row per phase."""
         factor = self.conversion[1]
-        columns = ("phase", "steps (%)", "events", "events (%)", "lift", "p-value", "mean inside", "mean outside")
         rows = [
-            (
-                g.name,
-                100 * g.share,
-                g.events,
-                100 * g.event_share,
-                g.lift,
-                g.p_value,
-                factor * g.inside,
-                factor * g.outside,
-            )
+            {
+                "phase": g.name,
+                "steps (%)": 100 * g.share,
+                "events": g.events,
+                "events (%)": 100 * g.event_share,
+                "lift": g.lift,
+                "p-value": g.p_value,
+                "mean inside": factor * g.inside,
+                "mean outside": factor * g.outside,
+            }
             for g in self.phases
         ]
-        return Table(f"Events by phase: {self._label}", columns, tuple(rows))
+        return Table.from_rows(f"Events by phase: {self._label}", rows)
 
     def event_table(self, events: Sequence[Event]) -> Table:
         """One row per event with the values at its peak; updates that the filter does not report have no column."""
@@ -195,7 +194,7 @@ class Failures(ScoredRuns):
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         if any(event.effective_weights is not None for event in events):
             columns += tuple(f"effective weight of {display_name(layer)} (%)" for layer in self.layers[:-1])
-        return Table("Worst events", columns, tuple(self._row(event, known) for event in events))
+        return Table("Worst events", columns, [self._row(event, known) for event in events])
 
     def _row(self, event: Event, known: list[int]) -> tuple[Value, ...]:
         numbers = [*(self.error_conversion[1] * event.error[known]), *np.degrees(event.angle_error[-1]), event.nees[-1]]
@@ -357,14 +356,9 @@ def _phase_statistics(name: str, inside: Mask, score: Array, events: Sequence[Ev
         event_share=event_share,
         lift=event_share / share,
         p_value=float(bdtrc(count - 1, len(events), share)),
-        inside=_mean(score[inside]),
-        outside=_mean(score[~inside]),
+        inside=known_mean(score[inside]),
+        outside=known_mean(score[~inside]),
     )
-
-
-def _mean(values: Array) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else np.nan
 
 
 def _quantiles(values: Array) -> Array:

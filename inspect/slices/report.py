@@ -108,31 +108,16 @@ class ErrorSlices(ScoredRuns):
     def tables(self) -> list[Table]:
         """One row per slice; scores in display units."""
         unit, factor = self.conversion
-        columns: tuple[str, ...] = (
-            "slice",
-            "ratio",
-            "from",
-            "to",
-            with_unit("inside", unit),
-            with_unit("outside", unit),
-        )
-        columns += ("episodes", "steps", "steps (%)", "p-value")
+        means = (with_unit(name, unit) for name in ("inside", "outside"))
+        columns = ("slice", "ratio", "from", "to", *means, "episodes", "steps", "steps (%)", "p-value")
         rows = [
             (
-                s.where,
-                s.ratio,
-                s.low if np.isfinite(s.low) else None,
-                s.high if np.isfinite(s.high) else None,
-                factor * s.inside,
-                factor * s.outside,
-                len(s.episodes),
-                s.steps,
-                100 * s.share,
-                s.p_value,
+                *(s.where, s.ratio, s.low, s.high, factor * s.inside, factor * s.outside),
+                *(len(s.episodes), s.steps, 100 * s.share, s.p_value),
             )
             for s in self.slices
         ]
-        return [Table(f"Slices with a larger {self.title}", columns, tuple(rows))]
+        return [Table(f"Slices with a larger {self.title}", columns, rows)]
 
 
 def find_slices(

@@ -6,10 +6,9 @@ Functions are vectorised over leading axes. Errors and deviations are difference
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtr, ndtr
 
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.signals import Array
 
 LEVELS = np.linspace(0.05, 0.95, 19)
 """Levels of the credible regions of calibration curves."""

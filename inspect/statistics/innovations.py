@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -53,11 +52,6 @@ class Whiteness:
     def white(self) -> bool:
         """Whether the interval contains zero, or is unknown."""
         return not (self.low > 0.0 or self.high < 0.0)
-
-    @property
-    def ends(self) -> tuple[float | None, float | None]:
-        """The interval, None if unknown."""
-        return (None, None) if math.isnan(self.low) else (self.low, self.high)
 
 
 def innovations(trace: Trace) -> tuple[Array, Array] | None:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtr, chdtrc, chdtri, stdtrit
 
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.signals import Array
+
 Numbers = NDArray[np.number[Any]]
 
 LEVEL = 0.95

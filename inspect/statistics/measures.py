@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,22 @@ def nees(trace: Trace) -> Array:
         return np.full(error.shape[:2], np.nan)
     white = np.linalg.solve(covariances(trace), error[..., None])[..., 0]
     return np.einsum("tln,tln->tl", error, white) / error.shape[-1]
+
+
+def nll(trace: Trace) -> Array:
+    """(T, L) nats: ``-ln N(x; m, S)`` of the true state x, in m and rad; NaN without a covariance."""
+    ratio, n = nees(trace), len(trace.task.components)
+    if not trace.has_covariance:
+        return ratio
+    with np.errstate(invalid="ignore"):  # covariances of updates that are not reported are NaN
+        volume = np.linalg.slogdet(covariances(trace)).logabsdet
+    return np.asarray(0.5 * (n * ratio + volume + n * math.log(2.0 * math.pi)))
+
+
+def known_mean(values: Array) -> float:
+    """Mean of the finite values; NaN without any."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else math.nan
 
 
 def contours(covariance: NDArray[Any]) -> tuple[Array, Array]:
@@ -257,6 +274,15 @@ def display_units(task: Task) -> tuple[tuple[str, ...], Array]:
     """Display units (``cm``, ``deg``) of the n components, and the conversion factors (n,) from SI."""
     pairs = [component.conversion for component in task.components]
     return tuple(unit for unit, _ in pairs), np.array([factor for _, factor in pairs])
+
+
+def by_component(task: Task, quantities: Mapping[str, Array]) -> dict[str, float]:
+    """Component with unit, and quantity -> value in the unit, from quantity -> values (n,) in SI units."""
+    return {
+        f"{with_unit(c.label, c.conversion[0])}: {name}": c.conversion[1] * values[i]
+        for i, c in enumerate(task.components)
+        for name, values in quantities.items()
+    }
 
 
 def error_names(task: Task) -> list[str]:

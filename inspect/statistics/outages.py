@@ -37,6 +37,11 @@ class DurationClass:
     square: float
     share: float
 
+    @property
+    def text(self) -> str:
+        """The durations: ``1 to 10``, or ``over 600``."""
+        return f"over {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
+
 
 @dataclass(frozen=True)
 class Outages:
@@ -171,6 +176,4 @@ def _classes(
 
 def root_mean_square(values: Sequence[float] | Array) -> float:
     """Root of the mean square of the known values; NaN without any."""
-    array = np.asarray(values, dtype=np.float64)
-    finite = array[np.isfinite(array)]
-    return float(np.sqrt(np.square(finite).mean())) if len(finite) else math.nan
+    return math.sqrt(measures.known_mean(np.square(np.asarray(values, dtype=np.float64))))

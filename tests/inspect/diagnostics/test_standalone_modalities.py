@@ -65,7 +65,8 @@ def result(update: float, alone: float, low: float, high: float) -> StandaloneMo
         high=np.array([high, 0.4]),
     )
     none, mask = np.zeros((0, 2)), np.zeros(0, dtype=bool)
-    return StandaloneModalities(DOOR, "f", ("image", "haptics"), 14, (phase,), none[:, 0], none, none, mask, mask)
+    run = {"task": DOOR, "filter": "f", "trajectories": 14, "contact": mask, "blackout": mask}
+    return StandaloneModalities(("image", "haptics"), (phase,), none[:, 0], none, none, **run)
 
 
 @pytest.mark.parametrize(
