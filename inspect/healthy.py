@@ -11,6 +11,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics
@@ -21,7 +22,7 @@ from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.batch import Progress, trace_all
+from beliefscope.inspect.traces.batch import trace_all
 
 MAX_EPISODES = 120
 """Maximum number of episodes of a profile; more hardly change it."""
@@ -51,7 +52,7 @@ class SensorRecord:
 
 
 def sensor_record(
-    episodes: Sequence[Episode], reference: Reference | None = None, progress: Progress | None = None
+    episodes: Sequence[Episode], reference: Reference | None = None, progress: Progress = None
 ) -> SensorRecord:
     """The statistics of the sensors of clean episodes, and their images.
 
@@ -82,7 +83,7 @@ def profile_of(
     episodes: Sequence[Episode],
     data: str,
     sensors: SensorRecord | None = None,
-    progress: Progress | None = None,
+    progress: Progress = None,
     indices: Sequence[int] | None = None,
     reference: Reference | None = None,
 ) -> HealthyProfile:
@@ -122,7 +123,7 @@ def profile_of(
 
 
 def recorded_profile(
-    checkpoint: Checkpoint, traces: Sequence[Trace], data: str, progress: Progress | None = None
+    checkpoint: Checkpoint, traces: Sequence[Trace], data: str, progress: Progress = None
 ) -> HealthyProfile:
     """The healthy profile of a filter over its recorded runs of clean episodes, as ``profile_of``."""
     sensors = sensor_record([trace.episode for trace in traces], progress=progress)
@@ -162,7 +163,7 @@ def measure_profile(
     episodes: Sequence[Episode],
     data: str,
     is_sample: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = None,
 ) -> dict[str, Any] | None:
     """JSON of the healthy profile of a trained filter over the held-out of the episodes; None if there are none.
 

@@ -7,7 +7,7 @@ networks, start and random numbers, but no step of its recursion uses any other 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ import torch
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.rollout import first_belief
@@ -55,7 +56,7 @@ def standalone_runs(traces: Sequence[Trace], checkpoint: Checkpoint | None) -> d
 
 
 def standalone_errors(
-    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
+    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Progress = None
 ) -> list[measures.Array]:
     """Errors (T, K, n) of the standalone filter of each of the K input modalities, by trace; m and rad."""
     modalities = modalities_of(checkpoint)
@@ -70,9 +71,7 @@ def standalone_errors(
 
 
 @torch.no_grad()
-def standalone(
-    checkpoint: Checkpoint, trace: Trace, modality: str, progress: Callable[[float], None] | None = None
-) -> Trace:
+def standalone(checkpoint: Checkpoint, trace: Trace, modality: str, progress: Progress = None) -> Trace:
     """Run the filter of a trace over the same episode with one modality only.
 
     Start, particles, seed and so the random numbers are those of the trace; its episode has the injected faults and

@@ -56,21 +56,18 @@ class StoredRuns:
         return self._replay[1].with_intervention(intervention)
 
 
-def _traced(checkpoint: Checkpoint, episode: Episode, progress: Progress, settings: dict[str, Any]) -> Trace:
-    """The run; an external filter that fails at a step is restarted at the true state."""
-    if not isinstance(checkpoint, ExternalFilter):
-        return trace(checkpoint, episode, progress=progress, **settings)
-    own = {name: value for name, value in settings.items() if name != "particles"}
-    return trace_with_restarts(checkpoint, episode, progress=progress, **own)
-
-
 def _run_or_load(
     path: Path, checkpoint: Checkpoint, episode: Episode, progress: Progress, settings: dict[str, Any]
 ) -> Trace:
+    """The stored trace, or that of a run; an external filter that fails at a step is restarted at the true state."""
     if path.is_file():
         with suppress(BadInput):
             return load_trace(path)
-    result = _traced(checkpoint, episode, progress, settings)
+    if isinstance(checkpoint, ExternalFilter):
+        own = {name: value for name, value in settings.items() if name != "particles"}
+        result = trace_with_restarts(checkpoint, episode, progress=progress, **own)
+    else:
+        result = trace(checkpoint, episode, progress=progress, **settings)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_trace(result, path)
     return result

@@ -185,13 +185,13 @@ class Counterfactual(Diagnostic):
     def _of_modalities(self) -> list[dict[str, Value]]:
         """Rows of a table."""
         main = self.task.main_error
-        columns = {f"change of its update, {main.unit}".rstrip(", "): main.factor * self.modality_distance}
+        change = main.factor * self.modality_distance[self.during].mean(0)
+        means = {f"change of its update, {main.unit}".rstrip(", "): change}
         if self.effective_weights is not None and self.counterfactual_weights is not None:
-            columns |= {
-                "effective weight": self.effective_weights,
-                "effective weight with intervention": self.counterfactual_weights,
+            means |= {
+                "effective weight": self.effective_weights[self.during].mean(0),
+                "effective weight with intervention": self.counterfactual_weights[self.during].mean(0),
             }
-        means = {name: values[self.during].mean(0) for name, values in columns.items()}
         return [
             {"modality": m, **{name: values[k] for name, values in means.items()}}
             for k, m in enumerate(self.modalities)

@@ -63,8 +63,8 @@ def judge(criterion: Criterion, comparison: CheckpointComparison, task: Task) ->
     measure = task.main_error.name if criterion.measure == ERROR else criterion.measure
     by_slice = {d.slice: d for d in comparison.differences if d.measure == measure}
     target = by_slice.pop(criterion.slice, None)
-    rows = [_improvement(target, -criterion.by)] if target else []
-    rows += [_guard(d, criterion.others) for d in by_slice.values()]
+    rows = [_change(target, -criterion.by, is_target=True)] if target else []
+    rows += [_change(d, criterion.others) for d in by_slice.values()]
     outcomes = {row.outcome for row in rows}
     outcome: Outcome = "met"
     if "not met" in outcomes:
@@ -74,27 +74,13 @@ def judge(criterion: Criterion, comparison: CheckpointComparison, task: Task) ->
     return Success(str(criterion), criterion.sentence(task), outcome, _verdict(outcome, rows, target), tuple(rows))
 
 
-def _improvement(difference: Difference, limit: float) -> SliceChange:
-    _, low, high = _changes(difference)
-    outcome: Outcome = "met" if high <= limit else "not met" if low > limit else "inconclusive"
-    return _row(difference, limit, outcome)
-
-
-def _guard(difference: Difference, limit: float) -> SliceChange:
-    change, low, _ = _changes(difference)
-    outcome: Outcome = "met" if change <= limit else "not met" if low > limit else "inconclusive"
-    return _row(difference, limit, outcome)
-
-
-def _row(difference: Difference, limit: float, outcome: Outcome) -> SliceChange:
-    before, after, unit = difference.display
-    return SliceChange(difference.slice, before, after, unit, *_changes(difference), limit, outcome)
-
-
-def _changes(difference: Difference) -> tuple[float, float, float]:
-    """Relative change and its interval."""
+def _change(difference: Difference, limit: float, is_target: bool = False) -> SliceChange:
+    """The limit is kept if the change is within it, or of the slice to improve, its whole interval."""
     change, low, high = (math.expm1(min(x, 30.0)) for x in (difference.effect, difference.low, difference.high))
-    return change, low, high
+    largest = high if is_target else change
+    outcome: Outcome = "met" if largest <= limit else "not met" if low > limit else "inconclusive"
+    before, after, unit = difference.display
+    return SliceChange(difference.slice, before, after, unit, change, low, high, limit, outcome)
 
 
 def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference | None) -> str:

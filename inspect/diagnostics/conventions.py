@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -14,6 +14,7 @@ from beliefscope.datasets.faults.injection import Faults, apply_to
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.shapley import run_subsets
@@ -202,9 +203,7 @@ def _of_sensor(task: Task, key: str, modality: str, channels: int) -> list[Chang
     return result
 
 
-def conventions(
-    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
-) -> Conventions:
+def conventions(traces: Sequence[Trace], checkpoint: Checkpoint, progress: Progress = None) -> Conventions:
     """Run a filter over the episodes of traces with each change of its inputs, with the same random numbers."""
     first, report, modalities = traces[0], progress or (lambda share: None), modalities_of(checkpoint)
     changes, errors = changes_of(first.task, modalities, first.episode), error_names(first.task)

@@ -10,7 +10,7 @@ import numpy as np
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry, drawn_steps
 from beliefscope.inspect.diagnostics.views import Array, Curve, Line, Plot, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -164,7 +164,7 @@ def ensemble(traces: Sequence[Trace]) -> Ensemble:
     where = np.concatenate([measures.counted(trace) for trace in traces])
     error, spread, rank = (np.concatenate(columns)[where] for columns in zip(*parts, strict=True))
     assert first.particles is not None
-    members, keep = first.particles.shape[1], len(first) if len(traces) == 1 else 0
+    members, keep = first.particles.shape[1], drawn_steps(traces)
     return Ensemble(
         task=first.task,
         filter=first.filter,

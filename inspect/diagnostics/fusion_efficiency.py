@@ -8,7 +8,7 @@ is the reference. ``fusion_gaps.py`` measures the reasons for a gap.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Entry, RunDiagnostic, drawn_steps, fields_of
 from beliefscope.inspect.diagnostics.fusion_gaps import Reason, reasons_of
@@ -154,9 +155,7 @@ class FusionEfficiency(RunDiagnostic):
         return [Curve("fused", main.factor * self.fused, chart, main.unit, "fused"), *alone, best]
 
 
-def fusion_efficiency(
-    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
-) -> FusionEfficiency:
+def fusion_efficiency(traces: Sequence[Trace], checkpoint: Checkpoint, progress: Progress = None) -> FusionEfficiency:
     """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
     return efficiency_of(traces, checkpoint, standalone_errors(traces, checkpoint, progress))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry, drawn_steps
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import TAIL, are_extreme, nis_of, squared_innovations
@@ -165,8 +165,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 def innovations_of(traces: Sequence[Trace]) -> Innovations:
     """Evaluate the innovations and gates of one filter over one or more episodes."""
-    first = traces[0]
-    keep = len(first) if len(traces) == 1 else 0
+    first, keep = traces[0], drawn_steps(traces)
     rejected = np.zeros(len(first), dtype=bool) if first.accepted is None else (first.accepted == 0.0).any(1)
     return Innovations(
         filter=first.filter,

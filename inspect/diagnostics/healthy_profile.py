@@ -125,20 +125,15 @@ def profile_document(task: str, filter_: str, checkpoint_hash: str, checkpoint: 
 
     The file beside a pretrained checkpoint is measured again when statistics are added, its header is not.
     """
-    own = checkpoint.healthy_profile if isinstance(checkpoint, Checkpoint) else None
-    return _beside_pretrained(task, filter_, checkpoint_hash) or own
+    document = _file_beside_pretrained(task, filter_)
+    beside = document["healthy_profile"] if document and document["checkpoint"] == checkpoint_hash else None
+    return beside or (checkpoint.healthy_profile if checkpoint is not None else None)
 
 
 def pretrained_reference(task: Task) -> Reference | None:
     """Healthy images of a task with pretrained filters; None without any."""
     image = _sensors_of_pretrained(task.name)["reference"]
     return None if image is None else Reference.from_json(image)
-
-
-def _beside_pretrained(task: str, filter_: str, checkpoint_hash: str) -> dict[str, Any] | None:
-    """JSON of the profile in the file beside the pretrained checkpoint of this hash."""
-    document = _file_beside_pretrained(task, filter_)
-    return document["healthy_profile"] if document and document["checkpoint"] == checkpoint_hash else None
 
 
 @lru_cache(maxsize=4)  # files of pretrained filters do not change; reading one takes 2 ms

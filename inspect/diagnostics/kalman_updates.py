@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import islice, permutations
 
 import numpy as np
 
@@ -49,7 +48,7 @@ def expected_updates(steps: RepeatedSteps) -> Updates:
     starts at the belief after the one before, or at its mean with the predicted covariance, if the filter does not
     update it. The kind and order with the smallest errors count.
     """
-    orders = list(_orders(steps.size.shape[2]))
+    orders = list(islice(permutations(range(steps.size.shape[2])), MAX_ORDERS))
 
     def error(updates: Updates) -> float:
         return _size(updates.covariance_error) + _size(updates.correction_error)
@@ -75,13 +74,6 @@ def correction_slopes(steps: RepeatedSteps, updates: Updates) -> Array:
 def _size(errors: Array) -> float:
     known = errors[np.isfinite(errors)]
     return float(known.mean()) if len(known) else 0.0
-
-
-def _orders(count: int) -> Iterator[tuple[int, ...]]:
-    for number, order in enumerate(permutations(range(count))):
-        if number == MAX_ORDERS:
-            return
-        yield order
 
 
 def _together(steps: RepeatedSteps) -> Updates:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.special import ndtr, stdtrit
 from beliefscope.datasets.task import Task, with_unit
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table
 from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, Quantity, no_maps
@@ -228,7 +229,7 @@ def maps(
     checkpoint: Checkpoint,
     size: int = COARSE,
     quantity: Quantity | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> MapSurvey:
     """Evaluate the maps of all steps at the true angle. Raises BadInput for a filter without maps."""
     parts, title = [], ""

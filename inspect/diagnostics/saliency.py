@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +14,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.calls import is_stepwise
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
@@ -207,7 +208,7 @@ def saliency(
     step: int | None = None,
     at: Literal["truth", "estimate"] = "truth",
     window: int = 4,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> Saliency:
     """Attribute the result of one step to its observations.
 

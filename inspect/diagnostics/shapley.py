@@ -15,6 +15,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import display_name
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import rollout
@@ -208,7 +209,7 @@ def run_subsets(
     checkpoint: Checkpoint,
     trace: Trace,
     offset: float = 0.0,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
     subsets: Mask | None = None,
 ) -> Array:
     """(T, S, n) m, rad: estimates of the trace's filter with subsets of its modalities.
@@ -266,7 +267,7 @@ def shapley(
     traces: Sequence[Trace],
     checkpoint: Checkpoint,
     offset: float = 0.0,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> Shapley:
     """Compute the Shapley values of the modalities of one filter over one or more episodes.
 

@@ -7,13 +7,14 @@ filter never uses them (``inspect/standalone.py``). Only the latter shows if fus
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Entry, RunDiagnostic, drawn_steps, fields_of
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
@@ -140,7 +141,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
 
 
 def standalone_modalities(
-    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
+    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Progress = None
 ) -> StandaloneModalities:
     """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
     modalities = modalities_of(checkpoint)

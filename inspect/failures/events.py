@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.engine import Engine
+from beliefscope.filters.engine import Engine, Progress
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
 from beliefscope.inspect.failures.step_scores import RECENT, ROUNDING, Survey
 from beliefscope.inspect.failures.survey import ScoredRuns, fields_of_runs, find_score, survey_of
@@ -236,7 +236,7 @@ def find_failures(
     particles: int = 300,
     engine: Engine = "local",
     workers: int = 1,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> Failures:
     """Run a filter over the episodes of a data set and rank its failures.
 

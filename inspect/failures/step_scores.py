@@ -32,6 +32,9 @@ FAST = 0.95
 OTHER = "other steps"
 """Phase of the steps of no other phase."""
 
+COLUMNS = ("episode", "step", "position", "error", "angle_error", "nees", "ess", "beta", "effective_weights")
+"""Fields of a survey that are columns of its episodes."""
+
 
 def phases_of(task: Task) -> tuple[str, ...]:
     """Names of the phases: changes of contact, blackout, fast motion, start, and the groups of the covariates."""
@@ -127,16 +130,8 @@ class Survey:
             angles=tuple(c.name for c in task.components if c.unit == "rad"),
             scores={name: columns[f"score {name}"] for name in scores_of(task) if f"score {name}" in columns},
             phases=_phases(columns, task),
-            episode=columns["episode"],
-            step=columns["step"],
-            position=columns["position"],
             time=None if np.isnan(columns["time"]).all() else columns["time"],
-            error=columns["error"],
-            angle_error=columns["angle_error"],
-            nees=columns["nees"],
-            ess=columns.get("ess"),
-            beta=columns.get("beta"),
-            effective_weights=columns.get("effective_weights"),
+            **{name: columns.get(name) for name in COLUMNS},
         )
 
     def time_of(self, index: int) -> float | None:

@@ -13,8 +13,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.fusion import product_of_experts
 from beliefscope.inspect.maps.likelihood_map import Quantity
-
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.signals import Array
 
 
 def fusion_rule(checkpoint: Checkpoint, modalities: tuple[str, ...], quantity: Quantity) -> str:

@@ -15,7 +15,7 @@ from beliefscope.filters.belief import Evidence
 from beliefscope.filters.catalog import KINDS
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import usual_variances, with_floor
-from beliefscope.filters.engine import one_thread
+from beliefscope.filters.engine import Progress, one_thread
 from beliefscope.filters.external.likelihood import has_likelihood, log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.fusion import mixture
@@ -227,7 +227,7 @@ class MapEngine:
         self,
         steps: Sequence[int],
         size: int = FINE,
-        progress: Callable[[float], None] | None = None,
+        progress: Progress = None,
         quantity: Quantity | None = None,
     ) -> Iterator[LikelihoodMap]:
         """Default maps of several steps. ``progress`` is called with the completed fraction, 0..1."""

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
 from beliefscope.inspect.maps.shape import classify, fit_rings
+from beliefscope.inspect.statistics.signals import Array
 from beliefscope.inspect.traces.data import Trace
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

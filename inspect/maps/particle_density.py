@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
 from beliefscope.filters.covariance_floor import with_floor
-from beliefscope.inspect.statistics.measures import wrap_angles
-
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.measures import Array, wrap_angles
 
 MAX_KERNELS = 5000
 """Larger particle sets are thinned in proportion to their weights; bounds the time of a map."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
+from beliefscope.inspect.statistics.signals import Array
 from beliefscope.inspect.traces.data import Trace
-
-Array = NDArray[np.float64]
 
 Others = Literal["fixed", "marginal"]
 OTHERS: tuple[Others, ...] = get_args(Others)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from beliefscope.inspect.statistics.signals import Array
 
 SHAPES = ("flat", "round", "ridge", "ring")
 """Shapes of a map, in the order of ``classify``."""

@@ -14,7 +14,7 @@ other covariates. So a slice that follows from those before is not reported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
+from beliefscope.filters.engine import Progress
 from beliefscope.inspect.slices.covariates import StepCovariate
 from beliefscope.inspect.statistics.measures import Array, Mask
 
@@ -99,7 +100,7 @@ def find_candidates(
     pairings: int = PAIRINGS,
     seed: int = 0,
     most: int = MAX_SLICES,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> list[Candidate]:
     """Slices whose scores are larger than those of the other steps, in the order of their discovery.
 

@@ -9,14 +9,14 @@ Bolme et al., "Visual object tracking using adaptive correlation filters" (CVPR 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from beliefscope.inspect.statistics.signals import Array
+from beliefscope.inspect.statistics.signals import Array, significant
 
 RADIUS = 7
 """Pixels: half the width of the kernel. The response is searched up to ``SEARCH`` pixels from the expected pixel."""
@@ -70,9 +70,8 @@ class LandmarkFilter:
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, rounded to ``DIGITS`` and ``PIXEL_DIGITS``."""
-        digits = {"background": PIXEL_DIGITS, "kernel": PIXEL_DIGITS, "camera": DIGITS, "scale": DIGITS}
-        arrays = {name: _rounded(getattr(self, name), number) for name, number in digits.items()}
-        return {**arrays, "height": float(f"{self.height:.{DIGITS}g}")}
+        pixels = {"background": PIXEL_DIGITS, "kernel": PIXEL_DIGITS}
+        return {f.name: significant(getattr(self, f.name), pixels.get(f.name, DIGITS)) for f in fields(self)}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> LandmarkFilter:
@@ -243,7 +242,3 @@ def _peaks(response: NDArray[np.float64]) -> Array:
     dy = vertex(*(response[t, rows + k, j] for k in (-1, 0, 1)))
     dx = vertex(*(response[t, i, columns + k] for k in (-1, 0, 1)))
     return np.stack([j + np.where(columns == j, dx, 0.0), i + np.where(rows == i, dy, 0.0)], axis=1)
-
-
-def _rounded(values: Array, digits: int) -> list[list[float]]:
-    return [[float(f"{value:.{digits}g}") for value in row] for row in values.tolist()]

@@ -23,7 +23,6 @@ from beliefscope.inspect.statistics.reading_model import (
     ReadingModel,
     angle_of,
     readings_of,
-    states_of,
     steps_of,
 )
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, is_angle, wrapped
@@ -100,7 +99,7 @@ class Rows:
 
     def __init__(self, episode: Episode, key: str, inputs: Array, steps: Indices) -> None:
         self.features, self.readings = inputs[steps], readings_of(episode, key)[steps]
-        self.states = states_of(episode)[steps]
+        self.states = episode.states.astype(np.float64)[steps]
         self.places = positions(episode.task, self.states)
         self.monomials = {degree: monomials(episode, key != CONTROL, degree)[steps] for degree in (1, *DEGREES)}
 

@@ -7,7 +7,7 @@ exchanged, a gain, a bias, and a delay behind the labels.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from beliefscope.inspect.statistics.reading_features import (
     monomials,
     positions,
 )
-from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, wrapped
+from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, significant, wrapped
 
 CONTROL = "control"
 """Key of the model of the controls."""
@@ -124,23 +124,9 @@ class ChannelModel:
         return np.where(((values < low) | (values > high)).any(1), np.nan, result)
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-
-        def rounded(values: Array) -> list[float]:
-            return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]
-
-        return {
-            "index": self.index,
-            "coefficients": [rounded(row) for row in self.coefficients.T],
-            "constants": rounded(self.constants),
-            "heading": rounded(self.heading),
-            "landmark": rounded(self.landmark),
-            "noise": float(f"{self.noise:.{DIGITS}g}"),
-            "bias": float(f"{self.bias:.{DIGITS}g}"),
-            "degree": self.degree,
-            "gain_spread": float(f"{self.gain_spread:.{DIGITS}g}"),
-            "limits": [rounded(row) for row in self.limits],
-        }
+        """JSON values; the rows of the coefficients are columns."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)} | {"coefficients": self.coefficients.T}
+        return {name: v if isinstance(v, int) else significant(v, DIGITS) for name, v in values.items()}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ChannelModel:
@@ -237,7 +223,7 @@ class ReadingModel:
         of_features = (m for m in self.of_channels if not len(m.landmark))
         if any(len(m.coefficients) != inputs[m.degree].shape[1] for m in of_features):
             return np.full((len(episode), len(self.of_channels)), np.nan)
-        states = states_of(episode)
+        states = episode.states.astype(np.float64)
         places = positions(episode.task, states)
         columns = [m.expected(inputs[m.degree], states, places) for m in self.of_channels]
         return np.stack(columns, axis=1)
@@ -255,11 +241,6 @@ class ReadingModel:
 def readings_of(episode: Episode, key: str) -> Array:
     """(T, d) readings of a vector sensor, or the controls."""
     return (episode.controls if key == CONTROL else episode.observations[key]).astype(np.float64)
-
-
-def states_of(episode: Episode) -> Array:
-    """(T, n) true states in double precision."""
-    return episode.states.astype(np.float64)
 
 
 def angle_of(columns: Array, states: Array, heading: Array) -> Array:

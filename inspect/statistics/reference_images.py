@@ -18,7 +18,7 @@ from scipy import fft
 from beliefscope.datasets.episode import Episode, lost_images
 from beliefscope.inspect.statistics.contact_distance import HARMONICS, fit_contact_distance
 from beliefscope.inspect.statistics.image_landmarks import DIGITS, LandmarkFilter, fit_landmark_filter, quadratic
-from beliefscope.inspect.statistics.signals import Array
+from beliefscope.inspect.statistics.signals import Array, significant
 
 Gray = NDArray[np.uint8]
 Spectrum = NDArray[np.complex128]
@@ -81,7 +81,7 @@ class Reference:
             "range": None if self.range is None else self.range.tolist(),
             "hand": None if self.hand is None else self.hand.to_json(),
             "object": None if self.object is None else self.object.to_json(),
-            "contact": None if self.contact is None else [float(f"{x:.{DIGITS}g}") for x in self.contact],
+            "contact": None if self.contact is None else significant(self.contact, DIGITS),
         }
 
     @classmethod

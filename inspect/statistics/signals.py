@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,6 +96,12 @@ def is_angle(values: Array) -> bool:
     jumps = np.abs(np.diff(values))
     turns = jumps > TURN - NEAR_TURN
     return bool(turns.any() and np.mean((jumps > TURN / 4.0) & ~turns) < OTHER_JUMPS)
+
+
+def significant(values: Any, digits: int) -> Any:
+    """A number, or an array as nested lists of numbers, with this many significant digits, for JSON."""
+    plain = values.tolist() if isinstance(values, np.ndarray) else values
+    return float(f"{plain:.{digits}g}") if isinstance(plain, float) else [significant(x, digits) for x in plain]
 
 
 def wrapped(angles: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Gaussian, Recurrent, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import first_belief, rollout
@@ -25,8 +26,6 @@ from beliefscope.inspect.traces.run import assemble_trace, step_arrays, trace
 EPISODES, STEPS = 32, 10_000
 """Maximum number of episodes in one run, and of their steps; limits memory."""
 
-Progress = Callable[[float], None]
-
 
 @torch.no_grad()
 def trace_all(
@@ -36,7 +35,7 @@ def trace_all(
     seed: int = 0,
     particles: int = 300,
     faults: Faults = NO_FAULTS,
-    progress: Progress | None = None,
+    progress: Progress = None,
     restart: bool = False,
 ) -> Iterator[Trace]:
     """Trace the episodes with these indices, those of equal length together, with an external filter one by one.
@@ -91,7 +90,7 @@ def _run_together(
     seed: int,
     particles: int,
     faults: Faults,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Iterator[Trace]:
     """The traces of episodes of equal length."""
     inputs = [faults.apply(episode, seed) for episode in episodes.values()]
@@ -115,7 +114,7 @@ def _run_together(
         )
 
 
-def part_of(progress: Progress | None, done: int, total: int, size: int = 1) -> Progress | None:
+def part_of(progress: Progress, done: int, total: int, size: int = 1) -> Progress:
     """The progress of the next part of this size of a whole; None without one."""
     return None if progress is None else lambda share: progress((done + share * size) / total)
 

@@ -159,8 +159,8 @@ ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type) and "Mapp
 """Names of the array fields of a trace."""
 
 
-STATIC = ("start_mean", "start_covariance")
-"""Arrays of a trace without a step axis."""
+STATIC = {"start_mean": "n", "start_covariance": "nn"}
+"""Arrays of a trace without a step axis, and their shapes."""
 
 PROVENANCE = ("data_hash", "episode_index", "seed", "faults", "settings")
 """Fields of a trace that identify its run, beside those of the filter."""

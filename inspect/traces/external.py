@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.adapter import EXTRA, letters_of
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
@@ -22,7 +23,7 @@ def trace_external(
     episode_index: int = 0,
     seed: int = 0,
     faults: Faults = NO_FAULTS,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> Trace:
     """Run an external filter over an episode from the true state, with the arguments of ``trace``.
 
@@ -32,19 +33,14 @@ def trace_external(
     Raises BadInput as ``trace``, and if the filter fails or returns invalid values.
     """
     external.check_task(episode)
-    provenance: dict[str, Any] = {
-        "data_hash": episode.digest(),
-        "episode_index": episode_index,
-        "seed": seed,
-        "faults": faults,
-    }
+    provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
     return run_external(external, faults.apply(episode, seed), progress, **provenance)
 
 
 def run_external(
     external: ExternalFilter,
     episode: Episode,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
     *,
     seen: Episode | None = None,
     **provenance: Any,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -14,13 +13,12 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace, check_origin, provenance_of, standalone_provenance
 from beliefscope.inspect.traces.external import run_external
 from beliefscope.inspect.traces.replay import Intervention, Replay, have_equal_arrays
-
-Progress = Callable[[float], None] | None
 
 
 def open_replay(checkpoint: Checkpoint, trace: Trace, progress: Progress = None) -> Replay | ExternalReplay:

@@ -154,19 +154,12 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any], give
 
     Raises AttributeError, KeyError, TypeError or ValueError (including BadInput) for inconsistent content.
     """
-    episode_arrays: dict[str, Any] = {
-        name.removeprefix("episode/"): a for name, a in arrays.items() if name.startswith("episode/")
-    }
-
-    def group(prefix: str) -> dict[str, Any]:
-        return {name.removeprefix(prefix): a for name, a in episode_arrays.items() if name.startswith(prefix)}
-
-    origin = header["episode"]
+    episode_arrays, origin = _group(arrays, "episode/"), header["episode"]
     episode = Episode(
         **origin | {"task": stored_task(origin["task"], given)},
         **{name: episode_arrays[name] for name in ("states", "controls", "contact", "qpos")},
-        observations=group("observations/"),
-        covariates=group("covariates/"),
+        observations=_group(episode_arrays, "observations/"),
+        covariates=_group(episode_arrays, "covariates/"),
         time=episode_arrays.get("time"),
     )
     values = {name: value for name, value in header.items() if name not in ("format", "episode", "recipe")}
@@ -176,10 +169,14 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any], give
         "faults": stored_faults(header),
     }
     own_arrays = {current_array(n): a for n, a in arrays.items() if not n.startswith(("episode/", "extra/"))}
-    extra = {name.removeprefix("extra/"): a for name, a in arrays.items() if name.startswith("extra/")}
-    trace = Trace(**values, episode=episode, extra=extra, **own_arrays)
+    trace = Trace(**values, episode=episode, extra=_group(arrays, "extra/"), **own_arrays)
     validate_trace(trace)
     return trace
+
+
+def _group(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The arrays whose names have a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
 
 
 def stored_faults(header: Mapping[str, Any]) -> Faults:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 from urllib.parse import parse_qsl
@@ -18,7 +18,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.engine import one_thread
+from beliefscope.filters.engine import Progress, one_thread
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import WEIGHTED
 from beliefscope.filters.rollout import first_belief
@@ -177,7 +177,7 @@ class Replay:
 
     @one_thread()  # as the traced run
     @torch.no_grad()
-    def __init__(self, checkpoint: Checkpoint, trace: Trace, progress: Callable[[float], None] | None = None) -> None:
+    def __init__(self, checkpoint: Checkpoint, trace: Trace, progress: Progress = None) -> None:
         """Raises BadInput if the trace is from another checkpoint. progress: called with the completed fraction."""
         check_origin(checkpoint, trace)
         filter_ = checkpoint.filter

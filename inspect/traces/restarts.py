@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.text import plural
+from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.adapter import MIN_STEPS, FailedStep, joined
 from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
@@ -34,7 +35,7 @@ def trace_with_restarts(
     episode_index: int = 0,
     seed: int = 0,
     faults: Faults = NO_FAULTS,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
     largest: float = math.inf,
 ) -> Trace:
     """The run over an episode; a filter that fails at a step is restarted at the true state where it has lost it.
@@ -81,7 +82,7 @@ def _until_lost(
     external: ExternalFilter,
     episode: Episode,
     seed: int,
-    progress: Callable[[float], None] | None,
+    progress: Progress,
     std: NDArray[Any],
     largest: float,
 ) -> tuple[Trace, str]:

@@ -18,7 +18,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Batch, Steps, check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, reweighted
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.engine import one_thread
+from beliefscope.filters.engine import Progress, one_thread
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
@@ -44,7 +44,7 @@ def trace(
     seed: int = 0,
     particles: int = 300,
     faults: Faults = NO_FAULTS,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
     particles_kept: int = PARTICLES_KEPT,
 ) -> Trace:
     """Run a filter over an episode from the true state, covariance 0.1 I (standardised), and keep every step.
@@ -77,7 +77,7 @@ def trace_parts(
     episode_index: int = 0,
     seed: int = 0,
     particles: int = 300,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
     particles_kept: int = PARTICLES_KEPT,
 ) -> Iterator[Trace]:
     """Yields consecutive parts of the trace of a built-in filter, with the same bits as ``trace``.
@@ -176,7 +176,7 @@ def run_parts(
     generator: torch.Generator,
     particles: int,
     particles_kept: int,
-    progress: Callable[[float], None] | None,
+    progress: Progress,
 ) -> Iterator[dict[str, Tensor]]:
     """Run a filter over consecutive evidence with N = 1; yields the arrays of its trace by block of steps.
 

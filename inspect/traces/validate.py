@@ -13,10 +13,9 @@ from beliefscope.datasets.episode import time_error
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.external.adapter import SHAPES
 from beliefscope.filters.filter import Kind
-from beliefscope.inspect.traces.data import Trace
+from beliefscope.inspect.traces.data import STATIC, Trace
 
 KINDS = (*get_args(Kind), "external")
-STATIC = {"start_mean": "n", "start_covariance": "nn"}
 LARGEST_SEED = 2**63 - 1
 
 
