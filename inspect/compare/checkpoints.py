@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import with_unit
@@ -34,10 +32,12 @@ from beliefscope.inspect.compare.lineage import base_of
 from beliefscope.inspect.compare.modules import ModuleChange, module_changes
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Line, Plot, Table, Value
+from beliefscope.inspect.failures.survey import held_out_or_all
 from beliefscope.inspect.statistics.calibration import LEVELS
 from beliefscope.inspect.statistics.episode_sums import calibration, measures_of, sample_steps, sum_episodes
 from beliefscope.inspect.statistics.intervals import too_few
 from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.traces.batch import Episodes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -187,7 +187,7 @@ class CheckpointComparison(Diagnostic):
 def compare_checkpoints(
     before: Checkpoint,
     after: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    data: Episodes,
     episodes: Iterable[int] | None = None,
     *,
     slices: Sequence[Slice] = (),
@@ -218,11 +218,7 @@ def compare_checkpoints(
             slice_.check(task, _models(filter_))
     selected, left_out = _standard(pair, {slice_.name for slice_ in slices})
     selected += slices
-    if episodes is None and isinstance(data, Dataset):
-        episodes = data.held_out()
-    elif episodes is None:
-        episodes = data if isinstance(data, Mapping) else range(len(data))
-    indices = tuple(episodes)
+    indices = tuple(held_out_or_all(data) if episodes is None else episodes)
     members = [data[index] for index in indices]
     sums = sum_episodes(
         pair,

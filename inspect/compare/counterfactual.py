@@ -11,7 +11,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.diagnostics.views import Curve, Table, Value
+from beliefscope.inspect.diagnostics.views import Curve, Table, Value, known
 from beliefscope.inspect.statistics.measures import (
     Array,
     covariances,
@@ -166,7 +166,7 @@ class Counterfactual(Diagnostic):
             (
                 name,
                 *(main.factor * e[span].mean() for e in (self.error, self.counterfactual_error, self.distance)),
-                _finite(self.divergence[span].mean()),
+                known(self.divergence[span].mean()),
             )
             for name, span in spans.items()
             if len(self.error[span])
@@ -307,7 +307,3 @@ def _recovery_step(sigmas: Array, to: int) -> int | None:
     exceeded = np.flatnonzero(sigmas[to:] > RECOVERED)
     step = to + (int(exceeded[-1]) + 1 if len(exceeded) else 0)
     return step if step < len(sigmas) else None
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

@@ -108,15 +108,8 @@ class Consistency(RunDiagnostic):
             return (*steps, *(alarm.text for alarm in self.healthy.alarms))
         entries = [entry for entry in self.by_layer if entry.inconsistent]
         texts = [f"{display_name(entry.layer)}, {entry.phase}: {entry.assessment}" for entry in entries]
-        return (
-            *steps,
-            *texts,
-            *(
-                f"innovations of {display_name(test.modality)} are not white"
-                for test in self.whiteness
-                if not test.white
-            ),
-        )
+        colored = [display_name(test.modality) for test in self.whiteness if not test.white]
+        return (*steps, *texts, *(f"innovations of {name} are not white" for name in colored))
 
     def _unimodal_sentence(self, entries: Sequence[LayerConsistency]) -> str:
         worst = max((entry for entry in entries if entry.inconsistent), key=inconsistency, default=None)

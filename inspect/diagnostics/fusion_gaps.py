@@ -7,7 +7,7 @@ state. Filters without virtual sensors (particle filters, sequence models) have 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -167,20 +167,25 @@ def _prior(traces: Sequence[Trace]) -> Reason:
     """
     sums = np.array([_prior_weights(trace) for trace in traces])  # (R, 2, 2)
     logarithms = jackknife(sums, lambda s: np.log(s[..., 0, 0] * s[..., 1, 1] / (s[..., 0, 1] * s[..., 1, 0])))
-    value, low, high = (float(np.exp(v)) for v in logarithms)
     nees = np.concatenate([measures.nees(trace)[measures.counted(trace), -1] for trace in traces]).mean()
-    return Reason(
-        name=PRIOR,
-        modality="",
-        quantity="number of times that the fused mean counts the prior",
-        ideal=1.0,
-        value=value,
-        low=low,
-        high=high,
-        contributes=low > 1.0 and value > MIN_COUNT,
-        headline=f"shared prior counted twice: every fused posterior contains it, and their mean counts it {value:.1f} "
-        f"times (NEES/n of the fused belief {nees:.2f})",
+    return _of_fusion(
+        PRIOR,
+        "number of times that the fused mean counts the prior",
+        logarithms,
+        MIN_COUNT,
+        lambda value: (
+            "shared prior counted twice: every fused posterior contains it, and their mean counts it "
+            f"{value:.1f} times (NEES/n of the fused belief {nees:.2f})"
+        ),
     )
+
+
+def _of_fusion(
+    name: str, quantity: str, logarithms: tuple[Array, Array, Array], smallest: float, headline: Callable[[float], str]
+) -> Reason:
+    """A property of the fusion that is 1 without a gap, from the logarithms of its value and interval."""
+    value, low, high = (float(np.exp(v)) for v in logarithms)
+    return Reason(name, "", quantity, 1.0, value, low, high, low > 1.0 and value > smallest, headline(value))
 
 
 def _prior_weights(trace: Trace) -> Array:
@@ -210,21 +215,18 @@ def _weights(traces: Sequence[Trace], of_sensors: bool) -> Reason:
     means = np.mean([mean for _, mean in parts], axis=0)
     count = means.shape[-1]
     logarithms = jackknife(sums, lambda s: 0.5 * np.log(s[..., -1].sum((-2, -1)) / _least(s, count)[0]))
-    value, low, high = (float(np.exp(v)) for v in logarithms)
     share = _least(sums.sum(0), count)[1]
     k = int(np.abs(means - share).round(6).argmax())  # of two, the first
     name = traces[0].modalities[k]
-    return Reason(
-        name=WEIGHTS,
-        modality="",
-        quantity="error with the effective weights over that with the best constant weights",
-        ideal=1.0,
-        value=value,
-        low=low,
-        high=high,
-        contributes=low > 1.0 and value > MIN_EXCESS,
-        headline=f"wrong weights: mean weight of {display_name(name)} {means[k]:.2f}, best {share[k]:.2f}; the best "
-        f"constant weights would reduce the error of the weighted mean by {percent(1.0 - 1.0 / value)}",
+    return _of_fusion(
+        WEIGHTS,
+        "error with the effective weights over that with the best constant weights",
+        logarithms,
+        MIN_EXCESS,
+        lambda value: (
+            f"wrong weights: mean weight of {display_name(name)} {means[k]:.2f}, best {share[k]:.2f}; the "
+            f"best constant weights would reduce the error of the weighted mean by {percent(1.0 - 1.0 / value)}"
+        ),
     )
 
 

@@ -114,18 +114,11 @@ class Innovations(Diagnostic):
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        texts = [
-            f"the gate of {display_name(e.modality)} {e.gate}"
-            for e in self.modalities
-            if e.gate not in ("", "acts", "never needed")
-        ]
+        wrong = [e for e in self.modalities if e.gate not in ("", "acts", "never needed")]
+        inconsistent = [display_name(e.modality) for e in self.modalities if not e.consistent]
         return (
-            *texts,
-            *(
-                f"innovations of {display_name(e.modality)} are inconsistent"
-                for e in self.modalities
-                if not e.consistent
-            ),
+            *(f"the gate of {display_name(e.modality)} {e.gate}" for e in wrong),
+            *(f"innovations of {name} are inconsistent" for name in inconsistent),
         )
 
     def tables(self) -> list[Table]:

@@ -168,6 +168,11 @@ class Views(ABC):
         return {"verdict": self.verdict, **{name: as_json(getattr(self, name)()) for name in VIEWS}}
 
 
+def known(value: float) -> float | None:
+    """A number; None for one that is not finite."""
+    return value if math.isfinite(value) else None
+
+
 def _plain(value: Any) -> Value:
     plain: Value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(plain, float) and math.isnan(plain) else plain

@@ -145,25 +145,24 @@ def weight_correlations(traces: Sequence[Trace], step_values: Sequence[dict[str,
     task, modalities = traces[0].task, traces[0].modalities
     width = step_values[0]["oracle"].shape[-1]
     columns = [c.name for c in task.components] if width == len(task.components) else [None]
-    labels: list[tuple[str, str, str | None, str]] = []
+    labels = [
+        (name, modality, column, other)
+        for name in names
+        for modality in modalities
+        for column in columns
+        for other in ("contact", "blackout", *(("oracle",) if name != "oracle" else ()))
+    ]
     sums = []
     for trace, steps in zip(traces, step_values, strict=True):
         keep = measures.counted(trace)
-        others = {"contact": trace.episode.contact, "blackout": measures.blackout(trace)}
+        phases = {"contact": trace.episode.contact, "blackout": measures.blackout(trace)}
         pairs = []
-        labels = []
-        for name in names:
-            for k, modality in enumerate(modalities):
-                for w, column in enumerate(columns):
-                    x = steps[name][keep, k, w]
-                    pairs += [(x, other[keep].astype(np.float64)) for other in others.values()]
-                    labels += [(name, modality, column, other) for other in others]
-                    if name != "oracle":
-                        pairs.append((x, steps["oracle"][keep, k, w]))
-                        labels.append((name, modality, column, "oracle"))
-        x, y = (np.stack(side) for side in zip(*pairs, strict=True))
-        sums.append(correlation_sums(x, y))
-    value, low, high = correlate(np.stack(sums))
+        for name, modality, column, other in labels:
+            at = (keep, modalities.index(modality), columns.index(column))
+            y = phases[other][keep].astype(np.float64) if other in phases else steps[other][at]
+            pairs.append((steps[name][at], y))
+        sums.append(correlation_sums(*(np.stack(side) for side in zip(*pairs, strict=True))))
     return [
-        Correlation(*label, *map(float, v)) for label, v in zip(labels, zip(value, low, high, strict=True), strict=True)
+        Correlation(*label, *map(float, values))
+        for label, *values in zip(labels, *correlate(np.stack(sums)), strict=True)
     ]

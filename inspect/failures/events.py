@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode, step_text
+from beliefscope.datasets.episode import step_text
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import display_name, with_unit
@@ -19,8 +18,15 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
 from beliefscope.inspect.failures.step_scores import RECENT, ROUNDING, Survey
-from beliefscope.inspect.failures.survey import ScoredRuns, fields_of_runs, find_score, survey_of
+from beliefscope.inspect.failures.survey import (
+    ScoredRuns,
+    fields_of_runs,
+    find_score,
+    held_out_or_all,
+    survey_of,
+)
 from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, known_mean, layer_label
+from beliefscope.inspect.traces.batch import Episodes
 
 HIGH = 0.9
 """Quantile of the scores of all steps above which a step is part of an event."""
@@ -200,10 +206,9 @@ class Failures(ScoredRuns):
         numbers = [*(self.error_conversion[1] * event.error[known]), *np.degrees(event.angle_error[-1]), event.nees[-1]]
         numbers += [event.ess] if self.particles else []
         numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
-        values = (float(value) if np.isfinite(value) else None for value in numbers)
         score = self.conversion[1] * event.score
         times = (event.time, event.first_time, event.last_time) if self.timed else ()
-        return (event.episode, event.step, event.first, event.last, *times, score, event.phase, *values)
+        return (event.episode, event.step, event.first, event.last, *times, score, event.phase, *map(known, numbers))
 
     @property
     def _label(self) -> str:
@@ -227,7 +232,7 @@ class Failures(ScoredRuns):
 
 def find_failures(
     checkpoint: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    data: Episodes,
     episodes: Iterable[int] | None = None,
     *,
     by: str = "error",
@@ -249,14 +254,10 @@ def find_failures(
     Raises BadInput for an unknown score, and as ``trace``.
     """
     find_score(by, checkpoint.task)
-    if episodes is None and isinstance(data, Dataset):
-        episodes = data.held_out()
-    elif episodes is None:
-        episodes = data if isinstance(data, Mapping) else range(len(data))
     survey = survey_of(
         checkpoint,
         data,
-        episodes,
+        held_out_or_all(data) if episodes is None else episodes,
         by=by,
         faults=faults,
         seed=seed,

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
@@ -16,12 +15,17 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Score, Survey, scores_of
-from beliefscope.inspect.traces.batch import trace_all
-
-Episodes = Dataset | Mapping[int, Episode] | Sequence[Episode]
+from beliefscope.inspect.traces.batch import Episodes, trace_all
 
 BLOCK = 16
 """Episodes that a process runs at a time."""
+
+
+def held_out_or_all(data: Episodes) -> Iterable[int]:
+    """Indices of the held-out episodes of a data set, or of all episodes that are given without one."""
+    if isinstance(data, Dataset):
+        return data.held_out()
+    return data if isinstance(data, Mapping) else range(len(data))
 
 
 @dataclass(frozen=True)

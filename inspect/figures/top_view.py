@@ -58,16 +58,15 @@ def draw_step(trace: Trace, step: int, map_: LikelihoodMap | None = None) -> Fig
     Shows robot and object, true and estimated object, estimates with 2 sigma contours, particles by weight, and the
     contact force. Only for tasks whose map is a position (``Task.floor``).
     """
-    task = trace.task
-    footprints = scene_footprints(trace, task, step)
+    footprints = scene_footprints(trace, trace.task, step)
     with rc_context(STYLE):
         figure = new_figure(figsize=(WIDTH if footprints else HEIGHT + 0.9, HEIGHT), layout="constrained")
         if footprints:
             scene, belief = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
-            _draw_scene(scene, footprints, trace, task, step, map_)
+            _draw_scene(scene, footprints, trace, step, map_)
         else:
             belief = figure.subplots()
-        _draw_belief(belief, trace, task, step, map_)
+        _draw_belief(belief, trace, step, map_)
         handles, names = belief.get_legend_handles_labels()
         figure.legend(handles, names, frameon=False, ncols=len(names), loc="outside lower center")
     return figure
@@ -94,32 +93,30 @@ def outline(points: Array) -> Array:
     return points[ConvexHull(points).vertices]
 
 
-def _draw_scene(
-    axes: Axes, footprints: list[Footprint], trace: Trace, task: Task, step: int, map_: LikelihoodMap | None
-) -> None:
+def _draw_scene(axes: Axes, footprints: list[Footprint], trace: Trace, step: int, map_: LikelihoodMap | None) -> None:
     _draw_map(axes, map_)
     for shape in footprints:
         pale = shape.rgb + PALE * (1.0 - shape.rgb)
         # Translucent, because a door's frame covers its hinge.
         axes.add_patch(Polygon(shape.outline, fc=pale, ec=0.55 * pale, lw=0.5, alpha=0.75))
-    _draw_object(axes, trace, task, step)
-    _draw_positions(axes, trace, task, step, size=3.0)
+    _draw_object(axes, trace, step)
+    _draw_positions(axes, trace, step, size=3.0)
     _draw_force(axes, trace, step)
     corners = np.concatenate([shape.outline for shape in footprints])
     if map_ is not None:
-        half = 100.0 * task.map_half_width
+        half = 100.0 * trace.task.map_half_width
         square = 100.0 * map_.centre + np.array([[-half, -half], [half, half]])
         axes.add_patch(Rectangle(square[0], 2 * half, 2 * half, fill=False, ec="0.6", lw=0.5, zorder=0.5))
         corners = np.concatenate([corners, square])
     low, high = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    _label_axes(axes, task, ["x", "y"])
+    _label_axes(axes, trace.task, ["x", "y"])
     axes.set_title("from above", loc="left")
 
 
-def _draw_belief(axes: Axes, trace: Trace, task: Task, step: int, map_: LikelihoodMap | None) -> None:
+def _draw_belief(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None) -> None:
     """Draw the part of the map square that contains the estimates and contours."""
-    plane = list(task.map_indices)
+    plane = list(trace.task.map_indices)
     centre, reach = 100.0 * trace.anchors[step][plane], MIN_HALF_WIDTH
     _draw_map(axes, map_)
     if trace.particles is not None and trace.log_weights is not None:
@@ -136,10 +133,10 @@ def _draw_belief(axes: Axes, trace: Trace, task: Task, step: int, map_: Likeliho
             axes.add_patch(ellipse)
             spread = max(ellipse.width, ellipse.height) / 2.0
         reach = max(reach, float(np.abs(at - centre).max()) + spread)
-    _draw_positions(axes, trace, task, step, size=5.0)
-    half = min(1.25 * reach, 100.0 * task.map_half_width)
+    _draw_positions(axes, trace, step, size=5.0)
+    half = min(1.25 * reach, 100.0 * trace.task.map_half_width)
     axes.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
-    _label_axes(axes, task, [task.components[i].label for i in plane])
+    _label_axes(axes, trace.task, [trace.task.components[i].label for i in plane])
     axes.set_title("belief" if map_ is None else f"belief, on the {map_.layers[-1]} {map_.quantity}", loc="left")
 
 
@@ -172,15 +169,16 @@ def _draw_map(axes: Axes, map_: LikelihoodMap | None) -> None:
     axes.imshow(rgba, origin="lower", extent=(*edges[0], *edges[1]), interpolation="nearest", zorder=0)
 
 
-def _draw_object(axes: Axes, trace: Trace, task: Task, step: int) -> None:
+def _draw_object(axes: Axes, trace: Trace, step: int) -> None:
     """Draw the true object, and the estimated object dashed."""
-    if task.outline is None:
+    outline_of = trace.task.outline
+    if outline_of is None:
         return
     for name, states, style in (("truth", trace.episode.states, "-"), ("fused", trace.estimate_mean, (0, (3, 1.5)))):
         if np.isfinite(states[step]).all():
             shade = colour(name, trace.modalities)
             axes.add_patch(
-                Polygon(footprint(task.outline(states[step])), fill=False, ec=shade, lw=1.3, ls=style, zorder=3)
+                Polygon(footprint(outline_of(states[step])), fill=False, ec=shade, lw=1.3, ls=style, zorder=3)
             )
 
 
@@ -193,8 +191,8 @@ def footprint(ghost: Outline) -> Array:
     return 100.0 * (flat @ np.array([[c, s], [-s, c]]) + ghost.position[:2])
 
 
-def _draw_positions(axes: Axes, trace: Trace, task: Task, step: int, size: float) -> None:
-    plane = list(task.map_indices)
+def _draw_positions(axes: Axes, trace: Trace, step: int, size: float) -> None:
+    plane = list(trace.task.map_indices)
     style: dict[str, Any] = {"ls": "", "zorder": 4}
     ring: dict[str, Any] = {"mfc": "none", "mew": 1.2}
     for name, mean, _ in _estimates(trace, step):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import with_unit
@@ -22,7 +20,7 @@ from beliefscope.inspect.slices.covariates import EpisodeCovariates, join_covari
 from beliefscope.inspect.slices.search import ALPHA, Candidate, Condition, Index, find_candidates
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.batch import trace_all
+from beliefscope.inspect.traces.batch import Episodes, trace_all
 
 MIN_SEARCHED = 8
 """Smallest number of episodes in which a search without a request by the user is worthwhile."""
@@ -122,7 +120,7 @@ class ErrorSlices(ScoredRuns):
 
 def find_slices(
     checkpoint: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    data: Episodes,
     episodes: Iterable[int],
     *,
     by: str = "error",

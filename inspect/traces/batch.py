@@ -26,11 +26,14 @@ from beliefscope.inspect.traces.run import assemble_trace, step_arrays, trace
 EPISODES, STEPS = 32, 10_000
 """Maximum number of episodes in one run, and of their steps; limits memory."""
 
+Episodes = Dataset | Mapping[int, Episode] | Sequence[Episode]
+"""Episodes by their indices."""
+
 
 @torch.no_grad()
 def trace_all(
     checkpoint: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    data: Episodes,
     indices: Collection[int],
     seed: int = 0,
     particles: int = 300,
@@ -69,9 +72,7 @@ def trace_all(
             done += len(members)
 
 
-def _blocks(
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode], indices: Iterable[int]
-) -> Iterator[dict[int, Episode]]:
+def _blocks(data: Episodes, indices: Iterable[int]) -> Iterator[dict[int, Episode]]:
     """Episodes by index, as many as run together."""
     block: dict[int, Episode] = {}
     for index in indices:
