@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,7 +9,7 @@ from torch import Tensor
 from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.external.calls import dtype_of, inputs_of
+from beliefscope.filters.external.calls import dtype_of, inputs_of, seeded
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.data import check_origin, check_step
@@ -56,7 +53,7 @@ class ExternalStep:
     def estimates(self, *inputs: Tensor) -> Tensor:
         """(B, n) SI units: estimates of the step with other inputs, (B, ...) each, one after another."""
         rows = []
-        with self._generators():
+        with seeded(0, self._external.adapter.module):  # restores the generators
             for i in range(len(inputs[0])):
                 self._external.restore(self._state)
                 torch.set_rng_state(self._random[0])
@@ -64,13 +61,6 @@ class ExternalStep:
                 values = self._external.step(self._keys([values[i : i + 1] for values in inputs]), self._controls)
                 rows.append(values["estimate_mean"][0])
         return torch.stack(rows)
-
-    @contextmanager
-    def _generators(self) -> Iterator[None]:
-        state = np.random.get_state()  # noqa: NPY002
-        with torch.random.fork_rng(devices=[]):
-            yield
-        np.random.set_state(state)  # noqa: NPY002
 
     def _keys(self, inputs: list[Tensor]) -> dict[str, Tensor]:
         """Observations by key of the readings of the modalities, in their original types."""

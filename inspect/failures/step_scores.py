@@ -123,7 +123,7 @@ class Survey:
             raise BadInput("the failure search needs at least one trace")
         parts = [by_index[index].columns for index in sorted(by_index)]
         columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-        run: dict[str, Any] = dict(next(iter(by_index.values())).run)
+        run: dict[str, Any] = {**next(iter(by_index.values())).run, **{name: columns.get(name) for name in COLUMNS}}
         task = run["task"]
         return cls(
             **run,
@@ -131,7 +131,6 @@ class Survey:
             scores={name: columns[f"score {name}"] for name in scores_of(task) if f"score {name}" in columns},
             phases=_phases(columns, task),
             time=None if np.isnan(columns["time"]).all() else columns["time"],
-            **{name: columns.get(name) for name in COLUMNS},
         )
 
     def time_of(self, index: int) -> float | None:

@@ -33,8 +33,8 @@ def trace_external(
     Raises BadInput as ``trace``, and if the filter fails or returns invalid values.
     """
     external.check_task(episode)
-    provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
-    return run_external(external, faults.apply(episode, seed), progress, **provenance)
+    run: dict[str, Any] = {"episode_index": episode_index, "seed": seed, "faults": faults}
+    return run_external(external, faults.apply(episode, seed), progress, data_hash=episode.digest(), **run)
 
 
 def run_external(
