@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,15 +16,9 @@ if TYPE_CHECKING:
     from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
-ALARM_RATE = (
-    "Probability that a healthy filter raises an alarm. Default: 0.02; for one episode and a healthy record of n < 49 "
-    "episodes, 1 / (n + 1)."
-)
-
-
 @dataclass(frozen=True)
-class RunsOrRecorded(opt.Runs):
-    """Options of a command that also takes recorded runs, by their path in place of the task."""
+class Options(opt.Runs):
+    """Options of a diagnosis, which also takes recorded runs, by their path in place of the task."""
 
     task: Annotated[
         str,
@@ -35,6 +29,37 @@ class RunsOrRecorded(opt.Runs):
         ),
     ]
     filter: str = ""
+    episode: int | None = opt.option(
+        "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
+    )
+    base: Path | None = opt.option(
+        "NAME|CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None
+    )
+    alarm_rate: float | None = opt.option(
+        "P",
+        "Probability that a healthy filter raises an alarm. Default: 0.02; for one episode and a healthy record of "
+        "n < 49 episodes, 1 / (n + 1).",
+        None,
+    )
+    profile_from: Path | None = opt.option(
+        "DATA|DIR",
+        "Clean data; the healthy record is measured on their held-out episodes. For recorded runs: a folder of healthy "
+        "runs.",
+        None,
+    )
+    profile_filter: str | None = opt.option(
+        "NAME|CHECKPOINT|FILE.py:FUNCTION", "Filter that runs over --profile-from. Default: --filter.", None
+    )
+    repair: int | None = opt.option(
+        "I", "Also find the smallest repair of the largest failure of this episode.", None, parser=opt.integer(0)
+    )
+    workspace: Path | None = opt.option(
+        "DIR",
+        "Workspace that keeps the healthy record of recorded runs, so that the page diagnoses the runs of this filter.",
+        None,
+    )
+    workers: int = 1
+    engine: opt.Engine = "local"
 
     def __post_init__(self) -> None:
         """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
@@ -54,35 +79,7 @@ class RunsOrRecorded(opt.Runs):
         return self.data is None and is_run(self.task)
 
 
-def diagnose(
-    runs: RunsOrRecorded,
-    episode: int | None = opt.option(
-        "I", "Diagnose only this episode. Default: the held-out ones.", None, parser=opt.integer(0)
-    ),
-    base: Path | None = opt.option(
-        "NAME|CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's.", None
-    ),
-    alarm_rate: float | None = opt.option("P", ALARM_RATE, None),
-    profile_from: Path | None = opt.option(
-        "DATA|DIR",
-        "Clean data; the healthy record is measured on their held-out episodes. For recorded runs: a folder of healthy "
-        "runs.",
-        None,
-    ),
-    profile_filter: str | None = opt.option(
-        "NAME|CHECKPOINT|FILE.py:FUNCTION", "Filter that runs over --profile-from. Default: --filter.", None
-    ),
-    repair: int | None = opt.option(
-        "I", "Also find the smallest repair of the largest failure of this episode.", None, parser=opt.integer(0)
-    ),
-    workspace: Path | None = opt.option(
-        "DIR",
-        "Workspace that keeps the healthy record of recorded runs, so that the page diagnoses the runs of this filter.",
-        None,
-    ),
-    workers: int = 1,
-    engine: opt.Engine = "local",
-) -> console.Result:
+def diagnose(options: Options) -> console.Result:
     """Name the probable cause of a filter's fault.
 
     Compares statistics of sensors, labels, modules and the filter with the filter's healthy record (the same statistics
@@ -102,79 +99,66 @@ def diagnose(
       beliefscope diagnose traces/today --profile-from traces/healthy
       beliefscope diagnose workspace/live --profile-from traces/healthy --workspace workspace
     """
-    opt.prepare_workers(engine, workers, "beliefscope.inspect.diagnosis.diagnose")
-    if alarm_rate is not None and not 0.0 < alarm_rate < 1.0:
-        raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
-    if profile_filter is not None and profile_from is None:
+    opt.prepare_workers(options.engine, options.workers, "beliefscope.inspect.diagnosis.diagnose")
+    if options.alarm_rate is not None and not 0.0 < options.alarm_rate < 1.0:
+        raise BadInput(f"--alarm-rate is {options.alarm_rate:g}, not a probability between 0 and 1")
+    if options.profile_filter is not None and options.profile_from is None:
         raise BadInput("--profile-filter needs --profile-from, the clean episodes that it runs over")
-    if runs.is_recorded:
-        if runs.faults or base or profile_filter or repair is not None:
+    if options.is_recorded:
+        if options.faults or options.base or options.profile_filter or options.repair is not None:
             raise BadInput(
                 "recorded runs are diagnosed as they are, without --faults, --base, --profile-filter, --repair"
             )
-        return _of_recordings(runs, episode, alarm_rate, profile_from, workspace)
-    if workspace is not None:
+        return _of_recordings(options)
+    if options.workspace is not None:
         raise BadInput("--workspace is for recorded runs; the page itself measures the record of a filter that can run")
-    return _of_filter(runs, episode, base, alarm_rate, profile_from, profile_filter, repair, workers, engine)
+    return _of_filter(options)
 
 
-def _of_filter(
-    runs: opt.Runs,
-    episode: int | None,
-    base: Path | None,
-    alarm_rate: float | None,
-    profile_from: Path | None,
-    profile_filter: str | None,
-    repair: int | None,
-    workers: int,
-    engine: opt.Engine,
-) -> console.Result:
-    """The diagnosis of a filter that runs over episodes, with the arguments of ``diagnose``."""
+def _of_filter(options: Options) -> console.Result:
+    """The diagnosis of a filter that runs over episodes."""
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
     from beliefscope.inspect.diagnosis.undo.repair import healthy_bound, smallest_repair
     from beliefscope.inspect.trace import trace
 
-    checkpoint, faults = runs.open()
-    correct = checkpoint if profile_filter is None else open_filter(checkpoint.task, profile_filter)
-    other = None if base is None else open_filter(checkpoint.task, str(base))
-    with runs.episodes(checkpoint.task) as data:
+    checkpoint, faults = options.open()
+    correct = checkpoint if options.profile_filter is None else open_filter(checkpoint.task, options.profile_filter)
+    base = None if options.base is None else open_filter(checkpoint.task, str(options.base))
+    with options.episodes(checkpoint.task) as data:
         held_out = len(data.held_out())
-        indices = data.held_out() if episode is None else [episode]
-        episodes = faults.apply_all(data, indices, runs.seed)
-        failed = None if repair is None else data[repair]
-    if profile_from is None:
-        _check_record(correct, runs, held_out if faults else 0)
-    profile = _profile(correct, profile_from, len(episodes), alarm_rate, () if faults else episodes.values())
+        indices = data.held_out() if options.episode is None else [options.episode]
+        episodes = faults.apply_all(data, indices, options.seed)
+        failed = None if options.repair is None else data[options.repair]
+    if options.profile_from is None:
+        _check_record(correct, options.data, held_out if faults else 0)
+    profile = _profile(correct, options, episodes.values())
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
             episodes,
-            seed=runs.seed,
-            particles=runs.particles,
-            alarm_rate=alarm_rate,
-            base=other,
+            seed=options.seed,
+            particles=options.particles,
+            alarm_rate=options.alarm_rate,
+            base=base,
             profile=profile,
-            engine=engine,
-            workers=workers,
+            engine=options.engine,
+            workers=options.workers,
             progress=advance,
         )
     document, parts = result.to_json(), [result.headline, *map(str, result.tables())]
     if failed is not None:
-        run_ = trace(checkpoint, failed, repair or 0, seed=runs.seed, particles=runs.particles, faults=faults)
+        run_ = trace(checkpoint, failed, options.repair or 0, options.seed, options.particles, faults)
         smallest = smallest_repair(checkpoint, run_, healthy_bound(profile.statistics), failed if faults else None)
         document["repair"] = None if smallest is None else smallest.to_json()
-        parts.append(f"Episode {repair} has no failure." if smallest is None else smallest.sentence)
+        parts.append(f"Episode {options.repair} has no failure." if smallest is None else smallest.sentence)
     return console.Result(document, "\n\n".join(parts))
 
 
-def _of_recordings(
-    runs: opt.Runs, episode: int | None, alarm_rate: float | None, healthy: Path | None, workspace: Path | None
-) -> console.Result:
-    """The diagnosis of recorded runs, with a healthy record of other ones or of the filter.
-
-    healthy: runs, or clean data over which the filter runs. workspace: keeps the record.
-    """
+def _of_recordings(options: Options) -> console.Result:
+    """The diagnosis of recorded runs, with a healthy record of other ones or of the filter, which may run for it."""
+    from beliefscope.app.workspace.healthy_records import record_path
+    from beliefscope.app.workspace.json_files import write_record
     from beliefscope.filters.external.unavailable import UnavailableFilter
     from beliefscope.filters.names import is_run
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
@@ -183,15 +167,15 @@ def _of_recordings(
     from beliefscope.recordings.open_trace import recorded_runs, runs_by_file
     from beliefscope.recordings.recorded_diagnosis import comparable
 
-    opened = runs_by_file(Path(runs.task))
+    healthy, opened = options.profile_from, runs_by_file(Path(options.task))
     files, traces = {trace.episode_index: file for file, trace in opened.items()}, list(opened.values())
     clean = recorded_runs(healthy) if healthy and is_run(str(healthy)) else []
-    places = [runs.task] * len(traces) + [str(healthy)] * len(clean)
-    traces, clean, checkpoint = comparable(traces, clean, places, runs.filter)
-    if episode is not None:
-        traces = [trace for trace in traces if trace.episode_index == episode]
+    places = [options.task] * len(traces) + [str(healthy)] * len(clean)
+    traces, clean, checkpoint = comparable(traces, clean, places, options.filter)
+    if options.episode is not None:
+        traces = [trace for trace in traces if trace.episode_index == options.episode]
         if not traces:
-            raise BadInput(f"{runs.task} has no run of episode {episode}")
+            raise BadInput(f"{options.task} has no run of episode {options.episode}")
     if clean and (warning := overlap_warning((t.episode for t in clean), (t.episode for t in traces))):
         console.note(f"Warning: {warning}")
     if clean:
@@ -203,16 +187,17 @@ def _of_recordings(
             "--profile-from DIR, or the filter of the runs, --filter"
         )
     else:
-        profile = _profile(checkpoint, healthy, len(traces), alarm_rate, [trace.episode for trace in traces])
-    if workspace is not None:
-        _keep(workspace, checkpoint, profile)
+        profile = _profile(checkpoint, options, [trace.episode for trace in traces])
+    if options.workspace is not None:
+        opt.check_workspace(options.workspace)
+        write_record(profile.to_json(), record_path(options.workspace, checkpoint))  # where the page finds it
     with console.progress("Diagnosing") as advance:
         result = diagnose_traces(
             checkpoint,
             traces,
-            seed=runs.seed,
-            particles=runs.particles,
-            alarm_rate=alarm_rate,
+            seed=options.seed,
+            particles=options.particles,
+            alarm_rate=options.alarm_rate,
             profile=profile,
             progress=advance,
         )
@@ -223,16 +208,7 @@ def _of_recordings(
     return console.Result(document, "\n\n".join(parts))
 
 
-def _keep(workspace: Path, checkpoint: Checkpoint, profile: HealthyProfile) -> None:
-    """Write the healthy record of a filter, where the page finds it."""
-    from beliefscope.app.workspace.healthy_records import record_path
-    from beliefscope.app.workspace.json_files import write_record
-
-    opt.check_workspace(workspace)
-    write_record(profile.to_json(), record_path(workspace, checkpoint))
-
-
-def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:
+def _check_record(checkpoint: Checkpoint, data: Path | None, clean: int) -> None:
     """Raise BadInput for a filter without a healthy record, with the command that measures it.
 
     clean: number of held-out episodes that are known to be clean.
@@ -241,31 +217,30 @@ def _check_record(checkpoint: Checkpoint, runs: opt.Runs, clean: int) -> None:
     from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, no_diagnosis
 
     if reason := no_diagnosis(checkpoint):
-        data = str(runs.data or sample_path(checkpoint.task)) if clean >= MIN_HEALTHY else "CLEAN.h5"
-        command = shlex.join(["beliefscope", *sys.argv[1:], "--profile-from", data])
+        source = str(data or sample_path(checkpoint.task)) if clean >= MIN_HEALTHY else "CLEAN.h5"
+        command = shlex.join(["beliefscope", *sys.argv[1:], "--profile-from", source])
         raise BadInput(f"{reason}; measure it on clean data with {MIN_HEALTHY} or more held-out episodes: {command}")
 
 
-def _profile(
-    checkpoint: Checkpoint, clean: Path | None, count: int, alarm_rate: float | None, diagnosed: Iterable[Episode]
-) -> HealthyProfile:
-    """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``.
+def _profile(checkpoint: Checkpoint, options: Options, diagnosed: Collection[Episode]) -> HealthyProfile:
+    """The healthy record of a filter, or of its runs over the held-out episodes of ``--profile-from``.
 
-    Raises BadInput, before the runs, if these are too few for the diagnosis of ``count`` episodes. Warns if some are
-    ``diagnosed``: a fault that the record has as well does not show.
+    Raises BadInput, before the runs, if these are too few for the diagnosis. Warns if some are ``diagnosed``, without
+    injected faults: a fault that the record has as well does not show.
     """
     from beliefscope.datasets.store import open_dataset
     from beliefscope.inspect.diagnosis.case import checked_alarm_rate
     from beliefscope.inspect.diagnosis.diagnose import required_profile
     from beliefscope.inspect.healthy import overlap_warning, profile_of
 
+    clean = options.profile_from
     if clean is None:
         return required_profile(checkpoint)
     with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
-        checked_alarm_rate(len(indices), count, alarm_rate)
+        checked_alarm_rate(len(indices), len(diagnosed), options.alarm_rate)
         advance(0.0)
         episodes = [data[index] for index in indices]
-        if warning := overlap_warning(episodes, diagnosed):
+        if warning := overlap_warning(episodes, () if options.faults else diagnosed):
             console.note(f"Warning: {warning}")
         return profile_of(checkpoint, episodes, str(clean), progress=advance, indices=indices)

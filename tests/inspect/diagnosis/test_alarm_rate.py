@@ -7,7 +7,7 @@ from inspect import signature
 import numpy as np
 import pytest
 
-from beliefscope.app.cli.commands.diagnose import diagnose as command
+from beliefscope.app.cli.commands.diagnose import Options
 from beliefscope.inspect.diagnosis.case import ALARM_RATE, checked_alarm_rate
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnostics.healthy_comparison import compare, with_critical_values
@@ -76,7 +76,7 @@ def test_a_smaller_alarm_rate_keeps_the_scale_of_deviations() -> None:
 
 
 def test_the_command_has_the_default_alarm_rate_of_the_library() -> None:
-    option = signature(command).parameters["alarm_rate"].default
+    option = signature(Options).parameters["alarm_rate"].default
     assert (option.default, signature(diagnose).parameters["alarm_rate"].default) == (None, None)
     assert f"Default: {ALARM_RATE}; for one episode and a healthy record of n < 49 episodes, 1 / (n + 1)" in option.help
     assert (checked_alarm_rate(49, 1), checked_alarm_rate(48, 1)) == (ALARM_RATE, 1 / 49)
