@@ -133,23 +133,28 @@ def finetune(
         else open_filter(opt.definition_of(target, learning.data), filter)
     )
     settings, data = learning.settings(base), learning.data
+    before, after, verdict = filter or target, str(output), None
     with opt.open_episodes(base.task, data, learning.skip_bad) as episodes:
         members, data_hash = _training_episodes(episodes, data, output.parent)
         command = finetune_command(target, filter, data, settings)
         partial = partial_path(output)
         source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
         if isinstance(base, ExternalFilter):
-            return _external(base, members, output, source, data)
-        with _progress(base, partial, log, rerun) as callbacks:
-            tuned = tune(base, members, callbacks=callbacks, **source)
-        assert tuned is not None, "runs without a stop callback always complete"
-        with console.progress("Measuring the healthy record") as advance:
-            profile = measure_profile(tuned.filter, base.name, members, command, data is None, advance)
-        checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
-        verdict = _judge(settings, base, output, episodes) if settings.success else None
-    lines = [*_summary(tuned.record), "", _change_command(filter or target, str(output), base.task.name, data)]
+            before, after = base.source, f"{base.source.partition('@')[0]}@{output}"
+            checkpoint_hash, record = _external(base, members, output, source, after)
+        else:
+            with _progress(base, partial, log, rerun) as callbacks:
+                tuned = tune(base, members, callbacks=callbacks, **source)
+            assert tuned is not None, "runs without a stop callback always complete"
+            record = tuned.record
+            with console.progress("Measuring the healthy record") as advance:
+                profile = measure_profile(tuned.filter, base.name, members, command, data is None, advance)
+            checkpoint_hash = save_checkpoint(tuned.filter, base.name, record, output, profile)
+            verdict = _judge(settings, base, output, episodes) if settings.success else None
+    change = ["beliefscope", "change", before, after, "--task", base.task.name]
+    lines = [*_summary(record), "", shlex.join(change + (["--data", str(data)] if data else []))]
     lines += ["", verdict.statement, verdict.verdict] if verdict else []
-    result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
+    result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, record, lines)
     return replace(result, document={**result.document, "success": verdict}) if verdict else result
 
 
@@ -195,11 +200,11 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: 
 
 
 def _external(
-    base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any], data: Path | None
-) -> console.Result:
-    """Fine-tune the module of an external filter on its own loss.
+    base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any], name: str
+) -> tuple[str, dict[str, Any]]:
+    """Fine-tune the module of an external filter on its own loss; hash of the result, and its record.
 
-    source: other arguments of ``finetune_external``. data: file of the episodes, for the suggested command.
+    source: other arguments of ``finetune_external``. name: of the fine-tuned filter, ``FILE.py:FUNCTION@CHECKPOINT``.
     """
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.external.module_weights import save_weights
@@ -210,10 +215,7 @@ def _external(
     assert result is not None, "runs without a stop callback always complete"
     tensors, record = result
     save_weights(tensors, output)
-    tuned = f"{base.source.partition('@')[0]}@{output}"
-    digest = load_external(tuned, base.task).hash
-    lines = [*_summary(record), "", _change_command(base.source, tuned, base.task.name, data)]
-    return opt.checkpoint_result(output, base.task.name, base.name, digest, record, lines)
+    return load_external(name, base.task).hash, record
 
 
 def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) -> Success:
@@ -233,13 +235,6 @@ def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) ->
             progress=advance,
         )
     return judge(settings.success, comparison, base.task)
-
-
-def _change_command(before: str, after: str, task: str, data: Path | None) -> str:
-    """The command that compares two filters over all steps of the held-out episodes."""
-    return shlex.join(
-        ["beliefscope", "change", before, after, "--task", task] + (["--data", str(data)] if data else [])
-    )
 
 
 def _summary(record: dict[str, Any]) -> list[str]:
