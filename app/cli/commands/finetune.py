@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -139,11 +139,12 @@ def finetune(
         command = finetune_command(target, filter, data, settings)
         partial = partial_path(output)
         source: dict[str, Any] = {"data_hash": data_hash, "command": command, "settings": settings, "partial": partial}
+        progress = _progress(base, partial, log, rerun)
         if isinstance(base, ExternalFilter):
             before, after = base.source, f"{base.source.partition('@')[0]}@{output}"
-            checkpoint_hash, record = _external(base, members, output, source, after)
+            checkpoint_hash, record = _external(base, members, output, source, after, progress)
         else:
-            with _progress(base, partial, log, rerun) as callbacks:
+            with progress as callbacks:
                 tuned = tune(base, members, callbacks=callbacks, **source)
             assert tuned is not None, "runs without a stop callback always complete"
             record = tuned.record
@@ -173,7 +174,7 @@ def _training_episodes(data: Dataset, path: Path | None, folder: Path) -> tuple[
 
 
 @contextmanager
-def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: str = "") -> Iterator[Callbacks]:
+def _progress(base: Checkpoint, partial: Path, log: Path | None, viewer: str) -> Iterator[Callbacks]:
     """Progress bars and logs of a fine-tuning run."""
     from beliefscope.filters.finetuning.finetune import Callbacks
     from beliefscope.filters.finetuning.report import curve_values, error_summary
@@ -200,7 +201,12 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None = None, viewer: 
 
 
 def _external(
-    base: ExternalFilter, episodes: list[Episode], output: Path, source: Mapping[str, Any], name: str
+    base: ExternalFilter,
+    episodes: list[Episode],
+    output: Path,
+    source: Mapping[str, Any],
+    name: str,
+    progress: AbstractContextManager[Callbacks],
 ) -> tuple[str, dict[str, Any]]:
     """Fine-tune the module of an external filter on its own loss; hash of the result, and its record.
 
@@ -210,7 +216,7 @@ def _external(
     from beliefscope.filters.external.module_weights import save_weights
     from beliefscope.filters.finetuning.external import finetune_external, loss_of
 
-    with _progress(base, source["partial"]) as callbacks:
+    with progress as callbacks:
         result = finetune_external(base, loss_of(base.source), episodes, callbacks=callbacks, **source)
     assert result is not None, "runs without a stop callback always complete"
     tensors, record = result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from safetensors.torch import load_file
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.filters.external.module_weights import save_weights
@@ -126,6 +128,19 @@ def test_invalid_losses_modules_and_weights_are_refused(
     (tmp_path / "plain.py").write_text(FILE.replace("def loss", "def cost"))
     with pytest.raises(BadInput, match=r"has no function loss\(module, windows\)"):
         loss_of(f"{tmp_path / 'plain.py'}:build")
+
+
+@pytest.mark.slow
+def test_the_command_writes_logs(
+    run: Callable[..., tuple[int, str, str]], base: ExternalFilter, episodes: list[Episode], tmp_path: Path
+) -> None:
+    write_dataset(tmp_path / "own.h5", base.task, episodes)
+    output, log = tmp_path / "tuned.safetensors", tmp_path / "log"
+    line = f"finetune cart --filter {base.source} --train sensor --steps 5 --length 20"
+    code, out, error = run(line, "--data", tmp_path / "own.h5", "--log", log, "-o", output)
+    assert code == 0, error
+    assert f"beliefscope change {base.source} {base.source}@{output} --task cart" in out
+    assert list(log.glob("*.rrd"))
 
 
 def test_page_names_the_command() -> None:
