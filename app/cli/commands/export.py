@@ -49,12 +49,10 @@ def export(
     opt.check_output(output)
     if len(sources) > 1:
         raise BadInput(f"{len(sources)} traces need a folder as output, not {str(output)!r}")
-    if output.suffix == ".html":
-        return opt.trace_result(_page(sources[0], output, task, filter), output)
-    if interactive:
+    if interactive and output.suffix != ".html":
         raise BadInput(f"--interactive writes a page: output {str(output)!r} must end in .html")
-    if output.suffix.lower() == ".rrd":
-        return opt.trace_result(_recording(sources[0], output, task, filter), output)
+    if output.suffix == ".html" or output.suffix.lower() == ".rrd":
+        return opt.trace_result(_page_or_recording(sources[0], output, task, filter), output)
     check_name("export format", output.suffix.removeprefix(".").lower(), (*FORMATS, "html", "rrd"))
     export_format(output)
     trace = open_trace(sources[0], task)
@@ -62,30 +60,22 @@ def export(
     return opt.trace_result(trace, output)
 
 
-def _recording(source: Path, output: Path, task: str, filter_: str) -> Trace:
-    """Write the Rerun recording of a trace, with its diagnostics."""
+def _page_or_recording(source: Path, output: Path, task: str, filter_: str) -> Trace:
+    """Write the interactive page, or the Rerun recording with its diagnostics, of a trace."""
     from beliefscope.inspect.catalog import quick
-    from beliefscope.inspect.traces.provenance import checkpoint_of
-    from beliefscope.recordings.open_trace import open_trace
-    from beliefscope.recordings.write import write_recording
+    from beliefscope.recordings.open_trace import open_traces
 
-    trace = open_trace(source, task)
-    with console.progress("Recording") as advance:
-        diagnostics = quick(trace, checkpoint_of([trace], [source], filter_))
-        write_recording(trace, output, diagnostics=diagnostics, progress=advance)
-    return trace
+    (trace,), checkpoint = open_traces([source], filter_, task)
+    if output.suffix == ".html":
+        from beliefscope.recordings.interactive.export import write_interactive
 
+        with console.progress(source.stem) as advance:
+            write_interactive(trace, output, checkpoint, progress=advance)
+    else:
+        from beliefscope.recordings.write import write_recording  # imports Rerun
 
-def _page(source: Path, output: Path, task: str, filter_: str) -> Trace:
-    """Write the interactive page of a trace."""
-    from beliefscope.inspect.traces.provenance import checkpoint_of
-    from beliefscope.recordings.interactive.export import write_interactive
-    from beliefscope.recordings.open_trace import open_trace
-
-    trace = open_trace(source, task)
-    checkpoint = checkpoint_of([trace], [source], filter_)
-    with console.progress(source.stem) as advance:
-        write_interactive(trace, output, checkpoint, progress=advance)
+        with console.progress("Recording") as advance:
+            write_recording(trace, output, diagnostics=quick(trace, checkpoint), progress=advance)
     return trace
 
 
@@ -99,7 +89,7 @@ def _folder(sources: list[Path], folder: Path, task: str, filter_: str) -> conso
     opt.check_folder(folder, "output")
     folder.mkdir(exist_ok=True)
     pages = [folder / name for name in names]
-    traces = [_page(source, page, task, filter_) for source, page in zip(sources, pages, strict=True)]
+    traces = [_page_or_recording(source, page, task, filter_) for source, page in zip(sources, pages, strict=True)]
     index = folder / "index.html"
     write_index(list(zip(pages, traces, strict=True)), index)
     return console.Result({"pages": names}, plural(len(names), "page"), index)
