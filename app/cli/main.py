@@ -9,8 +9,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from typing import Annotated, Any
@@ -44,6 +43,9 @@ RESUMED = {"collect", "train", "finetune", "study", "sweep"}
 """Commands that continue interrupted work."""
 
 
+_formatwarning = warnings.formatwarning
+
+
 class Terminated(BaseException):
     """SIGTERM: commands end as after Ctrl-C and remove their unfinished files."""
 
@@ -67,31 +69,17 @@ def command_group() -> Any:
     for command in group.commands.values():
         for parameter in command.params:
             if parameter.param_type_name == "argument":
-                parameter.display_type_rich = _no_type
+                parameter.display_type_rich = lambda ctx: None  # the name of an argument states what it is
     return group
 
 
-def _no_type(ctx: object) -> None:
-    """The type of an argument in the help text: none, as its name states what it is."""
-
-
-@contextmanager
-def _short_warnings() -> Iterator[None]:
-    """Python's warnings for users in the form of a command's own: without the place in the code."""
-    default = warnings.formatwarning
-
-    def short(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
-    ) -> str:
-        if not issubclass(category, UserWarning):
-            return default(message, category, filename, lineno, line)
-        return f"Warning: {' '.join(str(message).split())}\n"
-
-    warnings.formatwarning = short
-    try:
-        yield
-    finally:
-        warnings.formatwarning = default
+def short_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """A warning of Python; one for users in the form of a command's own, without the place in the code."""
+    if not issubclass(category, UserWarning):
+        return _formatwarning(message, category, filename, lineno, line)
+    return f"Warning: {' '.join(str(message).split())}\n"
 
 
 def main() -> None:
@@ -102,9 +90,10 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # like standard error: file names may not be valid text
     signal.signal(signal.SIGTERM, _terminate)
+    if not debug:
+        warnings.formatwarning = short_warning
     try:
-        with nullcontext() if debug else _short_warnings():
-            code = command_group()(prog_name="beliefscope", standalone_mode=False)
+        code = command_group()(prog_name="beliefscope", standalone_mode=False)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         console.flush()

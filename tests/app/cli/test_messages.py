@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import pytest
 
-from beliefscope.app.cli.main import _short_warnings
+from beliefscope.app.cli.main import short_warning
 
 Run = Callable[..., tuple[int, str, str]]
 
 
 def test_warnings_for_users_have_the_form_of_notes() -> None:
-    default = warnings.formatwarning
-    with _short_warnings():
-        assert warnings.formatwarning("Recorder\nis in training mode", UserWarning, "own.py", 3) == (
-            "Warning: Recorder is in training mode\n"
-        )
-        assert "own.py:3: RuntimeWarning" in warnings.formatwarning("overflow", RuntimeWarning, "own.py", 3)
-    assert warnings.formatwarning is default
+    text = short_warning("Recorder\nis in training mode", UserWarning, "own.py", 3)
+    assert text == "Warning: Recorder is in training mode\n"
+    assert "own.py:3: RuntimeWarning" in short_warning("overflow", RuntimeWarning, "own.py", 3)
 
 
 @pytest.mark.parametrize(
