@@ -177,7 +177,7 @@ OPTIONS: dict[str, Any] = {
     ),
     "freeze": option("PATTERN", "Freeze these modules: dotted names, * matches any text. Repeatable."),
     "workspace": option("DIR", "Workspace folder for recordings and traces; created if missing."),
-    "log": option("DIR", "Folder for TensorBoard logs."),
+    "log": option("DIR", "Folder for TensorBoard logs.", callback=lambda path: check_folder(path, "--log")),
     "every": flag("Use all episodes, not only the held-out ones.", "--all", default=...),
     "by": option(
         "SCORE",
@@ -221,17 +221,14 @@ def with_options(command: Callable[..., console.Result | None]) -> Callable[...,
             if result.code:
                 raise typer.Exit(result.code)
 
-    described = [_described(parameter, hints[parameter.name]) for parameter in parameters]
-    run.__signature__ = inspect.Signature(described)  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
+    for parameter in parameters:
+        name = parameter.name
+        if not (isinstance(parameter.default, ParameterInfo) or get_origin(hints[name]) is Annotated):
+            hints[name] = Annotated[hints[name], OPTIONS[name]]
+    keywords = [p.replace(kind=p.KEYWORD_ONLY, annotation=hints[p.name]) for p in parameters]
+    run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in keywords}
     return run
-
-
-def _described(parameter: inspect.Parameter, type_: Any) -> inspect.Parameter:
-    """A parameter in typer's form."""
-    own = isinstance(parameter.default, ParameterInfo) or get_origin(type_) is Annotated
-    annotation = type_ if own else Annotated[type_, OPTIONS[parameter.name]]
-    return parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=annotation)
 
 
 @dataclass(frozen=True)
@@ -383,11 +380,3 @@ def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:
     steps = plural(document["steps"], "step")
     run = f"{trace.filter} over {steps} of {trace.task.name} episode {trace.episode_index}"
     return console.Result(document, run + (f" with {trace.faults}" if trace.faults else ""), path)
-
-
-def checkpoint_result(
-    path: Path, task: str, name: str, digest: str, record: dict[str, Any], lines: Sequence[str]
-) -> console.Result:
-    """Description of a trained checkpoint."""
-    document = {"task": task, "filter": name, "checkpoint_hash": digest, "record": record}
-    return console.Result(document, "\n".join(lines), path)

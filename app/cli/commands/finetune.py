@@ -3,7 +3,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -155,8 +155,9 @@ def finetune(
     change = ["beliefscope", "change", before, after, "--task", base.task.name]
     lines = [*_summary(record), "", shlex.join(change + (["--data", str(data)] if data else []))]
     lines += ["", verdict.statement, verdict.verdict] if verdict else []
-    result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, record, lines)
-    return replace(result, document={**result.document, "success": verdict}) if verdict else result
+    names = {"task": base.task.name, "filter": base.name, "checkpoint_hash": checkpoint_hash}
+    document = names | {"record": record} | ({"success": verdict} if verdict else {})
+    return console.Result(document, "\n".join(lines), output)
 
 
 def _training_episodes(data: Dataset, path: Path | None, folder: Path) -> tuple[list[Episode], str]:

@@ -46,7 +46,7 @@ def inspect(
         for name, entry in entries.items()
     }
     opt.check_folder(figures, "--figures")
-    paths = [file for path in paths for file in (run_files(path) if path.is_dir() else [path]) or [path]]
+    paths = [file for path in paths for file in run_files(path) or [path]]
     traces, checkpoint = open_traces(paths, filter, task)
     with console.progress("Inspecting") as advance:
         results, reasons = run_diagnostics(traces, checkpoint, parsed, bool(every or only), advance)

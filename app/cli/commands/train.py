@@ -49,7 +49,6 @@ def train(
     from beliefscope.datasets.faults.injection import faulty_copies, read_faults
     from beliefscope.filters.names import check_trainable
 
-    opt.check_folder(log, "--log")
     target = load_task(opt.definition_of(task, data))
     check_trainable(target, task, filter)
     from beliefscope.filters.catalog import architecture
@@ -97,15 +96,16 @@ def train(
 
         profile = measure_profile(trained.filter, filter, episodes, record["command"], data is None, report_record)
     checkpoint_hash = save_checkpoint(trained.filter, filter, record, output, profile)
-    return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, _summary(filter, record))
+    document = {"task": task, "filter": filter, "checkpoint_hash": checkpoint_hash, "record": record}
+    return console.Result(document, _summary(filter, record), output)
 
 
-def _summary(filter: str, record: Mapping[str, Any]) -> list[str]:
+def _summary(filter: str, record: Mapping[str, Any]) -> str:
     """Lines about training and the errors on clean held-out episodes."""
     lines = [f"{filter}, trained in {record['seconds']:.0f} s"]
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
-    return lines
+    return "\n".join(lines)
 
 
 def _option(name: str, value: object) -> str:
