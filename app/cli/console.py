@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from beliefscope.app.jobs.remaining_time import RemainingTime
+from beliefscope.datasets.text import plural
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -65,14 +66,16 @@ class Result:
         return {**self.document, "path": str(self.path), "bytes": size}, f"{self.path} ({amount}): {self.text}"
 
 
-def arrow(title: str, rows: Any) -> str:
-    """Format an Arrow table; hashes are shortened."""
+def arrow(title: str, rows: Any, top: int, command: str = "") -> str:
+    """Format the first rows of an Arrow table, with the ``--top`` of ``command`` for all; hashes are shortened."""
     from beliefscope.inspect.diagnostics.views import format_table
 
     def short(value: Any) -> Any:
         return value[:12] if isinstance(value, str) and len(value) == 64 else value
 
-    return format_table(title, rows.column_names, [list(map(short, row.values())) for row in rows.to_pylist()])
+    first = [list(map(short, row.values())) for row in rows.slice(0, top).to_pylist()]
+    more = f"\n{plural(len(rows) - top, 'more row')}: {command}--top {len(rows)}" if len(rows) > top else ""
+    return format_table(title, rows.column_names, first) + more
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from beliefscope.app.protocol.errors import NotFound, QueueFull
 from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess, memory_in_use, redirect_output
 from beliefscope.app.workspace.json_files import content, read_record
 from beliefscope.app.workspace.paths import file_within
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.io.atomic_write import write_atomically, write_error
 from beliefscope.datasets.io.strict_json import read_json
@@ -173,9 +173,8 @@ class Jobs:
         default the arguments, which then have hashes of the files that the job reads. link: page address of the
         result. output_exists: False if files that the job wrote have been deleted.
 
-        Raises BadInput for an unknown kind or a full disk, and QueueFull.
+        Raises BadInput for a full disk, and QueueFull.
         """
-        check_name("job kind", kind, self._kinds)
         id = _id(kind, arguments if key is None else key)
         with self._lock:
             existing = self._jobs.get(id)

@@ -3,7 +3,6 @@ from pathlib import Path
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.text import plural
 
 
 def experiments(
@@ -36,13 +35,11 @@ def experiments(
         raise BadInput(f"no steps in phase {phase!r}. Available: {', '.join(tables.phases())}")
     if output is not None:
         write_rows(rows, output)
-    top_rows = rows.slice(0, top)
-    more = f"\n{plural(len(rows) - top, 'more row')}: --top {len(rows)}" if len(rows) > top else ""
-    document = {"rows": top_rows.to_pylist(), "count": len(rows)}
+    document = {"rows": rows.slice(0, top).to_pylist(), "count": len(rows)}
     if sql is not None:
-        return console.Result(document, console.arrow("Results", top_rows) + more, output)
-    text = console.arrow(f"Checkpoints, {phase} steps", top_rows.drop_columns(DOCUMENTS))
-    return console.Result(document, text + more + _provenance_note(tables.provenance_keys()), output)
+        return console.Result(document, console.arrow("Results", rows, top), output)
+    text = console.arrow(f"Checkpoints, {phase} steps", rows.drop_columns(DOCUMENTS), top)
+    return console.Result(document, text + _provenance_note(tables.provenance_keys()), output)
 
 
 def _provenance_note(keys: Sequence[str], listed: int = 8) -> str:

@@ -82,15 +82,10 @@ def sweep(
             progress=lambda done, total: update("Episodes", done / total, f"{done} of {total}"),
         )
     overview = Experiments([output]).overview()
-    document = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
-    document |= {"overview": overview.to_pylist()}
-    more, command = len(overview) - SHOWN, shlex.join(["beliefscope", "experiments", str(output)])
-    return console.Result(
-        document,
-        console.arrow("Checkpoints, largest errors first", overview.drop_columns(DOCUMENTS).slice(0, SHOWN))
-        + (f"\n{plural(more, 'more row')}: {command} --top {len(overview)}" if more > 0 else ""),
-        output / "results.parquet",
-    )
+    sizes = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
+    command = f"{shlex.join(['beliefscope', 'experiments', str(output)])} "
+    text = console.arrow("Checkpoints, largest errors first", overview.drop_columns(DOCUMENTS), SHOWN, command)
+    return console.Result(sizes | {"overview": overview.to_pylist()}, text, output / "results.parquet")
 
 
 def _warn(inputs: Inputs, cells: Sequence[Cell], output: Path) -> None:
