@@ -100,7 +100,7 @@ def main() -> None:
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
         message = error.format_message().rstrip(".").replace("Value error, ", "")
-        if getattr(error, "option_name", "") == "--data":  # resembles no option
+        if getattr(error, "option_name", "") == "--data" and message.startswith("No such"):  # resembles no option
             reason = ": traces contain their episodes" if command.split()[-1] in OF_TRACES else ""
             message = f"No such option: --data{reason}"
         end = "" if message.endswith("?") else "."

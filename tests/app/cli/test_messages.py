@@ -27,3 +27,8 @@ def test_warnings_for_users_have_the_form_of_notes() -> None:
 def test_data_of_traces_are_refused_without_another_option(run: Run, line: str, error: str) -> None:
     command = line.split()[0]
     assert run(line)[::2] == (2, f"error: {error} See: beliefscope {command} --help\n")
+
+
+def test_a_missing_value_of_the_data_is_named(run: Run) -> None:
+    error = "error: Option '--data' requires an argument. See: beliefscope --help\n"
+    assert run("evaluate door --filter crossmodal-pf --data")[::2] == (2, error)
