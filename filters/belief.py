@@ -160,7 +160,7 @@ class StepTrace:
         estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, the filter's output. LSTM: the
             covariance is NaN.
         modality: EKF, UKF only: posterior of the bank's filters, each updated with one modality; Gaussian (N, K, n).
-        log_likelihood: PF only: (N, K, M) of each predicted particle, unnormalised.
+        log_likelihood: PF only: (N, K, M) of each predicted particle, unnormalised; 0 for models that are not used.
         ancestors: PF only: (N, M) int64, index of each resampled particle's ancestor.
     """
 

@@ -33,11 +33,15 @@ def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussia
     """
     precision = torch.linalg.inv(bank.covariance)
     if present is not None:
-        power = torch.where(present.any(-1, keepdim=True), present.to(precision.dtype), 1.0 / present.shape[-1])
-        precision = precision * power[..., None, None]
+        precision = precision * powers_of_present(present)[..., None, None]
     covariance = symmetric(torch.linalg.inv(precision.sum(-3)))
     information = (precision @ bank.mean.unsqueeze(-1)).sum(-3)
     return Gaussian((covariance @ information).squeeze(-1), covariance)
+
+
+def powers_of_present(present: Tensor) -> Tensor:
+    """Powers (..., K) of the experts of a product: 1 for those in ``present`` (..., K) and 0 for others, or all 1 / K."""
+    return torch.where(present.any(-1, keepdim=True), present.float(), 1.0 / present.shape[-1])
 
 
 def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule = "paper") -> Gaussian:

@@ -135,6 +135,8 @@ class MixtureParticleFilter(ParticleFilter):
         assert isinstance(belief, Particles)
         predicted = Particles(self.propagate(belief.states, evidence, generator), belief.log_weights)
         log_likelihood = self.log_likelihood(evidence, predicted.states)
+        if evidence.present is not None:  # the update of an absent model is the prediction
+            log_likelihood = log_likelihood.masked_fill(~evidence.present.unsqueeze(-1), 0.0)
         scaled = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
         if evidence.present is not None:
             scaled = only_present(scaled, evidence.present)

@@ -41,7 +41,11 @@ def fusion_rule(checkpoint: Checkpoint, modalities: tuple[str, ...], quantity: Q
 
 
 def fuse_sensors(
-    checkpoint: Checkpoint, mean: Array, covariance: Array, weights: NDArray[np.float32] | None
+    checkpoint: Checkpoint,
+    mean: Array,
+    covariance: Array,
+    weights: NDArray[np.float32] | None,
+    present: NDArray[np.bool_],
 ) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of the filter's rule applied to virtual sensors instead of posteriors.
 
@@ -50,12 +54,14 @@ def fuse_sensors(
 
     Args:
         mean, covariance: (K, n), (K, n, n), z and R. weights: (K, W) beta of the trace, or None.
+        present: (K,) sensors with a reading.
     """
+    with_reading = torch.from_numpy(present)[None]
     bank = Gaussian(torch.from_numpy(mean)[None], torch.from_numpy(covariance)[None])
     if isinstance(checkpoint, ExternalFilter):
-        fused = product_of_experts(bank)
+        fused = product_of_experts(bank, with_reading)
     else:
         assert isinstance(checkpoint.filter, ExtendedKalmanFilter)
         beta = None if weights is None else torch.from_numpy(weights.astype(np.float64)).log()[None]
-        fused = checkpoint.filter.fuse(bank, beta)
+        fused = checkpoint.filter.fuse(bank, beta, with_reading)
     return fused.mean[0].numpy(), fused.covariance[0].numpy()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
@@ -18,7 +19,7 @@ from beliefscope.filters.covariance_floor import usual_variances, with_floor
 from beliefscope.filters.engine import Progress, one_thread
 from beliefscope.filters.external.likelihood import has_likelihood, log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.models.fusion import mixture
+from beliefscope.filters.models.fusion import mixture, only_present
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator
@@ -26,6 +27,7 @@ from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, Likelihoo
 from beliefscope.inspect.maps.map_statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.maps.plane import OTHERS, Others, Plane, describe_others, other_components, plane_of
+from beliefscope.inspect.statistics.measures import without_reading, wrap_angles
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.data import check_origin, check_step
 
@@ -121,6 +123,7 @@ class MapEngine:
         self._calls_models = has_likelihood(checkpoint)
         self._planes: dict[tuple[str, ...], Plane] = {}
         self._anchors = trace.anchors
+        self._present = ~without_reading(trace)  # (T, K)
         missing = missing_quantities(checkpoint, trace)
         self.quantities = tuple(quantity for quantity in QUANTITIES if quantity not in missing)
 
@@ -280,13 +283,17 @@ class MapEngine:
         scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(particle_likelihood)[None])[0]
         # The trace's weights: they may be manual.
         log_weights = None if trace.weights is None else torch.from_numpy(trace.weights[step]).log()
-        values = torch.cat([unimodal, mixture(unimodal - scale, log_weights).unsqueeze(0)])
+        present = torch.from_numpy(self._present[step])
+
+        def with_fused(each: Tensor) -> Tensor:
+            return torch.cat([each, mixture(only_present((each - scale)[None], present[None]), log_weights)])
+
+        values = with_fused(unimodal.masked_fill(~present[:, None], 0.0))
         if quantity == "posterior":
             assert trace.particles is not None
-            at_particles = torch.from_numpy(particle_likelihood)
-            at_particles = torch.cat([at_particles, mixture(at_particles - scale, log_weights).unsqueeze(0)])
+            at_particles = with_fused(torch.from_numpy(particle_likelihood))
             evidence_ = torch.logsumexp(torch.from_numpy(prior) + at_particles, dim=1, keepdim=True)
-            density = ParticleDensity(self.task, trace.particles[step], prior)
+            density = ParticleDensity(self.task, self.task.near(trace.particles[step], middle), prior)
             log_prior = density.log_density(middle, plane.along, x, y).astype(np.float32)
             values = values - evidence_ + torch.from_numpy(log_prior).flatten()
         return values.unflatten(1, (len(y), size)).numpy()
@@ -334,7 +341,8 @@ class MapEngine:
         assert trace.observation_covariance is not None
         sensors, noise = trace.observation_mean[step], trace.observation_covariance[step]
         z, r = sensors.astype(np.float64), noise.astype(np.float64)
-        fused = fuse_sensors(self.checkpoint, z, r, None if trace.weights is None else trace.weights[step])
+        weights = None if trace.weights is None else trace.weights[step]
+        fused = fuse_sensors(self.checkpoint, z, r, weights, self._present[step])
         return np.concatenate([z, fused[0][None]]), np.concatenate([r, fused[1][None]])
 
     def _gaussians(
@@ -343,7 +351,7 @@ class MapEngine:
         """(K + 1, R, S) log densities of the modalities' Gaussians and of the fused Gaussian (``_moments``).
 
         The squared Mahalanobis distance is a sum of a term by column, a term by row and their product. The marginal of
-        a Gaussian has the mean and the covariance of the remaining components.
+        a Gaussian has the mean and the covariance of the remaining components. Angles differ by at most half a turn.
         """
         ix, iy = plane.along
         mean, covariance = self._moments(step, quantity)
@@ -357,12 +365,26 @@ class MapEngine:
         precision = whiten.swapaxes(-1, -2) @ whiten
         x, y = plane.offsets(size)
         slope = (precision @ from_mean[..., None])[..., 0]
+        x, y = (
+            self._within_half_a_turn(from_mean[:, i, None], d, k)
+            for i, d, k in ((ix, x, plane.along[0]), (iy, y, plane.along[1]))
+        )  # (L, S), (L, R)
         along_x, along_y = (
             precision[:, i, i, None] * d**2 + 2.0 * slope[:, i, None] * d for i, d in ((ix, x), (iy, y))
         )
-        both = 2.0 * precision[:, ix, iy, None, None] * y[:, None] * x
+        both = 2.0 * precision[:, ix, iy, None, None] * y[:, :, None] * x[:, None]
         middle_squared = np.einsum("ln,ln->l", from_mean, slope)[:, None, None]
         squared = middle_squared + along_x[:, None, :] + along_y[:, :, None] + both
         log_det = np.log(np.einsum("lnn->ln", factor)).sum(-1)[:, None, None]
         constant = 0.5 * from_mean.shape[-1] * math.log(2.0 * math.pi)
-        return (-0.5 * squared - log_det - constant).astype(np.float32)
+        values = (-0.5 * squared - log_det - constant).astype(np.float32)
+        if quantity == "likelihood":
+            present = self._present[step]
+            values[~np.append(present, present.any())] = 0.0
+        return values
+
+    def _within_half_a_turn(self, from_mean: Doubles, offsets: Doubles, component: int) -> Doubles:
+        """Offsets (S,) along a component, for each difference (L, 1) from a mean; those of angles may be a turn less."""
+        if self.task.components[component].unit != "rad" or self.task.components[component].rotation:
+            return np.broadcast_to(offsets, (len(from_mean), len(offsets)))
+        return wrap_angles((from_mean + offsets)[..., None], [0])[..., 0] - from_mean

@@ -59,15 +59,24 @@ class ParticleDensity:
     def log_density(self, middle: Array, along: tuple[int, int], x: Array, y: Array) -> Array:
         """(R, S) log density at the cells [iy, ix] of a grid.
 
-        The exponent of a kernel is a term by column, a term by row, and their product, which all kernels share.
+        The exponent of a kernel is a term by column, a term by row, and their product, which all kernels share. A kernel
+        whose angle on an axis may differ by more than half a turn also has copies a turn away.
 
         Args:
             middle: (n,) SI, centre of the grid. along: state components of its axes. x, y: (S,) and (R,) SI, offsets of
                 its columns and rows.
         """
-        along_x, along_y = (self._whiten[:, self._components.index(k)] for k in along)
-        from_centre = wrap_angles(middle[self._components] - self._centres, self._angles) @ self._whiten.T
-        columns = self._log_weights - 0.5 * np.square(from_centre + along_x * x[:, None, None]).sum(-1)
+        axes = [self._components.index(k) for k in along]
+        along_x, along_y = (self._whiten[:, axis] for axis in axes)
+        difference = wrap_angles(middle[self._components] - self._centres, self._angles)
+        log_weights = self._log_weights
+        for axis, offsets in dict(zip(axes, (x, y), strict=True)).items():
+            if axis in self._angles and np.abs(difference[:, axis]).max() + np.abs(offsets).max() > np.pi:
+                turn = 2.0 * np.pi * np.eye(len(self._components))[axis]
+                difference = np.concatenate([difference - turn, difference, difference + turn])
+                log_weights = np.tile(log_weights, 3)
+        from_centre = difference @ self._whiten.T
+        columns = log_weights - 0.5 * np.square(from_centre + along_x * x[:, None, None]).sum(-1)
         rows = -y[:, None] * (from_centre @ along_y) - 0.5 * (along_y @ along_y) * y[:, None] ** 2
         at_column, at_row = (torch.from_numpy(terms.astype(np.float32)) for terms in (columns, rows))
         size = max(1, PAIRS_AT_ONCE // columns.size)

@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import jackknife
-from beliefscope.inspect.statistics.measures import Array, counted
+from beliefscope.inspect.statistics.measures import Array, counted, without_reading
 from beliefscope.inspect.traces.data import Trace
 
 AnyArray = NDArray[np.floating[Any]]
@@ -66,7 +66,10 @@ def innovations(trace: Trace) -> tuple[Array, Array] | None:
 
 
 def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
-    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None without virtual observations."""
+    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None without virtual observations.
+
+    ``z - H x`` is NaN at steps without a reading.
+    """
     parts = (
         trace.observation_mean,
         trace.predicted_mean,
@@ -76,7 +79,8 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
     if any(part is None for part in parts):
         return None
     z, predicted, r, p = (np.asarray(part, dtype=np.float64) for part in parts)
-    return trace.task.difference(z, predicted), p + r
+    innovation = trace.task.difference(z, predicted)
+    return np.where(without_reading(trace)[..., None], np.nan, innovation), p + r
 
 
 @dataclass(frozen=True)

@@ -176,9 +176,16 @@ def counted(trace: Trace) -> Mask:
 
 
 def absent(trace: Trace, modality: str) -> Mask:
-    """(T,): steps without a reading of any sensor of a modality; none of a modality without sensors."""
-    present = [trace.episode.present(key) for key in trace.task.modalities.get(modality, ())]
+    """(T,): steps without a reading of any sensor of a modality, or of ``image+haptics``; none without sensors."""
+    keys = [key for part in modality.split("+") for key in trace.task.modalities.get(part, ())]
+    present = [trace.episode.present(key) for key in keys]
     return ~np.logical_or.reduce(present) if present else np.zeros(len(trace), dtype=bool)
+
+
+def without_reading(trace: Trace) -> Mask:
+    """(T, K): ``absent`` for each modality of the trace."""
+    steps = [absent(trace, modality) for modality in trace.modalities]
+    return np.stack(steps, axis=-1) if steps else np.zeros((len(trace), 0), dtype=bool)
 
 
 def phases(trace: Trace) -> dict[str, Mask]:

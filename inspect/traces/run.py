@@ -22,6 +22,7 @@ from beliefscope.filters.engine import Progress, one_thread
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.fusion import only_present, powers_of_present
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.resampling import effective_sample_size
@@ -299,7 +300,9 @@ def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence)
     elif len(filter_.names) > 1:
         information = torch.linalg.inv(torch.cat([belief.covariance for belief in modality]))
         fused = torch.cat([s.estimate.covariance for s in steps])
-        arrays["effective_weights"] = (fused.unsqueeze(1) @ information).diagonal(dim1=-2, dim2=-1)
+        shares = (fused.unsqueeze(1) @ information).diagonal(dim1=-2, dim2=-1)
+        present = evidence.present
+        arrays["effective_weights"] = shares if present is None else shares * powers_of_present(present[:, 0])[..., None]
     return arrays
 
 
@@ -333,6 +336,8 @@ def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) 
     if len(filter_.names) == 1:
         return arrays
     scaled = log_likelihood - filter_.scale(prior, log_likelihood)
+    if evidence.present is not None:
+        scaled = only_present(scaled, evidence.present[:, 0])
     modality_evidence = torch.logsumexp(prior.unsqueeze(1) + scaled, dim=-1, keepdim=True)
     if evidence.log_weights is not None:
         modality_evidence = modality_evidence + evidence.log_weights[:, 0]

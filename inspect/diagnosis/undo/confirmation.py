@@ -67,7 +67,7 @@ def negative_log_likelihood(trace: Trace) -> float:
         pair = (measures.errors(trace)[:, -1], measures.covariances(trace)[:, -1]) if trace.has_covariance else None
     else:
         pair = virtual_innovations(trace)
-    return float("nan") if pair is None else float(_gaussian_nll(pair[0][keep], pair[1][keep]).mean())
+    return float("nan") if pair is None else measures.known_mean(_gaussian_nll(pair[0][keep], pair[1][keep]))
 
 
 def _gaussian_nll(error: Array, covariance: Array) -> Array:
