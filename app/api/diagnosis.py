@@ -12,7 +12,7 @@ from fastapi import FastAPI, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
-from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
+from beliefscope.app.api.models import Encoded, JobReply, Number, Progress, Reply, fields_of
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.permalinks import page_link
@@ -21,7 +21,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.text import plural
-from beliefscope.inspect.diagnosis.cause import Evidence, Recovery
+from beliefscope.inspect.diagnosis.cause import Candidate, Evidence, Recovery
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.views import as_json
@@ -33,16 +33,7 @@ MAX_EPISODES = 10
 """Held-out episodes of a diagnosis: more take longer and change little."""
 
 
-@fields_of(Evidence)
-class DiagnosisEvidence(Reply):
-    """A deviation that supports a cause. low, high: healthy range. episode, step: where it shows best."""
-
-
-@fields_of(Recovery)
-class DiagnosisRecovery(Reply):
-    """Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats."""
-
-
+@fields_of(Candidate, "episodes", "steps", "evidence", "next")
 class DiagnosisCause(Reply):
     """A ranked cause. cause: its name in the catalog. title: in words.
 
@@ -53,11 +44,7 @@ class DiagnosisCause(Reply):
     title: str
     component: str
     probability: float
-    episodes: list[int]
-    steps: list[int] | None
-    evidence: list[DiagnosisEvidence]
-    recovered: DiagnosisRecovery | None
-    next: str
+    recovered: Encoded[Recovery] | None
 
 
 class Diagnosis(Reply):
@@ -76,7 +63,7 @@ class Diagnosis(Reply):
     masked: bool
     headline: str
     causes: list[DiagnosisCause]
-    deviations: list[DiagnosisEvidence]
+    deviations: list[Encoded[Evidence]]
     task: str
     filter: str
     checkpoint_hash: str

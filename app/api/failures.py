@@ -8,7 +8,7 @@ from fastapi import Depends, FastAPI
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.jobs import arguments_over_episodes, result_or_job
-from beliefscope.app.api.models import JobReply, Number, Progress, Reply, fields_of
+from beliefscope.app.api.models import Encoded, JobReply, Number, Progress, Reply, fields_of
 from beliefscope.app.api.traces import finished_run
 from beliefscope.app.jobs.failures import failure_document
 from beliefscope.app.jobs.queue import Jobs
@@ -18,11 +18,10 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.text import plural
-from beliefscope.inspect.failures import by_episode
+from beliefscope.inspect.failures.by_episode import EpisodeErrors
 from beliefscope.inspect.failures.events import Event, PhaseStatistics
 from beliefscope.inspect.failures.survey_json import EVENT_FIELDS
 from beliefscope.inspect.slices.report import ErrorSlice
-from beliefscope.inspect.slices.search import Condition
 
 Among = Literal["held-out", "all"]
 
@@ -40,28 +39,15 @@ class FailureEvent(Reply):
 
     value: Number
     nees: Number
-    ess: Number
     effective_weights: list[Number] | None
     link: str
-
-
-@fields_of(Condition)
-class SliceCondition(Reply):
-    """Values of a covariate: ``low < value <= high`` in its unit for display, either may be None; or a category."""
-
-
-@fields_of(ErrorSlice)
-class FailureSlice(Reply):
-    """A data slice with a larger score. worst: episode and step of the largest one."""
-
-    conditions: list[SliceCondition]
 
 
 class FailureSlices(Reply):
     """Data slices in which a score is larger. summary: their number and the searched data, or why there are none."""
 
     summary: str
-    rows: list[FailureSlice]
+    rows: list[Encoded[ErrorSlice]]
 
 
 class FailureScore(Reply):
@@ -82,11 +68,6 @@ class FailureScore(Reply):
     slices: FailureSlices | None = None
 
 
-@fields_of(by_episode.EpisodeErrors)
-class EpisodeErrors(Reply):
-    """Position errors of one episode."""
-
-
 class Failures(Reply):
     """Failures of a filter over a data set."""
 
@@ -99,7 +80,7 @@ class Failures(Reply):
     steps: int
     layers: list[str]
     scores: list[FailureScore]
-    episodes: list[EpisodeErrors]
+    episodes: list[Encoded[EpisodeErrors]]
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from fastapi import Body, FastAPI, HTTPException
 from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
-from beliefscope.app.api.models import Number, Progress, Reply, ResultViews, fields_of
+from beliefscope.app.api.models import Encoded, Number, Progress, Reply, ResultViews, fields_of
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.api.weaknesses import Weakness, weaknesses_of
 from beliefscope.app.jobs.finetune import catalog_name
@@ -26,7 +26,7 @@ from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.success import measures
 from beliefscope.filters.finetuning.training_data import simulated_episodes
 from beliefscope.inspect.compare.effects import Regression
-from beliefscope.inspect.compare.success import SliceChange, Success
+from beliefscope.inspect.compare.success import Success
 
 Action = Literal["promote", "save", "discard"]
 
@@ -40,19 +40,12 @@ class FineTuneRunInfo(FineTuneRun):
     saved_as: Literal["saved", "default"] | None
 
 
-@fields_of(Validation)
-class ValidationInfo(Reply):
-    """A validation."""
-
-    loss: Number
-
-
 class FineTuneProgress(Reply):
     """Progress of a fine-tuning run. losses: (step, loss)."""
 
     steps: int
     losses: list[tuple[int, Number]]
-    validations: list[ValidationInfo]
+    validations: list[Encoded[Validation]]
 
 
 class FineTunedCheckpoint(Reply):
@@ -73,31 +66,14 @@ class RegressionEvent(Reply):
     link: str
 
 
-@fields_of(SliceChange)
-class SliceChangeInfo(Reply):
-    """Change of the criterion's measure in a slice."""
-
-    change: Number
-    low: Number
-    high: Number
-
-
-@fields_of(Success)
-class SuccessInfo(Reply):
-    """Outcome by the success criterion."""
-
-    slices: list[SliceChangeInfo]
-
-
 class FineTuneResult(Reply):
     """Result of a fine-tuning run. frozen: modules with unchanged hashes. success: None without a criterion."""
-
-    success: SuccessInfo | None = None
 
     finetuned: FineTunedCheckpoint
     comparison: ResultViews
     frozen: list[str]
     events: list[RegressionEvent]
+    success: Encoded[Success] | None = None
 
 
 @dataclass(frozen=True)
@@ -105,7 +81,7 @@ class FineTuneRunSummary(FineTuneRunInfo):
     """A fine-tuning run with its progress and its outcome by the success criterion."""
 
     progress: FineTuneProgress | None
-    success: SuccessInfo | None
+    success: Encoded[Success] | None
 
 
 class MeasureInfo(Reply):

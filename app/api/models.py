@@ -2,15 +2,18 @@
 
 The page's TypeScript types are generated from all of them. Large responses are sent without validation; the tests
 validate them (``tests/app/conftest.py``). Dataclasses of other folders are used as they are if they have only plain
-fields; models of those with arrays are derived by ``fields_of``.
+fields; models of those with arrays or numbers that may not be finite are derived, by ``Encoded`` or, if they have other
+fields too, by ``fields_of``.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from functools import cache
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, create_model
+from pydantic_core import CoreSchema
 
 from beliefscope.app.jobs.queue import Job
 from beliefscope.datasets.dataset import EpisodeSummary
@@ -33,6 +36,7 @@ class RequestBody(BaseModel):
 
 
 R = TypeVar("R", bound=Reply)
+T = TypeVar("T")
 
 
 def fields_of(source: type, *names: str) -> Callable[[type[R]], type[R]]:
@@ -53,11 +57,31 @@ def fields_of(source: type, *names: str) -> Callable[[type[R]], type[R]]:
 
 
 def _json_type(hint: Any) -> Any:
-    """The type of a field's JSON value: None for non-finite numbers, lists for arrays."""
-    if get_origin(hint) is np.ndarray:
-        (scalar,) = get_args(get_args(hint)[1])
+    """The type of a field's JSON value: None for non-finite numbers, lists for arrays, models for dataclasses."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is np.ndarray:
+        (scalar,) = get_args(arguments[1])
         return list[bool] if scalar is np.bool_ else list[Number]
+    if origin is tuple and dataclasses.is_dataclass(arguments[0]):
+        return list[_model(arguments[0])]  # type: ignore[arg-type, misc]
     return Number if hint is float else hint
+
+
+@cache
+def _model(source: type) -> type[Reply]:
+    """The model of a dataclass as ``as_json`` encodes it."""
+    return fields_of(source)(create_model(source.__name__, __base__=Reply, __doc__=source.__doc__))
+
+
+class _ModelOf:
+    """Annotation that replaces a dataclass by its model."""
+
+    def __get_pydantic_core_schema__(self, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler.generate_schema(_model(source))
+
+
+Encoded = Annotated[T, _ModelOf()]
+"""``Encoded[D]``: a dataclass D as ``as_json`` encodes it."""
 
 
 class Error(Reply):
@@ -193,23 +217,6 @@ class FilterName(Reply):
     filter: str
 
 
-@fields_of(views.Curve)
-class Curve(Reply):
-    """A quantity over the steps of a trace."""
-
-
-@fields_of(views.Line)
-class Line(Reply):
-    """A line of a plot."""
-
-
-@fields_of(views.Plot)
-class Plot(Reply):
-    """A plot whose x axis is not time. diagonal: draw y = x. names: labels of x = 0, 1, ..."""
-
-    lines: list[Line]
-
-
 @fields_of(views.ImagePanel)
 class PixelMap(Reply):
     """A value per pixel of a camera image."""
@@ -222,9 +229,9 @@ class ResultViews(Reply):
 
     verdict: str
     tables: list[views.Table]
-    curves: list[Curve]
+    curves: list[Encoded[views.Curve]]
     bands: dict[str, list[bool]]
-    plots: list[Plot]
+    plots: list[Encoded[views.Plot]]
     images: list[PixelMap]
 
 

@@ -1,6 +1,6 @@
 /** A cause in the Diagnosis tab: its probability, evidence, the effect of undoing it and the next action. */
 
-/** @import { DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
+/** @import { DiagnosisCause, Evidence } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
 import { fixed, percent, probabilityText, sentence, stepLabel, typeset } from '../core/units.js';
@@ -44,7 +44,7 @@ export function causeItem(cause, alone, open, actions) {
 }
 
 /**
- * @param {DiagnosisEvidence} evidence
+ * @param {Evidence} evidence
  * @param {boolean} alone whether the displayed episode is the only one
  * @param {OpenStep} open
  */
@@ -60,7 +60,7 @@ export function evidenceItem({ text, episode, step, time }, alone, open) {
 
 /**
  * Names the episode and the step that show an evidence; empty without a step of the only episode.
- * @param {Pick<DiagnosisEvidence, 'episode' | 'step' | 'time'>} evidence
+ * @param {Pick<Evidence, 'episode' | 'step' | 'time'>} evidence
  * @param {boolean} alone whether the displayed episode is the only one
  */
 export function placeLabel({ episode, step, time }, alone) {

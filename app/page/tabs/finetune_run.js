@@ -1,7 +1,7 @@
 /** A fine-tuning run: progress, verdict, decision about the checkpoint, and the changes in detail. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, SuccessInfo, Task } from '../types/server.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, Success, Task } from '../types/server.js' */
 
 import { create, element, html } from '../core/dom.js';
 import {
@@ -102,7 +102,7 @@ export class FinetuneRun {
     this.#drawEvents(run, result?.events ?? [], task);
   }
 
-  /** @param {SuccessInfo | null} success */
+  /** @param {Success | null} success */
   #drawSlices(success) {
     const table = element('.slices', HTMLTableElement, this.#host);
     table.hidden = !success;
@@ -221,7 +221,7 @@ function stateText(job) {
 /**
  * Returns the criterion in words; before the result only its slice and limits are known.
  * @param {string | null | undefined} text
- * @param {SuccessInfo | null} success
+ * @param {Success | null} success
  */
 function statement(text, success) {
   if (!text) return 'This run has no success criterion.';

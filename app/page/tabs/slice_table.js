@@ -1,6 +1,6 @@
 /** Table of data slices in which a score is larger; each row opens the worst step of its slice. */
 
-/** @import { FailureScore, FailureSlice, SliceCondition } from '../types/server.js' */
+/** @import { FailureScore, ErrorSlice, Condition } from '../types/server.js' */
 
 import { create, element } from '../core/dom.js';
 import { percent, sentence, significant, withUnit } from '../core/units.js';
@@ -10,7 +10,7 @@ import { scoreUnit } from './failure_scores.js';
 
 const NO_BREAK = '\u00a0'; // space that keeps a unit on the line of its number
 
-/** @typedef {{slice: FailureSlice, row: HTMLTableRowElement, button: HTMLButtonElement}} SliceRow */
+/** @typedef {{slice: ErrorSlice, row: HTMLTableRowElement, button: HTMLButtonElement}} SliceRow */
 
 export class SliceTable {
   #table;
@@ -62,7 +62,7 @@ export class SliceTable {
   }
 
   /**
-   * @param {FailureSlice} slice
+   * @param {ErrorSlice} slice
    * @param {FailureScore} score
    * @param {number} count of searched episodes
    * @param {number} i place in the table
@@ -113,7 +113,7 @@ function headingsOf(score) {
 
 /**
  * Describes a slice, its effect and its size: Position error is 1.5 times as large (1.3 to 1.7) where blackout: ...
- * @param {FailureSlice} slice
+ * @param {ErrorSlice} slice
  * @param {FailureScore} score
  * @param {number} count of searched episodes
  */
@@ -127,10 +127,10 @@ export function sliceSentence(slice, score, count) {
   );
 }
 
-/** @param {FailureSlice} slice */
+/** @param {ErrorSlice} slice */
 const sliceText = ({ conditions }) => conditions.map(conditionText).join(' and ');
 
-/** @param {FailureSlice} slice */
+/** @param {ErrorSlice} slice */
 function ratioText({ ratio, low, high }) {
   const interval = low === null || high === null ? '' : ` (${factor(low)} to ${factor(high)})`;
   return `${factor(ratio)} ×${interval}`;
@@ -144,7 +144,7 @@ const factor = (value) => (value === null ? '–' : String(Number(value.toPrecis
 
 /**
  * Describes a condition in units of the page: 1 s < outage length ≤ 2 s, contact, or policy is push.
- * @param {SliceCondition} condition
+ * @param {Condition} condition
  */
 export function conditionText({ covariate, unit, low, high, category }) {
   if (category === 'yes') return covariate;

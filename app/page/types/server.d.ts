@@ -92,7 +92,7 @@ export interface Weakness extends Omit<api.Weakness, 'settings'> {
 
 export interface FineTuneRunSummary extends FineTuneRunInfo {
   progress: FineTuneProgress | null;
-  success: api.SuccessInfo | null;
+  success: api.Success | null;
 }
 
 export interface FineTuneRunInfo extends Omit<api.FineTuneRunInfo, 'settings' | 'job'> {
@@ -106,7 +106,7 @@ export interface FineTuneOffer extends Omit<api.FineTuneOffer, 'settings' | 'run
 }
 
 export interface FineTuneProgress extends Omit<api.FineTuneProgress, 'validations'> {
-  validations: (Omit<api.ValidationInfo, 'slices'> & {
+  validations: (Omit<api.Validation, 'slices'> & {
     slices: Record<string, { rmse: Record<string, number | null> }>;
   })[];
 }
