@@ -10,7 +10,6 @@ import logging
 import re
 import secrets
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 
 from starlette.datastructures import URL, Headers, MutableHeaders, QueryParams
 from starlette.exceptions import HTTPException
@@ -69,23 +68,6 @@ HEADERS = {
 log = logging.getLogger("beliefscope.app")
 
 
-@dataclass(frozen=True)
-class Reply:
-    """A response of the guard. page: HTML instead of the reason as JSON."""
-
-    status: int
-    reason: str
-    headers: Mapping[str, str] = field(default_factory=dict)
-    page: str = ""
-
-    @property
-    def response(self) -> Response:
-        """The response; of a refused WebSocket, too."""
-        if self.page:
-            return HTMLResponse(self.page, self.status, self.headers)
-        return JSONResponse({"error": self.reason}, self.status, self.headers)
-
-
 class Guard:
     """ASGI middleware that checks all requests and WebSockets and adds security headers to all responses.
 
@@ -106,10 +88,7 @@ class Guard:
         response = _Response(scope, send)
         reply = self.reply(scope)
         if reply is not None:
-            if reply.status >= 400:
-                event = {"status": reply.status, "path": scope["path"], "client": _address(scope)}
-                log.warning("refused: %s", reply.reason, extra={"event": event})
-            await reply.response(scope, receive, response.send)
+            await reply(scope, receive, response.send)
             return
         try:
             await self.app(scope, _limit_body(scope, receive), response.send)
@@ -118,21 +97,21 @@ class Guard:
             log.exception("failed: %s", error, extra={"event": {"error": id, "path": scope["path"]}})
             if response.started or scope["type"] == "websocket":
                 raise
-            failure = Reply(500, f"{error or type(error).__name__} (error {id})")
-            await failure.response(scope, receive, response.send)
+            failure = JSONResponse({"error": f"{error or type(error).__name__} (error {id})"}, 500)
+            await failure(scope, receive, response.send)
 
-    def reply(self, scope: Scope) -> Reply | None:
-        """The response to a refused request, or None if it is allowed."""
+    def reply(self, scope: Scope) -> Response | None:
+        """The response to a request or WebSocket that is refused or signs in, or None if it is allowed."""
         headers = Headers(scope=scope)
         hosts = [value.lower() for value in headers.getlist("host")]
         if len(hosts) != 1:
-            return Reply(403, "The request must have one Host header.")
+            return _refusal(scope, 403, "The request must have one Host header.")
         host = hosts[0]
         if _name(host) not in self.hosts and not (self.sign_in and is_address(_name(host))):
             allowed = ", ".join(sorted(self.hosts))
-            return Reply(403, f"Host {host!r} is not allowed. Allowed: {allowed} (any port).")
+            return _refusal(scope, 403, f"Host {host!r} is not allowed. Allowed: {allowed} (any port).")
         if scope["type"] == "http" and _is_cross_site(headers):
-            return Reply(403, "The request comes from a page of another site.")
+            return _refusal(scope, 403, "The request comes from a page of another site.")
         bearer = next(filter(None, map(_bearer, headers.getlist("authorization"))), "")
         if self.sign_in and scope["path"] not in WITHOUT_TOKEN:
             reply = self._authenticate(self.sign_in, scope, host, bearer, "; ".join(headers.getlist("cookie")))
@@ -145,12 +124,12 @@ class Guard:
         is_script = self.sign_in is not None and bearer and not origins
         if origins not in ([f"http://{host}"], [f"https://{host}"]) and not is_script:
             origin = ", ".join(origins) or "none"
-            return Reply(403, f"Origin must be http://{host}; the request has {origin}.")
+            return _refusal(scope, 403, f"Origin must be http://{host}; the request has {origin}.")
         if self.read_only and scope["type"] == "http" and f"{scope['method']} {scope['path']}" not in READ_ONLY_ALLOWED:
-            return Reply(403, READ_ONLY)
+            return _refusal(scope, 403, READ_ONLY)
         return None
 
-    def _authenticate(self, sign_in: SignIn, scope: Scope, host: str, bearer: str, cookies: str) -> Reply | None:
+    def _authenticate(self, sign_in: SignIn, scope: Scope, host: str, bearer: str, cookies: str) -> Response | None:
         """The response to an unauthenticated request, or the cookie for a valid token; None if authenticated."""
         is_page = scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and scope["path"] == "/"
         query = scope.get("query_string", b"").decode("latin-1")
@@ -160,20 +139,30 @@ class Guard:
         try:
             if not token or not sign_in.accepts(token, _address(scope)):
                 if not bearer and sign_in.has_cookie(host, cookies):
-                    return Reply(303, "", {"location": address}) if token else None
+                    return Response(status_code=303, headers={"location": address}) if token else None
                 reason = "The token is wrong." if token else "This server requires a token."
                 reason += " Open the link that `beliefscope serve` printed, or enter the token."
                 challenge = uncached | {"www-authenticate": "Bearer"}
-                return Reply(401, reason, challenge, sign_in_page(reason, address) if is_page else "")
+                return _refusal(scope, 401, reason, challenge, sign_in_page(reason, address) if is_page else "")
         except TooManyAttempts as error:
             wait = f"{max(1.0, error.args[0]):.0f}"
             reason = f"Too many wrong tokens from this address; try again in {wait} s."
             page = sign_in_page(reason, address) if is_page else ""
-            return Reply(429, reason, uncached | {"retry-after": wait}, page)
+            return _refusal(scope, 429, reason, uncached | {"retry-after": wait}, page)
         if bearer:
             return None
-        page = redirect_page(address)
-        return Reply(200, "", uncached | {"set-cookie": sign_in.cookie(host)}, page)
+        return HTMLResponse(redirect_page(address), headers=uncached | {"set-cookie": sign_in.cookie(host)})
+
+
+def _refusal(
+    scope: Scope, status: int, reason: str, headers: Mapping[str, str] | None = None, page: str = ""
+) -> Response:
+    """The response to a refused request or WebSocket, which is logged. page: HTML instead of the reason as JSON."""
+    event = {"status": status, "path": scope["path"], "client": _address(scope)}
+    log.warning("refused: %s", reason, extra={"event": event})
+    if page:
+        return HTMLResponse(page, status, headers)
+    return JSONResponse({"error": reason}, status, headers)
 
 
 def _bearer(authorization: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,7 +38,7 @@ def scope(host: str, origin: str | None = None, method: str | None = "GET") -> S
 def refusal(guard: Guard, request: Scope) -> str:
     """The reason of a refusal, or empty."""
     reply = guard.reply(request)
-    return "" if reply is None else reply.reason
+    return "" if reply is None else json.loads(reply.body)["error"]
 
 
 @pytest.mark.parametrize(
