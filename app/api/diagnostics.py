@@ -1,7 +1,6 @@
 """Routes under ``/api/diagnostics``: diagnostics of one episode, all held-out ones or all runs; slow ones as jobs."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -14,7 +13,6 @@ from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.live_runs import LIVE_PREFIX
-from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.errors import unknown_name
@@ -63,9 +61,18 @@ def _options(name: str, request: Request) -> dict[str, Any]:
     return _entry(name).parse_options({k: v for k, v in request.query_params.items() if k not in RUN_PARAMETERS})
 
 
-RequestedEntry = Annotated[Entry, Depends(_entry)]
-Options = Annotated[dict[str, Any], Depends(_options)]
-Episodes = Literal["held-out"] | None
+@dataclass(frozen=True)
+class DiagnosticRequest:
+    """A diagnostic with its options, the selected run, and whether to compute it over other episodes instead."""
+
+    entry: Annotated[Entry, Depends(_entry)]
+    selection: RequestedRun
+    options: Annotated[dict[str, Any], Depends(_options)]
+    episodes: Literal["held-out"] | None = None
+
+
+RequestedDiagnostic = Annotated[DiagnosticRequest, Depends()]
+"""The diagnostic selected by path and query."""
 
 
 def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
@@ -90,29 +97,27 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
         response_model=DiagnosticResult,
         responses={202: {"model": JobReply | Progress}},
     )
-    def get_result(
-        entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
-    ) -> Response:
-        run = finished_run(store, selection)
+    def get_result(request: RequestedDiagnostic) -> Response:
+        entry, options = request.entry, request.options
+        run = finished_run(store, request.selection)
         _check(entry, run)
-        if not (entry.slow or episodes):
+        if not (entry.slow or request.episodes):
             key = repr((entry.name, sorted(options.items())))
             result = run.result(
                 key, lambda: {"trajectories": 1, **entry([run.trace], run.checkpoint, **options).views()}
             )
             return Response(result, media_type="application/json")
-        return result_or_job(jobs, "diagnostic", _arguments(store, entry, selection, run, options, episodes))
+        return result_or_job(jobs, "diagnostic", _arguments(store, request, run))
 
     @app.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
-    def compute(
-        entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
-    ) -> JobReply:
+    def compute(request: RequestedDiagnostic) -> JobReply:
+        entry, selection = request.entry, request.selection
         run = store.request(selection)
         _check(entry, run)
-        arguments = _arguments(store, entry, selection, run, options, episodes)
+        arguments = _arguments(store, request, run)
         unit = "run" if selection.data.startswith(LIVE_PREFIX) else "held-out episode"
-        scope = f"all {plural(len(arguments['selections']), unit)}" if episodes else ""
-        state = {"over": episodes, "diagnostic": entry.name, "options": urlencode(options)}
+        scope = f"all {plural(len(arguments['selections']), unit)}" if request.episodes else ""
+        state = {"over": request.episodes, "diagnostic": entry.name, "options": urlencode(request.options)}
         title, link = f"{entry.title} of {selection.describe(scope)}", selection.link("diagnostics", **state)
         return JobReply(job=jobs.submit("diagnostic", title, arguments, link=link))
 
@@ -122,24 +127,19 @@ def _check(entry: Entry, run: TracedRun) -> None:
         raise HTTPException(409, reason)
 
 
-def _arguments(
-    store: TraceStore,
-    entry: Entry,
-    selection: Selection,
-    run: TracedRun,
-    options: Mapping[str, Any],
-    episodes: Episodes,
-) -> dict[str, Any]:
+def _arguments(store: TraceStore, request: DiagnosticRequest, run: TracedRun) -> dict[str, Any]:
     """Arguments of the job, with everything that its result depends on. run: the selected one."""
-    is_live = selection.data.startswith(LIVE_PREFIX)
-    if episodes and is_live:
+    selection = request.selection
+    if not request.episodes:
+        selections = [selection]
+    elif selection.data.startswith(LIVE_PREFIX):
         selections = store.live.of_same_filter(selection)
     else:
-        indices = store.dataset(selection.task, selection.data)[1].held_out() if episodes else [selection.episode]
+        indices = store.dataset(selection.task, selection.data)[1].held_out()
         selections = [replace(selection, episode=index) for index in indices]
     return {
-        "diagnostic": entry.name,
-        "options": dict(sorted(options.items())),
+        "diagnostic": request.entry.name,
+        "options": dict(sorted(request.options.items())),
         "selections": [item.to_json() for item in selections],
         "keys": [store.key(item) for item in selections],
         "record": store.record_version(run.checkpoint),
