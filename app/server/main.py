@@ -221,15 +221,8 @@ class _Server(uvicorn.Server):
 def _add_files(app: FastAPI, viewer: WebViewer) -> None:
     uplot = installed("uplot") / "static"
     files = PageFiles(PAGE, [uplot / name for name in UPLOT_FILES])
-
-    # In the event loop, from memory: a browser requests all files at once.
-    @app.get("/")
-    async def page(request: Request) -> Response:
-        return files.index(request)
-
-    @app.get("/static/{path:path}")
-    async def page_file(path: str, request: Request) -> Response:
-        return files.file(request, path)
+    app.get("/")(files.index)
+    app.get("/static/{path:path}")(files.file)
 
     @app.get("/vendor/rerun/viewer.js")
     def viewer_script() -> Response:

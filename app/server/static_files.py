@@ -39,12 +39,13 @@ class PageFiles:
         self._index = b""
         self._files: dict[str, tuple[bytes, str]] = {}  # content and hash
 
-    def index(self, request: Request) -> Response:
+    # Handlers in the event loop, from memory: a browser requests all files at once.
+    async def index(self, request: Request) -> Response:
         """The page."""
         self._read()
         return tagged(request, _hash(self._index), lambda: self._index, "text/html; charset=utf-8")
 
-    def file(self, request: Request, path: str) -> Response:
+    async def file(self, request: Request, path: str) -> Response:
         """``HASH/NAME`` as in the index, immutable; or ``NAME``, revalidated. Raises HTTPException 404."""
         version, _, name = path.partition("/")
         if version != self._version or name not in self._files:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import posixpath
 import re
 import shutil
@@ -114,19 +115,19 @@ def test_edited_file_has_a_new_address(tmp_path: Path) -> None:
     (tmp_path / "core" / "main.js").write_text("import { a } from '../a.js';")
     (tmp_path / "a.js").write_text("export const a = 1;")
     files = PageFiles(tmp_path)
-    before = bytes(files.index(request("br")).body)
+    before = bytes(asyncio.run(files.index(request("br"))).body)
     (tmp_path / "a.js").write_text("export const a = 12;")
-    after = bytes(files.index(request("br")).body)
+    after = bytes(asyncio.run(files.index(request("br"))).body)
     names = [set(re.findall(rb"/static/(\w+)/", page)) for page in (before, after)]
     assert [len(hashes) for hashes in names] == [1, 1]
     assert names[0] != names[1]
     address = f"{names[1].pop().decode()}/a.js"
-    assert files.file(request("br"), address).body == b"export const a = 12;"
+    assert asyncio.run(files.file(request("br"), address)).body == b"export const a = 12;"
     (tmp_path / "a.js").write_text("export const a = 123;")
-    answer = files.file(request("br"), address)
+    answer = asyncio.run(files.file(request("br"), address))
     assert answer.body == b"export const a = 12;", "a browser would cache the new content under the old address"
     assert "immutable" in answer.headers["cache-control"]
-    assert files.file(request("br"), "a.js").body == b"export const a = 123;"
+    assert asyncio.run(files.file(request("br"), "a.js")).body == b"export const a = 123;"
 
 
 def test_unknown_address_is_a_page_for_browsers_and_json_for_programs(shared_client: TestClient) -> None:
