@@ -190,12 +190,9 @@ def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> 
 
 def preliminary_diagnosis(store: TraceStore, selection: Selection) -> Any:
     """The preliminary diagnosis as JSON values, kept with the run. Raises BadInput without a healthy profile."""
-    run = finished_run(store, selection)
-
-    def compute() -> Any:
-        return as_json(preliminary(run.checkpoint, run.trace, store.settings.particles).to_json())
-
-    return json.loads(run.result("diagnosis", compute))
+    run, particles = finished_run(store, selection), store.settings.particles
+    result = run.result("diagnosis", lambda: as_json(preliminary(run.checkpoint, run.trace, particles).to_json()))
+    return json.loads(result)
 
 
 def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -162,10 +161,8 @@ def add_routes(app: FastAPI, store: TraceStore, files: RecordingFolder, jobs: Jo
         assert info.filter is not None
         key = repr((recording.name, recording.bytes, recording.modified))
         run = f"{recording.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
-        filters: Mapping[str, Checkpoint] = {}
-        with suppress(BadInput):  # a task that this server does not have
-            filters = store.filters(str(info.task))
-        filter_, output = display_name(info.filter, info.checkpoint_hash, filters), store.live.folder / f"{run}{SUFFIX}"
+        filter_ = display_name(info.filter, info.checkpoint_hash, matcher.filters(str(info.task)))
+        output = store.live.folder / f"{run}{SUFFIX}"
         link = page_link(task=info.task, filter=filter_, data=LIVE_PREFIX + run, episode=info.episode or 0, tab="scene")
         arguments, title = {"recording": str(files.path(name)), "run": str(output)}, f"The run in {recording.name}"
         return JobReply(job=jobs.submit("reading", title, arguments, link=link, output_exists=output.is_file()))
@@ -232,15 +229,19 @@ class RunMatcher:
             why_not=why_not,
         )
 
+    def filters(self, task: str) -> dict[str, Checkpoint]:
+        """The filters of a task by name; none of a task that this server does not have."""
+        with suppress(BadInput):
+            return self._store.filters(task)
+        return {}
+
     def _match(self, info: RecordingInfo | None) -> tuple[RunNames | None, str]:
         """Names of the run's filter and data set, or None and the reason."""
         if info is None or info.problem:
             return None, "" if info is None else info.problem
         task, episode, settings = str(info.task), int(info.episode or 0), self._store.settings
-        filters: Mapping[str, Checkpoint] = {}
-        with suppress(BadInput):  # a task that this server does not have
-            filters = self._store.filters(task)
-        filter_ = next((name for name, filter_ in filters.items() if filter_.hash == info.checkpoint_hash), None)
+        filters = self.filters(task).items()
+        filter_ = next((name for name, filter_ in filters if filter_.hash == info.checkpoint_hash), None)
         if filter_ is None:
             short = info.checkpoint_hash[:8]
             reason = f"Filter {info.filter} of {task} with checkpoint {short} is not served here."
