@@ -55,9 +55,10 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
     @app.get("/api/lineage/{task}/{hash}.zip", response_class=Response)
     def archive(task: str, hash: str) -> Response:
         lineage = _lineage(store, task)
-        if hash not in lineage.members:
+        member = lineage.members.get(hash)
+        if member is None or member.task != task:
             raise NotFound(f"No checkpoint of task {task!r} has hash {hash!r}.")
-        name = f"{task}-{lineage.members[hash].name}-{hash[:12]}"
+        name = f"{task}-{member.name}-{hash[:12]}"
         content = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(content, "w") as archive:
             for path in export(lineage, hash, Path(folder) / name, __version__):

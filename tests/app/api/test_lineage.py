@@ -63,6 +63,7 @@ def test_bases_come_first_and_export_contains_ancestors(client: TestClient, sett
     assert hashes == {*line, second}
     assert len(json.loads(files["lineage.json"])["members"]) == 3
     assert client.get(f"{url}/{'0' * 64}.zip").status_code == 404
+    assert client.get(f"/api/lineage/push/{second}.zip").status_code == 404, "a checkpoint of another task"
     assert client.get("/api/lineage/dor").status_code == 400
 
 
