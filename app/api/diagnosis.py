@@ -21,7 +21,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.text import plural
-from beliefscope.inspect.diagnosis.cause import Candidate, Evidence, Recovery
+from beliefscope.inspect.diagnosis.cause import Candidate, Diagnosis as DiagnosisResult, Recovery
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.views import as_json
@@ -47,6 +47,7 @@ class DiagnosisCause(Reply):
     recovered: Encoded[Recovery] | None
 
 
+@fields_of(DiagnosisResult, "state", "masked", "headline", "deviations")
 class Diagnosis(Reply):
     """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
 
@@ -59,11 +60,7 @@ class Diagnosis(Reply):
     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
     """
 
-    state: Literal["healthy", "fault", "unsure"]
-    masked: bool
-    headline: str
     causes: list[DiagnosisCause]
-    deviations: list[Encoded[Evidence]]
     task: str
     filter: str
     checkpoint_hash: str

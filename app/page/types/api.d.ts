@@ -181,19 +181,8 @@ export interface components {
          *     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
          */
         Diagnosis: {
-            /**
-             * State
-             * @enum {string}
-             */
-            state: "healthy" | "fault" | "unsure";
-            /** Masked */
-            masked: boolean;
-            /** Headline */
-            headline: string;
             /** Causes */
             causes: components["schemas"]["DiagnosisCause"][];
-            /** Deviations */
-            deviations: components["schemas"]["Evidence"][];
             /** Task */
             task: string;
             /** Filter */
@@ -228,6 +217,17 @@ export interface components {
             restarts?: {
                 [key: string]: number[];
             } | null;
+            /**
+             * State
+             * @enum {string}
+             */
+            state: "healthy" | "fault" | "unsure";
+            /** Masked */
+            masked: boolean;
+            /** Headline */
+            headline: string;
+            /** Deviations */
+            deviations: components["schemas"]["Evidence"][];
         };
         /**
          * DiagnosisCause
