@@ -12,6 +12,7 @@ import logging
 import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,6 @@ import websockets.asyncio.server
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.exceptions import ConnectionClosedOK
 
-QUEUE_SIZE = 64  # messages of a client that viser has not received yet
 MAX_CLIENTS = 4  # per scene; a page has one, and a second one only until a lost connection is detected
 ACCEPTED_MESSAGES = frozenset({viser._messages.GuiUpdateMessage})
 """Messages with a server-wide handler; camera messages are handled per connection.
@@ -60,44 +60,31 @@ def client_page() -> bytes:
 class _Connection:
     """The part of websockets' ``ServerConnection`` that viser's handler uses, for one client.
 
-    Runs in viser's event loop; the client's WebSocket runs in the server's.
+    Runs in viser's event loop; the client's WebSocket runs in the server's. Waiting for it applies backpressure in both
+    directions. ``recv`` and ``send`` raise ConnectionClosedOK once the client has gone.
     """
 
     def __init__(self, websocket: WebSocket, subprotocol: str, server_loop: asyncio.AbstractEventLoop) -> None:
         self.subprotocol = subprotocol
         self._websocket = websocket
         self._server_loop = server_loop
-        self._incoming: asyncio.Queue[bytes | None] = asyncio.Queue(QUEUE_SIZE)
-
-    async def put(self, message: bytes) -> None:
-        """Queue a message of the client, once there is room. Runs in viser's loop."""
-        await self._incoming.put(message)
-
-    def end(self) -> None:
-        """Discard queued messages and report the connection as closed. Runs in viser's loop."""
-        while not self._incoming.empty():
-            self._incoming.get_nowait()
-        self._incoming.put_nowait(None)
 
     async def recv(self) -> bytes:
-        message = await self._incoming.get()
-        if message is None:
-            raise ConnectionClosedOK(None, None)
+        message: bytes = await self._run_in_server_loop(self._websocket.receive_bytes())
         return message
 
     async def send(self, message: bytes) -> None:
-        # Waiting for the client applies backpressure to viser.
-        try:
-            await self._run_in_server_loop(self._websocket.send_bytes(message))
-        except (WebSocketDisconnect, RuntimeError) as error:
-            raise ConnectionClosedOK(None, None) from error
+        await self._run_in_server_loop(self._websocket.send_bytes(message))
 
     async def close(self, code: int = 1000, reason: str = "") -> None:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        with contextlib.suppress(ConnectionClosedOK):
             await self._run_in_server_loop(self._websocket.close(code, reason))
 
-    async def _run_in_server_loop(self, coroutine: Any) -> None:
-        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(coroutine, self._server_loop))
+    async def _run_in_server_loop(self, coroutine: Any) -> Any:
+        try:
+            return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(coroutine, self._server_loop))
+        except (WebSocketDisconnect, RuntimeError, KeyError) as error:  # KeyError: a text message, which has no bytes
+            raise ConnectionClosedOK(None, None) from error
 
 
 Handler = Callable[[_Connection], Awaitable[None]]
@@ -127,7 +114,7 @@ class EmbeddedViser:
             raise RuntimeError(f"viser {viser.__version__} has other message handlers than embedded_viser.py expects.")
         self._handler: Handler = captured[0]
         self._loop = self.server.get_event_loop()
-        self._connections: dict[_Connection, None] = {}  # ordered by age
+        self._clients: list[Future[None]] = []  # the running handler of each, ordered by age
 
     @property
     def subprotocol(self) -> str:
@@ -142,20 +129,15 @@ class EmbeddedViser:
             return
         await websocket.accept(subprotocol=self.subprotocol)
         connection = _Connection(websocket, self.subprotocol, asyncio.get_running_loop())
-        self._connections[connection] = None
-        while len(self._connections) > MAX_CLIENTS:
-            oldest = next(iter(self._connections))
-            del self._connections[oldest]
-            self._end(oldest)
-        handling = asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._handle(connection), self._loop))
-        receiving = asyncio.ensure_future(self._receive(websocket, connection))
+        handling = asyncio.run_coroutine_threadsafe(self._handle(connection), self._loop)
+        self._clients.append(handling)
+        for oldest in self._clients[:-MAX_CLIENTS]:
+            oldest.cancel()
         try:
-            await asyncio.wait({handling, receiving}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({asyncio.wrap_future(handling)})
         finally:
-            receiving.cancel()
-            self._end(connection)
-            await asyncio.wait({handling}, timeout=2.0)
-            self._connections.pop(connection, None)
+            handling.cancel()
+            self._clients.remove(handling)
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await websocket.close()
 
@@ -165,21 +147,10 @@ class EmbeddedViser:
         except Exception as error:  # raised by viser for an invalid message
             log.debug("Closing the connection of a scene: %s", error)
 
-    async def _receive(self, websocket: WebSocket, connection: _Connection) -> None:
-        with contextlib.suppress(WebSocketDisconnect, KeyError):
-            while True:
-                message = await websocket.receive_bytes()
-                # Waiting for viser applies backpressure to the client.
-                await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(connection.put(message), self._loop))
-
-    def _end(self, connection: _Connection) -> None:
-        with contextlib.suppress(RuntimeError):  # viser's loop is closed
-            self._loop.call_soon_threadsafe(connection.end)
-
     def close(self) -> None:
         """End all connections and viser's threads. Blocks for up to a few seconds."""
-        for connection in tuple(self._connections):
-            self._end(connection)
+        for client in tuple(self._clients):
+            client.cancel()
         with _process_lock, _silence():
             self.server.stop()
 
