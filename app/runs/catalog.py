@@ -80,13 +80,6 @@ class TaskCatalog:
                 data[SAMPLE] = _sample(sample_path(self.task), self.task)
         return data
 
-    def filter(self, name: str) -> Checkpoint:
-        """Raises BadInput for an unknown name."""
-        filters = self.filters
-        if name not in filters:
-            raise unknown_name("filter", name, filters)
-        return filters[name]
-
     def dataset(self, name: str) -> Dataset:
         """The data set with the name; the first one for an empty name. Raises BadInput for an unknown name."""
         if name not in self.data and (name or not self.data):

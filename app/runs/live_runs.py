@@ -4,7 +4,7 @@ A run is the only episode of the data set ``live:NAME``. The filter and its view
 """
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -121,21 +121,12 @@ class LiveRuns:
                 self._runs.pop(name).close()
         return sorted(times, key=lambda name: -times[name])[:LISTED_RUNS]
 
-    def traced_run(
-        self,
-        run: LiveRun,
-        selection: Selection,
-        filters: Mapping[str, Checkpoint],
-        with_record: Callable[[Checkpoint], Checkpoint],
-    ) -> TracedRun | None:
+    def traced_run(self, run: LiveRun, selection: Selection, name: str, checkpoint: Checkpoint) -> TracedRun | None:
         """The live run, or None if the selection applies another filter, faults or an intervention to its episode.
 
-        with_record: gives the filter the healthy record of the workspace, if there is one.
-
-        Raises BadInput if the run belongs to another task or episode.
+        name, checkpoint: of the run's filter (``resolve_filter``). Raises BadInput if the run belongs to another task
+        or episode.
         """
-        name, checkpoint = resolve_filter(run, filters)
-        checkpoint = with_record(checkpoint)
         if (selection.task, selection.episode) != (run.task.name, run.template.episode_index):
             raise BadInput(
                 f"live run {run.name!r} is of task {run.task.name!r}, episode {run.template.episode_index}, "

@@ -17,7 +17,7 @@ from weakref import WeakValueDictionary
 from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
 from beliefscope.app.runs.examples import EXAMPLES, Example, available
-from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
+from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns, resolve_filter
 from beliefscope.app.runs.result_filters import candidates
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings, runs_in_processes
@@ -85,7 +85,7 @@ class TraceStore:
             problems = list(problems)
             for name in filters if task in catalogs else ():
                 try:
-                    self._add_stored_filter(task, name)
+                    self._find_filter(task, name)
                 except BadInput as error:
                     problems.append(str(error).removesuffix("."))
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
@@ -160,7 +160,7 @@ class TraceStore:
         """Whether the run failed, or the healthy record of its filter was measured after its start."""
         if run.future.done() and run.future.exception() is not None:
             return True
-        record = self._records.get(self._record_path(run.checkpoint))
+        record = self._records.get(record_path(self.settings.workspace, run.checkpoint))
         return record is not None and record is not run.checkpoint.healthy_profile
 
     def cached(self, selection: Selection) -> TracedRun | None:
@@ -194,28 +194,28 @@ class TraceStore:
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
         """With the healthy record of the workspace, if it was measured. Raises BadInput for an unknown name."""
         with self._lock:
-            return self._with_record(self._filter(task, filter_))
+            checkpoint = self._find_filter(task, filter_)
+            if checkpoint is None:
+                raise unknown_name("filter", filter_, self._catalog(task).filters)
+            return self._with_record(checkpoint)
 
     def _with_record(self, checkpoint: Checkpoint) -> Checkpoint:
         with self._lock:
-            record = self._records.get(self._record_path(checkpoint))
+            record = self._records.get(record_path(self.settings.workspace, checkpoint))
         if record is not None:
             checkpoint = copy.copy(checkpoint)
             object.__setattr__(checkpoint, "healthy_profile", record)  # a checkpoint is frozen
         return checkpoint
 
-    def _record_path(self, checkpoint: Checkpoint) -> Path:
-        return record_path(self.settings.workspace, checkpoint)
-
     def record_version(self, checkpoint: Checkpoint) -> int | None:
         """Differs between measurements of the filter's record in the workspace; None without."""
         with self._lock:
-            return self._records.modified(self._record_path(checkpoint))
+            return self._records.modified(record_path(self.settings.workspace, checkpoint))
 
     def write_record(self, checkpoint: Checkpoint, record: dict[str, Any]) -> None:
         """Keep a healthy record of a filter in the workspace; replaces an earlier one."""
         with self._lock:
-            self._records.put(self._record_path(checkpoint), record)
+            self._records.put(record_path(self.settings.workspace, checkpoint), record)
 
     def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
         """Name and data set; the task's first for an empty name. Raises BadInput for an unknown name."""
@@ -242,30 +242,32 @@ class TraceStore:
             raise unknown_name("task", task, catalogs)
         return catalogs[task]
 
-    def _filter(self, task: str, name: str) -> Checkpoint:
-        self._add_stored_filter(task, name)
-        return self._catalog(task).filter(name)
+    def _find_filter(self, task: str, name: str) -> Checkpoint | None:
+        """A filter of the catalog, to which those of sweeps and studies are added; None if it does not exist.
 
-    def _add_stored_filter(self, task: str, name: str) -> None:
-        """Add a filter that only a sweep or a study has. Raises BadInput if its file is missing or changed."""
-        if name in self._catalog(task).filters:
-            return
+        Raises BadInput for an unknown task, and if the file of a filter that only a sweep or a study has is missing or
+        changed.
+        """
+        catalog = self._catalog(task)
+        if name in (filters := catalog.filters):
+            return filters[name]
         problems = []
         for source, load in candidates(task, name, self.settings):
             try:
-                self._catalog(task).opened[name] = load()
-                return
+                return catalog.opened.setdefault(name, load())
             except BadInput as error:
                 problems.append(f"filter {name!r} of {source}: {error}")
         if problems:
             raise BadInput(problems[0])
+        return None
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
         """The recorded live run, if the selection is exactly that run."""
         if not selection.data.startswith(LIVE_PREFIX):
             return None
         run = self.live[selection.data.removeprefix(LIVE_PREFIX)]
-        return self.live.traced_run(run, selection, self.filters_of(run), self._with_record)
+        name, checkpoint = resolve_filter(run, self.filters_of(run))
+        return self.live.traced_run(run, selection, name, self._with_record(checkpoint))
 
     def _episode(self, selection: Selection) -> Episode:
         with self._lock:
