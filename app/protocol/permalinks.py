@@ -17,28 +17,26 @@ def permalink(task: Task, filter_: str, data: str, episode: int, step: int, faul
     filter_, data: names on the page. by: the score that ranks the page's failures; it also selects the track of the
     timeline, the component or the kind of weights.
     """
-    query: dict[str, str | int] = {
-        "task": task.name,
-        "filter": filter_,
-        "data": data,
-        "episode": episode,
-        "step": step,
-        "component": by if by in {c.name for c in task.components} else task.map_components[0],
-        "weights": "effective" if by == "regret" else "raw",
-        "track": {"ess": "particles", "nees": "nees"}.get(by, "error"),
-        "tab": "scene",
-    }
-    if faults:
-        query["faults"] = faults
-    if by != "error":
-        query["by"] = by
-    # Browsers' URLSearchParams do not encode the star and encode the tilde.
-    return "?" + urlencode(query, safe="*").replace("~", "%7E")
+    return page_link(
+        task=task.name,
+        filter=filter_,
+        data=data,
+        episode=episode,
+        step=step,
+        component=by if by in {c.name for c in task.components} else task.map_components[0],
+        weights="effective" if by == "regret" else "raw",
+        track={"ess": "particles", "nees": "nees"}.get(by, "error"),
+        tab="scene",
+        faults=faults,
+        by="" if by == "error" else by,
+    )
 
 
 def page_link(**state: str | int | None) -> str:
     """The page's address with the parts of its state that are not empty."""
-    return "?" + urlencode({name: value for name, value in state.items() if value not in ("", None)})
+    query = {name: value for name, value in state.items() if value not in ("", None)}
+    # Browsers' URLSearchParams do not encode the star and encode the tilde.
+    return "?" + urlencode(query, safe="*").replace("~", "%7E")
 
 
 def comparison_permalink(link: str, event: Regression, filter_: str) -> str:
