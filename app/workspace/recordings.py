@@ -67,25 +67,35 @@ class RecordingFolder:
         self._probe = RecordingProbe()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reading recordings")
         self.writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writing recordings")
-        self._queued: dict[str, os.stat_result] = {}
+        self._queued: set[tuple[str, int, int]] = set()  # name, size and time of the files that wait to be read
 
     def list_recordings(self) -> list[Recording]:
         """All recordings, most recent first. Files without valid metadata are read in the background."""
+        recordings = []
         with self._lock:
-            recordings = [self._recording(name, status) for name, status in self._files()]
+            for path in self.folder.glob(f"*{ENDING}"):
+                with suppress(NotFound):  # not a regular file, or deleted meanwhile
+                    recordings.append(self.get(path.name))
         return sorted(recordings, key=lambda recording: (-recording.modified, recording.name))
 
     def get(self, name: str) -> Recording:
-        """Raises NotFound."""
+        """The recording; a file without valid metadata is read in the background. Raises NotFound."""
         path = self.path(name)
         with self._lock, suppress(FileNotFoundError):
-            return self._recording(path.name, path.lstat())
+            status = path.lstat()
+            stamp = _stamp(status)
+            record = self._records.get(self._record_path(path.name))
+            info = None if record is None or (record.bytes, record.modified) != stamp else record.info
+            if info is None and (path.name, *stamp) not in self._queued:
+                self._queued.add((path.name, *stamp))
+                self._reader.submit(self._read_metadata, path, stamp)
+            return Recording(path.name, status.st_size, status.st_mtime, info)
         return _not_found(name)
 
     def path(self, name: str) -> Path:
         """Path of an existing regular file; links are not followed. Raises NotFound."""
         path = self.folder / (name.removesuffix(ENDING) + ENDING)
-        with suppress(OSError):
+        with suppress(FileNotFoundError, NotADirectoryError):
             if "/" not in name and _is_listed(path.name) and stat.S_ISREG(path.lstat().st_mode):
                 return path
         return _not_found(name)
@@ -121,7 +131,7 @@ class RecordingFolder:
     def publish(self, part: Path, path: Path, info: RecordingInfo) -> None:
         """Move a complete file to its path. Its metadata is written first, so that no process reads the file for it."""
         with self._lock:
-            self._store(path.name, part.lstat(), info)
+            self._store(path.name, _stamp(part.lstat()), info)
             os.rename(part, path)
 
     def add(self, part: Path, name: str, info: RecordingInfo) -> Recording:
@@ -163,37 +173,22 @@ class RecordingFolder:
         for executor in (self._reader, self.writer):
             executor.shutdown(wait=True, cancel_futures=True)
 
-    def _files(self) -> Iterator[tuple[str, os.stat_result]]:
-        """Names and states of all regular files."""
-        for path in self.folder.glob(f"*{ENDING}"):
-            with suppress(FileNotFoundError):  # deleted meanwhile
-                if _is_listed(path.name) and stat.S_ISREG((status := path.lstat()).st_mode):
-                    yield path.name, status
-
-    def _recording(self, name: str, status: os.stat_result) -> Recording:
-        record = self._records.get(self._record_path(name))
-        info = None if record is None or (record.bytes, record.modified) != _stamp(status) else record.info
-        if info is None and (name not in self._queued or _stamp(self._queued[name]) != _stamp(status)):
-            self._queued[name] = status
-            self._reader.submit(self._read_metadata, name, status)
-        return Recording(name, status.st_size, status.st_mtime, info)
-
     def _record_path(self, name: str) -> Path:
         return self.folder / ".about" / f"{name}.json"
 
-    def _store(self, name: str, status: os.stat_result, info: RecordingInfo) -> None:
-        self._records.put(self._record_path(name), Record(*_stamp(status), info))
+    def _store(self, name: str, stamp: tuple[int, int], info: RecordingInfo) -> None:
+        self._records.put(self._record_path(name), Record(*stamp, info))
 
-    def _read_metadata(self, name: str, status: os.stat_result) -> None:
+    def _read_metadata(self, path: Path, stamp: tuple[int, int]) -> None:
         try:
             with suppress(OSError, CancelledError):
-                info = self._probe(self.folder / name)
+                info = self._probe(path)
                 with self._lock:
-                    if _stamp((self.folder / name).lstat()) == _stamp(status):
-                        self._store(name, status, info)
+                    if _stamp(path.lstat()) == stamp:
+                        self._store(path.name, stamp, info)
         finally:
             with self._lock:
-                self._queued.pop(name, None)
+                self._queued.remove((path.name, *stamp))
 
 
 def checked(name: str) -> str:
