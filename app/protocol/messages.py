@@ -2,7 +2,8 @@
 
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, NonNegativeInt, TypeAdapter
+from pydantic_core.core_schema import no_info_after_validator_function, str_schema
 
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.inspect.maps.likelihood_map import MapOptions, Quantity
@@ -19,16 +20,11 @@ Viewpoint = Literal["first", "above", "camera"]
 """Initial viewpoint, above the belief, and facing the camera."""
 
 
-def _parse_faults(value: Any) -> Any:
-    if isinstance(value, Faults):
-        return value
-    if not isinstance(value, str):
-        raise ValueError("Input should be a valid string")
-    return Faults.parse(value)
+FROM_TEXT = GetPydanticSchema(lambda *_: no_info_after_validator_function(Faults.parse, str_schema()))
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
 
 class Cursor(_Message):
@@ -51,7 +47,7 @@ class Cursor(_Message):
     step: NonNegativeInt
     angle: Annotated[float, Field(ge=-MAX_ANGLE, le=MAX_ANGLE)] | None = None
     size: Literal[41, 135] = 41  # ``COARSE`` while the cursor moves, ``FINE`` when it rests
-    faults: Annotated[Faults, BeforeValidator(_parse_faults)] = NO_FAULTS
+    faults: Annotated[Faults, FROM_TEXT] = NO_FAULTS
     scene: bool = True
     data: str = ""
     against: str = ""
