@@ -55,11 +55,11 @@ class Settings:
             "workspace": str(self.workspace),
             **{name: {key: str(path) for key, path in getattr(self, name).items()} for name in FOLDERS},
             "checkpoints": {
-                name: {"source": filter_.source, "task": task_to_json(filter_.task)}
+                name: {"source": source, "task": task_to_json(filter_.task)}
                 if isinstance(filter_, ExternalFilter)
-                else str(filter_.path if isinstance(filter_, Checkpoint) else filter_)
+                else source
                 for name, filter_ in self.checkpoints.items()
-                if runs_in_processes(filter_)
+                if (source := origin(filter_)) is not None
             },
             "tasks": list(self.tasks),
             "particles": self.particles,
@@ -70,26 +70,20 @@ class Settings:
     def from_json(cls, values: Mapping[str, Any]) -> Settings:
         """Inverse of ``to_json``. Loads the user-defined tasks and the external filters."""
         given = [load_task(task) for task in values["tasks"]]
-
-        def external(filter_: Mapping[str, Any]) -> ExternalFilter:
-            return load_external(filter_["source"], stored_task(filter_["task"], given))
-
-        folders: Any = {name: {key: Path(path) for key, path in values[name].items()} for name in FOLDERS}
-        return cls(
-            Path(values["workspace"]),
-            checkpoints={
-                name: Path(filter_) if isinstance(filter_, str) else external(filter_)
-                for name, filter_ in values["checkpoints"].items()
-            },
-            **folders,
-            particles=values["particles"],
-            seed=values["seed"],
-            tasks=tuple(values["tasks"]),
-        )
+        read: dict[str, Any] = {name: {key: Path(path) for key, path in values[name].items()} for name in FOLDERS}
+        checkpoints = {
+            name: Path(filter_)
+            if isinstance(filter_, str)
+            else load_external(filter_["source"], stored_task(filter_["task"], given))
+            for name, filter_ in values["checkpoints"].items()
+        }
+        read |= {"workspace": Path(values["workspace"]), "checkpoints": checkpoints, "tasks": tuple(values["tasks"])}
+        return cls(**{**values, **read})
 
 
-def runs_in_processes(filter_: Path | Checkpoint) -> bool:
-    """Whether other processes can load a filter: it is in a file, or an external one given by its build function."""
+def origin(filter_: Path | Checkpoint) -> str | None:
+    """Checkpoint file or build function from which other processes can load a filter; None for one without either."""
     if isinstance(filter_, ExternalFilter):
-        return is_code(filter_.source)
-    return isinstance(filter_, Path) or filter_.path is not None
+        return filter_.source if is_code(filter_.source) else None
+    path = filter_.path if isinstance(filter_, Checkpoint) else filter_
+    return None if path is None else str(path)

@@ -20,7 +20,7 @@ from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns, resolve_filter
 from beliefscope.app.runs.result_filters import candidates
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.settings import Settings, runs_in_processes
+from beliefscope.app.runs.settings import Settings, origin
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.workspace.healthy_records import record_path
@@ -33,7 +33,6 @@ from beliefscope.datasets.initial_view import initial_view
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference, task_to_json
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.standalone import check_standalone
 from beliefscope.inspect.stored_runs import StoredRuns
 from beliefscope.inspect.trace import Trace, load_trace
@@ -308,7 +307,7 @@ class TraceStore:
         try:
             request = self._run_request(selection, run.checkpoint)
             # The first run is complete in this process before the worker has started.
-            if self._worker is not None and self._worker.started and runs_in_processes(run.checkpoint):
+            if self._worker is not None and self._worker.started and origin(run.checkpoint) is not None:
                 result = _run_in_worker(self._worker, request, progress)
             else:
                 episode = self._episode(selection)
@@ -324,12 +323,11 @@ class TraceStore:
         with self._lock:
             live = selection.data.startswith(LIVE_PREFIX)
             data = self.live.path(selection.data) if live else self.dataset(selection.task, selection.data)[1].path
-            source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else str(checkpoint.path)
             original = str(self._trace_file(replace(selection, intervention=None, only="")))
             return RunRequest(
                 **vars(selection),
                 definition=json.dumps(task_to_json(checkpoint.task)),
-                checkpoint=source,
+                checkpoint=origin(checkpoint) or "",
                 external=checkpoint.path is None,
                 path=str(data),
                 original=original,
