@@ -17,9 +17,6 @@ HASH_DIGITS = 8
 
 NAME = re.compile(rf"(.+)-([0-9a-f]{{{HASH_DIGITS}}})", re.DOTALL)
 
-Candidate = tuple[str, Callable[[], Checkpoint]]
-"""Where a checkpoint is stored, such as ``sweep 'lr'``, and the function that loads it, which may raise BadInput."""
-
 
 def all_studies(folders: Mapping[str, Path], workspace: Path) -> list[Study]:
     """The studies given to the server by name, those in the workspace, and the built-in one."""
@@ -38,8 +35,29 @@ def result_filter_name(name: str, hash_: str) -> str:
     return f"{name}-{hash_[:HASH_DIGITS]}"
 
 
-def candidates(task: str, name: str, settings: Settings) -> Iterator[Candidate]:
-    """The checkpoints of the server's sweeps and studies with a name from ``result_filter_name``."""
+def find_result_filter(task: str, name: str, settings: Settings) -> Checkpoint | None:
+    """The checkpoint of the server's sweeps and studies with a name from ``result_filter_name``; None if none has it.
+
+    Raises BadInput if its file is missing or was changed after its evaluation.
+    """
+    problems = []
+    for source, find, hash_ in _candidates(task, name, settings):
+        try:
+            path = find()
+            loaded = load_checkpoint(path, settings.definitions)
+            if loaded.hash == hash_:
+                return loaded
+            problem = f"checkpoint {str(path)!r} was changed after its evaluation, from {hash_[:12]}"
+        except BadInput as error:
+            problem = str(error)
+        problems.append(f"filter {name!r} of {source}: {problem}")
+    if problems:
+        raise BadInput(problems[0])
+    return None
+
+
+def _candidates(task: str, name: str, settings: Settings) -> Iterator[tuple[str, Callable[[], Path], str]]:
+    """Source, such as ``sweep 'lr'``, function that finds the file or raises BadInput, and hash of each checkpoint."""
     if (match := NAME.fullmatch(name)) is None:
         return
     for sweep, folder in sweep_folders(settings).items():
@@ -49,19 +67,10 @@ def candidates(task: str, name: str, settings: Settings) -> Iterator[Candidate]:
             tables = Experiments([folder])
             query = "SELECT checkpoint FROM checkpoints WHERE task = ? AND name = ? AND starts_with(checkpoint, ?)"
             for row in tables.query(query, [task, *match.groups()]).to_pylist():
-                find = partial(tables.path, "checkpoints", "checkpoint", row["checkpoint"])
-                yield f"sweep {sweep!r}", partial(_load, find, row["checkpoint"], settings)
+                hash_ = row["checkpoint"]
+                yield f"sweep {sweep!r}", partial(tables.path, "checkpoints", "checkpoint", hash_), hash_
     for study in all_studies(settings.studies, settings.workspace):
         with suppress(BadInput):  # damaged results; the list of studies reports them
             for cell, hash_ in study.read().checkpoints.items() if study.has_checkpoints else ():
                 if cell.startswith(f"{task}/") and result_filter_name(cell, hash_) == name:
-                    yield f"study {study.name!r}", partial(_load, partial(study.checkpoint, cell), hash_, settings)
-
-
-def _load(find: Callable[[], Path], hash_: str, settings: Settings) -> Checkpoint:
-    """Load a file. Raises BadInput if it is missing or was changed."""
-    path = find()
-    loaded = load_checkpoint(path, settings.definitions)
-    if loaded.hash != hash_:
-        raise BadInput(f"checkpoint {str(path)!r} was changed after its evaluation, from {hash_[:12]}")
-    return loaded
+                    yield f"study {study.name!r}", partial(study.checkpoint, cell), hash_

@@ -9,7 +9,7 @@ from typing import Any, Self
 from urllib.parse import parse_qsl
 
 from beliefscope.app.protocol.permalinks import page_link
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.inspect.traces.replay import Intervention
 
@@ -80,10 +80,7 @@ class Selection:
                 raise BadInput(f"comparison run {text!r}: only= names one modality, without other parts")
             return replace(self, only=parts["only"])
         for key in parts:
-            if key not in ("filter", "faults"):
-                raise unknown_name(
-                    "part of the comparison run", key, ("filter", "faults", "only", "from", "to", "weights")
-                )
+            check_name("part of the comparison run", key, ("filter", "faults", "only", "from", "to", "weights"))
         faults = Faults.parse(parts["faults"]) if "faults" in parts else self.faults
         other = replace(self, filter=parts.get("filter", self.filter), faults=faults)
         if other == self:

@@ -18,7 +18,7 @@ from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
 from beliefscope.app.runs.examples import EXAMPLES, Example, available
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns, resolve_filter
-from beliefscope.app.runs.result_filters import candidates
+from beliefscope.app.runs.result_filters import find_result_filter
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings, origin
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
@@ -250,15 +250,10 @@ class TraceStore:
         catalog = self._catalog(task)
         if name in (filters := catalog.filters):
             return filters[name]
-        problems = []
-        for source, load in candidates(task, name, self.settings):
-            try:
-                return catalog.opened.setdefault(name, load())
-            except BadInput as error:
-                problems.append(f"filter {name!r} of {source}: {error}")
-        if problems:
-            raise BadInput(problems[0])
-        return None
+        found = find_result_filter(task, name, self.settings)
+        if found is not None:
+            catalog.opened[name] = found
+        return found
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
         """The recorded live run, if the selection is exactly that run."""

@@ -65,7 +65,10 @@ class Trash:
         """The files in the trash, most recent first. Deletes expired ones."""
         files = []
         with self._lock:
-            for id in self._ids():
+            ids: list[str] = []
+            with suppress(FileNotFoundError):
+                ids = [entry.name for entry in self._folder.iterdir() if ID.fullmatch(entry.name)]
+            for id in ids:
                 deleted, path = int(id.partition("-")[0], 16) / 1e3, self._path(id)
                 if path is None or deleted < time.time() - RETENTION_DAYS * 86400:
                     self._delete(id)
@@ -75,16 +78,11 @@ class Trash:
 
     def empty(self) -> int:
         """Delete all files permanently; return their size in bytes."""
-        freed = sum(file.bytes for file in self.list_deleted())
+        files = self.list_deleted()
         with self._lock:
-            for id in self._ids():
-                self._delete(id)
-        return freed
-
-    def _ids(self) -> list[str]:
-        with suppress(FileNotFoundError):
-            return [entry.name for entry in os.scandir(self._folder) if ID.fullmatch(entry.name)]
-        return []
+            for file in files:
+                self._delete(file.id)
+        return sum(file.bytes for file in files)
 
     def _path(self, id: str) -> Path | None:
         with suppress(OSError):
