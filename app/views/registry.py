@@ -6,7 +6,7 @@ import time
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.views.memory import release_memory
-from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
+from beliefscope.app.views.scheduler import DeadlineExecutor
 from beliefscope.app.views.view_socket import View
 from beliefscope.datasets.errors import BadInput
 
@@ -21,7 +21,7 @@ class Views:
     def __init__(self, store: TraceStore, limit: int = 32, timeout: float = 30.0) -> None:
         self._store = store
         self._executor = DeadlineExecutor()
-        self._scene_lock = FairLock()
+        self._scene_lock = asyncio.Lock()
         self._limit = limit
         self._timeout = timeout
         self._views: dict[str, View] = {}

@@ -1,9 +1,10 @@
 """Scheduling of short computations for many clients on a few threads."""
 
 import asyncio
+import contextlib
 import os
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import AsyncIterator, Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -82,21 +83,16 @@ class DeadlineExecutor:
         self._start_tasks()
 
 
-class FairLock:
-    """Asynchronous lock that is granted in order of arrival and stays locked for a pause after each use.
+@contextlib.asynccontextmanager
+async def held_with_pause(lock: asyncio.Lock, pause: float = 2.0, max_pause: float = 0.1) -> AsyncIterator[None]:
+    """Hold a lock during the block; it then stays locked for a pause, before the next one in order of arrival has it.
 
     pause: in s for each s that the lock was held. max_pause: in s.
     """
-
-    def __init__(self, pause: float = 2.0, max_pause: float = 0.1) -> None:
-        self._pause, self._max_pause = pause, max_pause
-        self._lock = asyncio.Lock()
-        self._acquired = 0.0
-
-    async def __aenter__(self) -> None:
-        await self._lock.acquire()
-        self._acquired = time.monotonic()
-
-    async def __aexit__(self, *_: object) -> None:
-        pause = min(self._pause * (time.monotonic() - self._acquired), self._max_pause)
-        asyncio.get_running_loop().call_later(pause, self._lock.release)
+    await lock.acquire()
+    acquired = time.monotonic()
+    try:
+        yield
+    finally:
+        held = time.monotonic() - acquired
+        asyncio.get_running_loop().call_later(min(pause * held, max_pause), lock.release)

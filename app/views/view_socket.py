@@ -25,7 +25,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.scene import Scene
-from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
+from beliefscope.app.views.scheduler import DeadlineExecutor, held_with_pause
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.inspect.maps.map_engine import COARSE, FINE
@@ -47,7 +47,7 @@ class View:
     name: random part of its addresses. idle_since: monotonic time at which its page disconnected; None while connected.
     """
 
-    def __init__(self, store: TraceStore, executor: DeadlineExecutor, scene_lock: FairLock, dark: bool) -> None:
+    def __init__(self, store: TraceStore, executor: DeadlineExecutor, scene_lock: asyncio.Lock, dark: bool) -> None:
         """Start the scene's server, which blocks for about 50 ms. scene_lock: held while a scene is drawn."""
         self.name = secrets.token_urlsafe(12)
         self.scene = Scene(dark)
@@ -152,7 +152,7 @@ class View:
             if self._scene_update is None:
                 continue
             async with self._errors_sent(websocket, self._scene_update[0].serial):
-                async with self._scene_lock:
+                async with held_with_pause(self._scene_lock):
                     update, self._scene_update = self._scene_update, None  # may have been replaced by a newer one
                     if update is None:
                         continue

@@ -28,7 +28,7 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
-from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
+from beliefscope.app.views.scheduler import DeadlineExecutor, held_with_pause
 from beliefscope.app.views.view_socket import PREFETCH_STEPS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
@@ -257,12 +257,12 @@ def test_executor_runs_earliest_deadline_first_and_resources_exclusively() -> No
     assert asyncio.run(scenario()) == (["coarse", "scene", "fine"], 1)
 
 
-def test_fair_lock_pauses_after_each_holder() -> None:
+def test_a_lock_pauses_after_each_holder() -> None:
     async def scenario() -> list[tuple[str, float]]:
-        lock, events = FairLock(pause=2.0, max_pause=60.0), []
+        lock, events = asyncio.Lock(), []
 
         async def hold(name: str) -> None:
-            async with lock:
+            async with held_with_pause(lock, pause=2.0, max_pause=60.0):
                 events.append((name, time.monotonic()))
                 await asyncio.sleep(0.02)
                 events.append((name, time.monotonic()))
