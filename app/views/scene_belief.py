@@ -19,6 +19,7 @@ from beliefscope.app.views.scene_context import (
     ForceArrow,
     RobotScene,
     add_grid,
+    add_lines,
 )
 from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.simulation.replay import replay
@@ -256,8 +257,3 @@ class ComparisonEstimate:
     def remove(self) -> None:
         """Remove all nodes from the scene."""
         self._root.remove()
-
-
-def add_lines(server: ViserServer, path: str, lines: Array, color: RGB) -> None:
-    """Add line segments (N, 2, 3) in m, 2 pixels thick."""
-    server.scene.add_line_segments(path, lines.astype(np.float32), color, thickness=2.0, thickness_units="screen")

@@ -19,6 +19,7 @@ from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
 from beliefscope.inspect.figures.scene_shapes import (
     DISC,
     FAN,
+    RGB,
     Array,
     ColoredMesh,
     body_meshes,
@@ -65,7 +66,8 @@ class FloorMap:
 
     def __init__(self, server: ViserServer, trace: Trace, heights: Mapping[str, float]) -> None:
         """heights: z in m for each choice of ``SceneLayers.height``."""
-        self._trace, self._heights = trace, heights
+        self._heights = heights
+        self._colors = {layer: rgb(layer, trace) for layer in (*trace.modalities, "fused")}
         self._displayed: tuple[LikelihoodMap, SceneLayers] | None = None
         self._image: Any = server.scene.add_image(
             "/map", np.zeros((1, 1, 3), np.uint8), 0.1, 0.1, format="png", receive_shadow=False, visible=False
@@ -81,7 +83,7 @@ class FloorMap:
         self._displayed = maps, layers
         layer = maps.layers.index(layers.ground) if layers.ground in maps.layers else len(maps.layers) - 1
         pixels = map_pixels(maps, layer, layers.colours, layers.scale == "log", layers.range == "same")
-        cells = framed(pixels, rgb(maps.layers[layer], self._trace))
+        cells = framed(pixels, self._colors[maps.layers[layer]])
         # viser's images have their top row at the smallest y, as maps have.
         set_png(self._image, "_data", cells)
         self._image.render_width = self._image.render_height = len(cells) * float(maps.offsets_x[1] - maps.offsets_x[0])
@@ -196,9 +198,7 @@ class RobotScene:
             )
             if movable[part.body]:
                 self._movable.append((mesh, part))
-        server.scene.add_line_segments(
-            "/floor", FLOOR_LINES, GRAY, thickness=1.0, thickness_units="screen", position=(*FLOOR_CENTRE, 0.0)
-        )
+        add_lines(server, "/floor", FLOOR_LINES + (*FLOOR_CENTRE, 0.0), GRAY, thickness=1.0)
         # The renderer's own shadows need the slow material and halve the frame rate again.
         self._shadows = SoftShadows(parts, FLOOR_CENTRE, FLOOR_HALF_WIDTH)
         self._shadow_image: Any = server.scene.add_image(
@@ -242,11 +242,16 @@ class RobotScene:
             mesh.color = tuple(max(TRANSLUCENT_GRAY, channel) for channel in part.color) if translucent else part.color
 
 
+def add_lines(server: ViserServer, path: str, lines: Array, color: RGB, thickness: float = 2.0) -> None:
+    """Add line segments (N, 2, 3) in m. thickness: pixels."""
+    server.scene.add_line_segments(path, lines.astype(np.float32), color, thickness=thickness, thickness_units="screen")
+
+
 def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:
     """For tasks without replay: a grid under the belief and the axes of the two map components."""
     floor = grid(task, trace)
     for path, lines, thickness in (("/plane", floor.lines, 1.0), ("/plane/axes", floor.axes, 3.0)):
-        server.scene.add_line_segments(path, lines, GRAY, thickness=thickness, thickness_units="screen")
+        add_lines(server, path, lines, GRAY, thickness)
     unit, factor = task.main_error.conversion
     for name, axis, edge in zip(task.map_components, floor.axes, floor.high, strict=True):
         text = f"{display_name(name)} {round(factor * edge, 6):g} {unit}"
