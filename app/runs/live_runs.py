@@ -105,10 +105,6 @@ class LiveRuns:
         run.poll()
         return run
 
-    def path(self, data: str) -> Path:
-        """The file of a data set ``live:NAME``."""
-        return self.folder / f"{data.removeprefix(LIVE_PREFIX)}{SUFFIX}"
-
     def newest(self) -> list[str]:
         """Names of the runs, most recent first. Closes runs whose files were deleted."""
         times: dict[str, float] = {}

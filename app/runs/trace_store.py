@@ -316,15 +316,15 @@ class TraceStore:
 
     def _run_request(self, selection: Selection, checkpoint: Checkpoint) -> RunRequest:
         with self._lock:
-            live = selection.data.startswith(LIVE_PREFIX)
-            data = self.live.path(selection.data) if live else self.dataset(selection.task, selection.data)[1].path
+            data, live = selection.data, selection.data.startswith(LIVE_PREFIX)
+            source = self.live.ended_run(data).reader if live else self._catalog(selection.task).dataset(data)
             original = str(self._trace_file(replace(selection, intervention=None, only="")))
             return RunRequest(
                 **vars(selection),
                 definition=json.dumps(task_to_json(checkpoint.task)),
                 checkpoint=origin(checkpoint) or "",
                 external=checkpoint.path is None,
-                path=str(data),
+                path=str(source.path),
                 original=original,
                 output=str(self._trace_file(selection)),
                 seed=self.settings.seed,
