@@ -34,32 +34,8 @@ POLE_RADIUS = 0.005  # m
 FLOOR_MAP_HEIGHT = 0.003  # m above the floor
 NEAR, FAR = 0.01, 1000.0  # m, smallest and largest distance that is drawn, viser's defaults
 AMBIENT_LIGHT = 1.0  # intensity, in place of the environment map
+FLAT = (1.0, 1.0, 0.0)  # factors that project a point to the floor
 EDGE_OFFSET = 0.002  # m from the surfaces of an object to the edges of its outline
-
-
-class Pole:
-    """A pole at an estimate, with or without a label."""
-
-    def __init__(self, server: ViserServer, path: str, text: str, height: float, radius: float, color: RGB) -> None:
-        """text: of the label; without a label if empty."""
-        self._height = height
-        self._pole = server.scene.add_cylinder(f"{path}/pole", radius, height, color=color, **SHADING)
-        self._label: Any = None
-        if text:
-            self._label = server.scene.add_label(f"{path}/label", text, anchor="bottom-center", **SMALL_LABEL)
-
-    def move(self, anchor: Array) -> None:
-        """Place the pole below and above an anchor (3,)."""
-        foot = np.array([*anchor[:2], 0.0])
-        self._pole.position = foot + self._height / 2.0 * UP
-        if self._label is not None:
-            self._label.position = foot + self._height * UP
-
-    def hide(self) -> None:
-        """Hide the pole and its label."""
-        self._pole.visible = False
-        if self._label is not None:
-            self._label.visible = False
 
 
 class BeliefScene:
@@ -102,13 +78,11 @@ class BeliefScene:
             add_grid(server, self._task, trace)
         available = set(run.header["scene"])
         poles = self._belief.names if "estimates" in available else ()
-        self._poles = [self._add_pole(i, name) for i, name in enumerate(poles)]
+        self._pole_frames = [self._add_pole(i, name) for i, name in enumerate(poles)]
         self._outline_frames = [] if self._belief.outline is None else self._add_outlines(self._belief.outline)
         self._add_layers(available)
         if np.isnan(trace.episode.states).any():  # unknown true state
-            for pole in self._poles[:1]:
-                pole.hide()
-            for frame in self._outline_frames[:1]:
+            for frame in (*self._pole_frames[:1], *self._outline_frames[:1]):
                 frame.visible = False
         self.set_layers(layers)
         self.viewpoints = self._belief.viewpoints(self._replay)
@@ -143,8 +117,8 @@ class BeliefScene:
         belief = self._belief
         if self._robot is not None and self._replay is not None:
             self._robot.move(self._replay.positions[step], self._replay.rotations[step])
-        for i, pole in enumerate(self._poles):
-            pole.move(belief.anchors[step, i])
+        for i, frame in enumerate(self._pole_frames):
+            frame.position = belief.anchors[step, i] * FLAT
         if self._discs is not None:
             pose = belief.discs(step)
             self._discs.batched_positions, self._discs.batched_wxyzs, self._discs.batched_scales = pose
@@ -186,11 +160,11 @@ class BeliefScene:
         if "camera" in available:
             self._camera = CameraView(self._server, self._task, self._trace)
 
-    def _add_pole(self, index: int, name: str) -> Pole:
+    def _add_pole(self, index: int, name: str) -> Any:
         text = "estimate" if name == "fused" and len(self._trace.modalities) < 2 else layer_label(name)
         text = text if self._labels else ""
         color, height = rgb(name, self._trace), self._belief.pole_height(index)
-        return Pole(self._server, f"/estimates/{name}", text, height, POLE_RADIUS * self._belief.scale, color)
+        return add_pole(self._server, f"/estimates/{name}", text, height, POLE_RADIUS * self._belief.scale, color)
 
     def _add_discs(self) -> Any:
         """Contours as discs: instances of one mesh, because viser recompiles lines whose points change."""
@@ -228,6 +202,15 @@ class BeliefScene:
         return frames
 
 
+def add_pole(server: ViserServer, path: str, text: str, height: float, radius: float, color: RGB) -> Any:
+    """A frame on the floor with a pole of a height in m, and a label on its top unless the text is empty."""
+    frame = server.scene.add_frame(path, show_axes=False)
+    server.scene.add_cylinder(f"{path}/pole", radius, height, color=color, position=height / 2.0 * UP, **SHADING)
+    if text:
+        server.scene.add_label(f"{path}/label", text, anchor="bottom-center", position=height * UP, **SMALL_LABEL)
+    return frame
+
+
 def drawn_distances(viewpoints: Iterable[tuple[Array, Array]]) -> tuple[float, float]:
     """Smallest and largest distance from the eye that are drawn, m: more than the defaults in a scene of kilometres."""
     factor = max(1.0, *(3.0 * float(np.linalg.norm(eye - target)) / FAR for eye, target in viewpoints))
@@ -242,7 +225,7 @@ class ComparisonEstimate:
         self._anchors, self._outline = belief.anchors[:, 1], belief.outline
         self._root = server.scene.add_frame("/other", show_axes=False)
         height = float(self._anchors[0, 2]) + belief.above  # below the labels of the selected run
-        self._pole = Pole(server, "/other", "comparison run", height, POLE_RADIUS / 2, color)
+        self._pole: Any = add_pole(server, "/other/pole", "comparison run", height, POLE_RADIUS / 2, color)
         self._frame: Any = server.scene.add_frame("/other/outline", show_axes=False)
         if self._outline is not None:
             size = np.asarray(self._outline.size) + 4.0 * EDGE_OFFSET
@@ -250,7 +233,7 @@ class ComparisonEstimate:
 
     def move(self, step: int) -> None:
         """Move all nodes to their poses at a step."""
-        self._pole.move(self._anchors[step])
+        self._pole.position = self._anchors[step] * FLAT
         if self._outline is not None:
             self._frame.position, self._frame.wxyz = self._outline.position[step, 1], self._outline.wxyz[step, 1]
 

@@ -139,12 +139,13 @@ class ForceArrow:
     def __init__(self, server: ViserServer, trace: Trace) -> None:
         self.set_trace(trace)
         color = rgb("contact", trace)
+        self._root: Any = server.scene.add_frame("/force/contact", show_axes=False, visible=False)
         self._arrow: Any = server.scene.add_arrows(
-            "/force/arrow", np.zeros((1, 2, 3), np.float32), color, shaft_radius=0.006, head_radius=0.016, visible=False
+            "/force/contact/arrow", np.zeros((1, 2, 3), np.float32), color, shaft_radius=0.006, head_radius=0.016
         )
         # Seen from the side, the discs are rings around the shaft.
         self._rings: Any = server.scene.add_batched_meshes_simple(
-            "/force/rings",
+            "/force/contact/rings",
             DISC,
             FAN,
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (MAX_RINGS, 1)),
@@ -153,12 +154,9 @@ class ForceArrow:
             batched_colors=np.array(color, np.uint8) // 2,
             side="double",
             lod="off",
-            visible=False,
             **SHADING,
         )
-        self._label: Any = server.scene.add_label(
-            "/force/label", "", anchor="bottom-center", visible=False, **SMALL_LABEL
-        )
+        self._label: Any = server.scene.add_label("/force/contact/label", "", anchor="bottom-center", **SMALL_LABEL)
 
     def set_trace(self, trace: Trace) -> None:
         """Use the forces of this trace in ``show``."""
@@ -167,8 +165,7 @@ class ForceArrow:
     def show(self, step: int) -> None:
         """Show the force of a step, if it is in contact."""
         drawn = self._force.at(step)
-        for part in (self._arrow, self._rings, self._label):
-            part.visible = drawn is not None
+        self._root.visible = drawn is not None
         if drawn is None:
             return
         self._arrow.points, self._arrow.head_length = drawn.arrow[None].astype(np.float32), drawn.head_length
@@ -198,7 +195,7 @@ class RobotScene:
             )
             if movable[part.body]:
                 self._movable.append((mesh, part))
-        add_lines(server, "/floor", FLOOR_LINES + (*FLOOR_CENTRE, 0.0), GRAY, thickness=1.0)
+        add_lines(server, "/floor", FLOOR_LINES + np.array([*FLOOR_CENTRE, 0.0]), GRAY, thickness=1.0)
         # The renderer's own shadows need the slow material and halve the frame rate again.
         self._shadows = SoftShadows(parts, FLOOR_CENTRE, FLOOR_HALF_WIDTH)
         self._shadow_image: Any = server.scene.add_image(
