@@ -11,7 +11,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.diagnostics.views import Curve, Table, Value, known
+from beliefscope.inspect.diagnostics.views import Curve, Table, Value, known_number
 from beliefscope.inspect.statistics.measures import (
     Array,
     covariances,
@@ -166,7 +166,7 @@ class Counterfactual(Diagnostic):
             (
                 name,
                 *(main.factor * e[span].mean() for e in (self.error, self.counterfactual_error, self.distance)),
-                known(self.divergence[span].mean()),
+                known_number(self.divergence[span].mean()),
             )
             for name, span in spans.items()
             if len(self.error[span])

@@ -17,7 +17,7 @@ from beliefscope.datasets.task import Task, with_unit
 from beliefscope.datasets.text import capitalised, plural
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.diagnostics.views import Curve, Table, Value, known
+from beliefscope.inspect.diagnostics.views import Curve, Table, Value, known_number
 from beliefscope.inspect.statistics.measures import (
     Array,
     blackout,
@@ -294,7 +294,7 @@ def _row(label: str, measure: str, both: Array, relative: bool = False) -> tuple
     """Both values, their difference and, if ``relative``, the difference in % of the first."""
     first, second = (float(value) for value in both)
     change = 100.0 * (second - first) / first if relative and first else math.nan
-    return (label, measure, *map(known, (first, second, second - first, change)))
+    return (label, measure, *map(known_number, (first, second, second - first, change)))
 
 
 def _change(share: float) -> str:

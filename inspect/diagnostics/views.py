@@ -168,7 +168,7 @@ class Views(ABC):
         return {"verdict": self.verdict, **{name: as_json(getattr(self, name)()) for name in VIEWS}}
 
 
-def known(value: float) -> float | None:
+def known_number(value: float) -> float | None:
     """A number; None for one that is not finite."""
     return value if math.isfinite(value) else None
 

@@ -144,7 +144,7 @@ def weight_correlations(traces: Sequence[Trace], step_values: Sequence[dict[str,
     names = [name for name in ("beta", "effective_weights", "oracle") if name in step_values[0]]
     task, modalities = traces[0].task, traces[0].modalities
     width = step_values[0]["oracle"].shape[-1]
-    columns = [c.name for c in task.components] if width == len(task.components) else [None]
+    columns: list[str | None] = [c.name for c in task.components] if width == len(task.components) else [None]
     labels = [
         (name, modality, column, other)
         for name in names

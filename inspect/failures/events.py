@@ -16,7 +16,7 @@ from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress
-from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
+from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value, known_number
 from beliefscope.inspect.failures.step_scores import RECENT, ROUNDING, Survey
 from beliefscope.inspect.failures.survey import (
     ScoredRuns,
@@ -208,7 +208,8 @@ class Failures(ScoredRuns):
         numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
         score = self.conversion[1] * event.score
         times = (event.time, event.first_time, event.last_time) if self.timed else ()
-        return (event.episode, event.step, event.first, event.last, *times, score, event.phase, *map(known, numbers))
+        steps = (event.episode, event.step, event.first, event.last, *times)
+        return (*steps, score, event.phase, *map(known_number, numbers))
 
     @property
     def _label(self) -> str:
