@@ -40,7 +40,7 @@ def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussia
 
 
 def powers_of_present(present: Tensor) -> Tensor:
-    """Powers (..., K) of the experts of a product: 1 for those in ``present`` (..., K) and 0 for others, or all 1 / K."""
+    """Powers (..., K) of the experts of a product: 1 if ``present`` (..., K), else 0; all 1 / K if none is."""
     return torch.where(present.any(-1, keepdim=True), present.float(), 1.0 / present.shape[-1])
 
 

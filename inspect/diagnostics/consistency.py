@@ -171,7 +171,7 @@ class Consistency(RunDiagnostic):
         """Roots of NEES / n and NIS / n: errors in predicted standard deviations, with 95 % bounds."""
         if not len(self.nees):
             return []
-        low, high = nees_bounds(len(self.task.components), 1)
+        low, high = nees_bounds(int(np.isfinite(self.entry(FUSED).rmse).sum()), 1)  # of the known components
         bounds = (math.sqrt(low), math.sqrt(high))
         title = "Error in predicted standard deviations (root of NEES/n)"
         charts: list[tuple[str, str, Array, tuple[str, ...], Callable[[str], str]]]
@@ -206,7 +206,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if not trace.has_covariance or not np.isfinite(trace.estimate_covariance).any():
         return f"filter {trace.filter} has no covariance to compare its errors with"
-    return None
+    return None if measures.known_components(trace) else measures.UNKNOWN_TRUTH
 
 
 def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> Consistency:
@@ -273,15 +273,14 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
 def _step_measures(trace: Trace) -> dict[str, Array]:
     """Measures by step and layer, (T, L, ...)."""
     task = trace.task
-    error, covariance = measures.errors(trace), measures.covariances(trace)
-    n = error.shape[-1]
-    nees = measures.nees(trace)
+    error, covariance, known = measures.errors(trace), measures.covariances(trace), measures.known_components(trace)
+    of_known, nees = measures.of_components(covariance, known), measures.nees(trace)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     nis = np.full(nees.shape, np.nan)
     if (values := nis_of(trace)) is not None:
         nis[:, :-1] = values
     if trace.log_likelihood is None or trace.prior_log_weights is None:
-        level = gaussian_level(n * nees, n)
+        level = gaussian_level(len(known) * nees, len(known))
         crps = gaussian_crps(error, np.sqrt(np.where(variance < 0.0, np.nan, variance)))
     else:
         assert trace.particles is not None
@@ -290,7 +289,7 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
         weights = np.exp(measures.particle_log_weights(trace))
         for k in range(error.shape[1]):  # one layer at a time limits memory to (T, M, n)
             from_mean = measures.wrapped(task, deviation - error[:, k, None])
-            level[:, k] = particle_level(from_mean, weights[:, k], error[:, k], covariance[:, k])
+            level[:, k] = particle_level(from_mean[..., known], weights[:, k], error[:, k, known], of_known[:, k])
             crps[:, k] = particle_crps(np.swapaxes(deviation, 1, 2), weights[:, k, None])
     beliefs = {"variance": variance, "nees": nees, "nis": nis, "nll": measures.nll(trace)}
     return {"error": error, **beliefs, "level": level, "crps": crps}
@@ -306,8 +305,9 @@ def _summarise(
     sums = np.bincount(index, steps["nees"])
     nees, levels = float(steps["nees"].mean()), (LEVEL, 1.0 - (1.0 - LEVEL) / cells)
     intervals = [(float(low), float(high)) for _, low, high in (mean_interval(sums, counts, each) for each in levels)]
+    rmse = np.sqrt(np.square(error).mean(0))
     if too_few(len(counts)):
-        lowest = [nees / nees_limit(error.shape[1], each) for each in levels]
+        lowest = [nees / nees_limit(int(np.isfinite(rmse).sum()), each) for each in levels]
         intervals = [(low, math.inf) if low > 1.0 else (math.nan, math.nan) for low in lowest]
     return LayerConsistency(
         layer=layer,
@@ -322,7 +322,7 @@ def _summarise(
         calibration=curve,
         miscalibration=float(np.abs(curve - LEVELS).mean()),
         nll=float(steps["nll"].mean()),
-        rmse=np.sqrt(np.square(error).mean(0)),
+        rmse=rmse,
         sharpness=np.sqrt(np.maximum(steps["variance"].mean(0), 0.0)),
         crps=steps["crps"].mean(0),
     )

@@ -175,7 +175,7 @@ class Errors(Diagnostic):
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
-    return None if _known_steps(trace).any() else "the true state is unknown"
+    return None if _known_steps(trace).any() else measures.UNKNOWN_TRUTH
 
 
 def _known_steps(trace: Trace) -> Mask:

@@ -18,7 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Array, Value
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.intervals import jackknife, mean_interval
+from beliefscope.inspect.statistics.intervals import correlation_interval, jackknife, mean_interval
 from beliefscope.inspect.statistics.oracle import simplex_minimum, squared_error
 from beliefscope.inspect.trace import Trace
 
@@ -84,13 +84,14 @@ def reasons_of(traces: Sequence[Trace], checkpoint: Checkpoint) -> tuple[Reason,
     return tuple(reasons)
 
 
-def _sensor_errors(trace: Trace) -> tuple[Array, Array]:
-    """Errors (T, K, n) of the virtual sensors, and the inverses of R (T, K, n, n), at counted steps."""
+def _sensor_errors(trace: Trace) -> tuple[Array, Array, measures.Mask]:
+    """Errors (T, K, n) of the virtual sensors, inverses of R (T, K, n, n), and (T, K) steps with a reading; counted."""
     assert trace.observation_mean is not None
     assert trace.observation_covariance is not None
     error = trace.task.difference(trace.observation_mean, trace.episode.states[:, None])
     keep = measures.counted(trace)
-    return error[keep], np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
+    precision = np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
+    return error[keep], precision, ~measures.without_reading(trace)[keep]
 
 
 def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
@@ -107,17 +108,17 @@ def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
     units, scale = measures.display_units(task)
     sensors = [_sensor_errors(trace) for trace in traces]
     weighted = []
-    for error, precision in sensors:
-        weight = np.einsum("tknn->tkn", precision)
+    for error, precision, has_reading in sensors:
+        weight = np.einsum("tknn->tkn", precision) * has_reading[..., None]
         weighted.append(np.stack([weight, weight * error, weight * error**2], axis=-1).sum(0))
     sums = np.stack(weighted)  # (R, K, n, 3)
     total = sums.sum(0)
     bias = total[..., 1] / total[..., 0]  # (K, n)
-    value, low, high = jackknife(sums, lambda s: s[..., 1] / np.sqrt(s[..., 0] * s[..., 2]))
-    informative = [(np.einsum("tknn->tkn", np.linalg.inv(p)) < spread).all(-1) for _, p in sensors]
+    value, low, high = correlation_interval(sums, lambda s: s[..., 1] / np.sqrt(s[..., 0] * s[..., 2]))
+    informative = [(np.einsum("tknn->tkn", np.linalg.inv(p)) < spread).all(-1) for _, p, _ in sensors]
     never = ~np.concatenate(informative).any(0)
-    used = [mask | never for mask in informative]
-    squares = [np.einsum("tki,tkij,tkj->tk", e - bias, p, e - bias, optimize=True) / e.shape[-1] for e, p in sensors]
+    used = [(mask | never) & has_reading for mask, (_, _, has_reading) in zip(informative, sensors, strict=True)]
+    squares = [np.einsum("tki,tkij,tkj->tk", e - bias, p, e - bias, optimize=True) / e.shape[-1] for e, p, _ in sensors]
     nees = np.stack([(value * mask).sum(0) for value, mask in zip(squares, used, strict=True)])
     counts = np.stack([mask.sum(0) for mask in used])
     reasons = []

@@ -152,6 +152,8 @@ class Comparison:
         """``No alarm`` or the largest alarms. One episode alone is no evidence of a fault and at most unusual."""
         if self.trajectories == 1 and 1.0 / (self.healthy_trajectories + 1) > SINGLE_SIGNIFICANCE:
             return "Too few episodes (1; at least 2 needed) to compare with the healthy record."
+        if not self.deviations:
+            return "Too few steps to compare with the healthy record."
         alarms = self.alarms
         record = f"the healthy record of {self.healthy_trajectories} episodes"
         if not alarms:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -48,7 +49,7 @@ class ParticleSteps:
             if likelihoods are not available.
         modes: (T,) number of modes of the posterior over the map components.
         farther: (T,) share of predicted weight that is farther from the mean than the true state (Mahalanobis); 0 if
-            the true state is outside of all particles.
+            the true state is outside of all particles, NaN where it is unknown.
         contact, blackout: (T,) phases.
     """
 
@@ -72,7 +73,7 @@ class PhaseParticles:
         effective, ancestors, largest: medians.
         smallest: smallest effective sample size.
         degenerate, resampled, several_modes, outside: share of steps with a degenerate set, with resampling, with
-            several modes, and with the true state outside of all particles.
+            several modes, and with the true state outside of all particles, NaN if it is unknown.
         evidence: (K,) mean.
     """
 
@@ -138,11 +139,11 @@ class ParticleHealth(Diagnostic):
         if phases:
             most = max(phases, key=lambda entry: entry.degenerate)
             parts.append(f"Degeneracy is most frequent in {most.phase}: {percent(most.degenerate, '.1f')} of steps.")
-        parts.append(
-            f"The true state is outside of all predicted particles in {percent(total.outside, '.1f')} of steps."
-            if total.outside
-            else "The true state is always covered by the predicted particles."
-        )
+        if total.outside > 0.0:
+            share = percent(total.outside, ".1f")
+            parts.append(f"The true state is outside of all predicted particles in {share} of steps.")
+        elif total.outside == 0.0:
+            parts.append("The true state is always covered by the predicted particles.")
         if total.several_modes:
             parts.append(f"The posterior is multimodal in {percent(total.several_modes, '.1f')} of steps.")
         return " ".join(parts)
@@ -238,8 +239,8 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
         prior = trace.prior_log_weights
         weights = np.full(trace.log_weights.shape, 1.0) if prior is None else np.exp(prior.astype(np.float64))
         farther = _farther(trace, weights / weights.sum(1, keepdims=True))
-        values["outside//all"] = float((farther[phases["all"]] < OUTSIDE).mean())
-    return values
+        values["outside//all"] = _outside(farther[phases["all"]])
+    return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
 def measure_steps(trace: Trace) -> ParticleSteps:
@@ -256,7 +257,9 @@ def measure_steps(trace: Trace) -> ParticleSteps:
         evidence = np.logaddexp.reduce(prior[:, None] + trace.log_likelihood, axis=-1)
     indices = np.arange(count)
     ancestors = np.broadcast_to(indices, (steps, count)) if trace.ancestors is None else trace.ancestors
-    points = trace.particles[..., list(task.map_indices)].astype(np.float64)
+    points = trace.task.near(trace.particles, trace.estimate_mean[:, None])[..., list(task.map_indices)].astype(
+        np.float64
+    )
     points = np.pad(points, ((0, 0), (0, 0), (0, 2 - points.shape[-1])))  # a map of one component has no second
     return ParticleSteps(
         effective=1.0 / np.square(weights).sum(1),
@@ -306,15 +309,23 @@ def _regions(density: Array, height: float) -> NDArray[np.int64]:
     return np.bincount(step[1:][weight[1:] >= MIN_WEIGHT], minlength=len(density))
 
 
+def _outside(farther: Array) -> float:
+    """Share of the steps with a known true state at which this is outside of all particles; NaN without any."""
+    return measures.known_mean(np.where(np.isnan(farther), np.nan, farther < OUTSIDE))
+
+
 def _farther(trace: Trace, weights: Array) -> Array:
-    """(T,) share of the predicted weight (T, M) that is farther from the mean than the true state."""
+    """(T,) share of the predicted weight (T, M) farther from the mean than the known part of the true state."""
     assert trace.particles is not None
-    task = trace.task
+    task, known = trace.task, measures.known_components(trace)
+    if not known:
+        return np.full(len(trace), np.nan)
     deviation = task.difference(trace.particles, trace.episode.states[:, None])
     error = (weights[..., None] * deviation).sum(1)
-    from_mean = measures.wrapped(task, deviation - error[:, None])
+    from_mean = measures.wrapped(task, deviation - error[:, None])[..., known]
     covariance = with_floor(np.einsum("tm,tmi,tmj->tij", weights, from_mean, from_mean))
-    return 1.0 - particle_level(from_mean, weights, error, covariance)
+    level = particle_level(from_mean, weights, error[:, known], covariance)
+    return np.where(np.isfinite(error[:, known]).all(-1), 1.0 - level, np.nan)
 
 
 def _summarise(phase: str, count: int, steps: dict[str, Array]) -> PhaseParticles:
@@ -329,7 +340,7 @@ def _summarise(phase: str, count: int, steps: dict[str, Array]) -> PhaseParticle
         degenerate=float((effective < DEGENERATE * count).mean()),
         resampled=float(steps["resampled"].mean()),
         several_modes=float((steps["modes"] > 1).mean()),
-        outside=float((steps["farther"] < OUTSIDE).mean()),
+        outside=_outside(steps["farther"]),
         evidence=steps["evidence"].mean(0),
     )
 

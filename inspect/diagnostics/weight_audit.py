@@ -245,8 +245,9 @@ class WeightAudit(RunDiagnostic):
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if trace.effective_weights is not None:
-        missing = np.isnan(trace.modality_mean).all()
-        return f"filter {trace.filter} reports no single-modality updates" if missing else None
+        if np.isnan(trace.modality_mean).all():
+            return f"filter {trace.filter} reports no single-modality updates"
+        return None if np.isfinite(measures.main_error(trace)[:, -1]).any() else measures.UNKNOWN_TRUTH
     if not trace.modalities and trace.kind == "external":
         return f"filter {trace.filter} reports no fusion weights"
     if not trace.modalities:

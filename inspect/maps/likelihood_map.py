@@ -103,8 +103,10 @@ class LikelihoodMap:
             if self.is_curve:
                 axes.plot(self.offsets_x, values[0] / 255.0)
             else:
-                x, y = self.offsets_x, self.offsets_y
-                axes.imshow(values, extent=(x[0], x[-1], y[0], y[-1]), origin="lower", cmap="viridis")
+                x, y = (
+                    q[0] - 0.5 * (q[1] - q[0]) for q in (self.offsets_x, self.offsets_y)
+                )  # edges of the first cells
+                axes.imshow(values, extent=(x, -x, y, -y), origin="lower", cmap="viridis")
                 axes.plot(0, 0, "+", color="white")
             axes.set_title(name, fontsize=9)
             axes.tick_params(labelsize=7)

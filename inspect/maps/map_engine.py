@@ -384,7 +384,7 @@ class MapEngine:
         return values
 
     def _within_half_a_turn(self, from_mean: Doubles, offsets: Doubles, component: int) -> Doubles:
-        """Offsets (S,) along a component, for each difference (L, 1) from a mean; those of angles may be a turn less."""
+        """(L, S) offsets from the centre whose sums with the differences (L, 1) from a mean are at most half a turn."""
         if self.task.components[component].unit != "rad" or self.task.components[component].rotation:
             return np.broadcast_to(offsets, (len(from_mean), len(offsets)))
         return wrap_angles((from_mean + offsets)[..., None], [0])[..., 0] - from_mean

@@ -59,8 +59,8 @@ class ParticleDensity:
     def log_density(self, middle: Array, along: tuple[int, int], x: Array, y: Array) -> Array:
         """(R, S) log density at the cells [iy, ix] of a grid.
 
-        The exponent of a kernel is a term by column, a term by row, and their product, which all kernels share. A kernel
-        whose angle on an axis may differ by more than half a turn also has copies a turn away.
+        The exponent of a kernel is a term by column, a term by row, and their product, which all kernels share. If
+        angles on an axis may differ by more than half a turn, the kernels have copies a turn away.
 
         Args:
             middle: (n,) SI, centre of the grid. along: state components of its axes. x, y: (S,) and (R,) SI, offsets of

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
-from beliefscope.inspect.statistics.intervals import jackknife
+from beliefscope.inspect.statistics.intervals import correlation_interval
 from beliefscope.inspect.statistics.measures import Array, counted, without_reading
 from beliefscope.inspect.traces.data import Trace
 
@@ -30,9 +30,9 @@ class Whiteness:
     """Whiteness test of the innovations of one modality in one component.
 
     Attributes:
-        autocorrelation: at lag 1, mean over trajectories.
-        low, high: its 95 % interval over trajectories, simultaneous over modalities and components; NaN for too few
-            trajectories. The autocorrelation of T white values has the mean -1 / T, which is added.
+        autocorrelation: at lag 1, mean over trajectories, plus 1 / T: that of T white values has the mean -1 / T.
+        low, high: its 95 % interval over trajectories, simultaneous over modalities and components and computed on
+            Fisher's scale; NaN for too few trajectories.
         statistic: Ljung-Box statistic, summed over trajectories.
         degrees: its degrees of freedom.
         p_value: probability of a larger statistic for white innovations; too small for small departures from it over
@@ -195,9 +195,9 @@ def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
     if not names:
         return []
     values = np.array([[tests[name] for name in names] for tests in results])  # (E, S, 3)
-    statistic, correlation = values[..., 0].sum(0), values[..., 1].mean(0)
+    statistic = values[..., 0].sum(0)
     unbiased = np.stack([values[..., 1] + 1.0 / values[..., 2].min(1, keepdims=True), np.ones_like(values[..., 1])], -1)
-    _, low, high = jackknife(unbiased, lambda sums: sums[..., 0] / sums[..., 1], 1.0 - 0.05 / len(names))
+    correlation, low, high = correlation_interval(unbiased, lambda s: s[..., 0] / s[..., 1], 1.0 - 0.05 / len(names))
     degrees = LAGS * len(results)
     return [
         Whiteness(*name, float(r), float(a), float(b), float(q), degrees, float(chdtrc(degrees, q)))

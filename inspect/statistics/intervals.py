@@ -121,13 +121,20 @@ def correlate(sums: Array) -> tuple[Array, Array, Array]:
         Value, low and high, (..., C) each. NaN where x or y is constant; intervals need ``MIN_TRAJECTORIES``
         trajectories.
     """
+    return correlation_interval(sums, _correlation)
+
+
+def correlation_interval(
+    sums: Array, correlation: Callable[[Array], Array], level: float = LEVEL
+) -> tuple[Array, Array, Array]:
+    """As ``jackknife`` for a value from -1 to 1, on Fisher's scale ``artanh r``."""
+
+    def fisher(part: Array) -> Array:
+        return np.arctanh(np.clip(correlation(part), -1.0 + 1e-9, 1.0 - 1e-9))
+
     with np.errstate(invalid="ignore"):
-        value, low, high = jackknife(sums, _fisher)
+        value, low, high = jackknife(sums, fisher, level)
     return np.tanh(value), np.tanh(low), np.tanh(high)
-
-
-def _fisher(sums: Array) -> Array:
-    return np.arctanh(np.clip(_correlation(sums), -1.0 + 1e-9, 1.0 - 1e-9))
 
 
 def _correlation(sums: Array) -> Array:

@@ -31,6 +31,10 @@ UPDATES_NOTE = "Updates start from the fused prior; the diagnostic Standalone mo
 """Part of every verdict that compares modalities by their updates."""
 
 
+UNKNOWN_TRUTH = "the true state is unknown"
+"""Reason why a diagnostic does not apply."""
+
+
 def layer_label(layer: str) -> str:
     """Display name of an estimate: that of a modality is an update of the fused filter's prior, not standalone."""
     if layer in ("fused", "truth"):
@@ -105,22 +109,39 @@ def quantities(task: Task) -> list[tuple[int, str, float]]:
     ]
 
 
+def known_components(trace: Trace) -> list[int]:
+    """Indices of the components whose true value is known at any step."""
+    return np.flatnonzero(np.isfinite(trace.episode.states).any(0)).tolist()
+
+
+def of_components(covariance: NDArray[Any], components: Sequence[int]) -> NDArray[Any]:
+    """The covariance (..., k, k) of some components."""
+    if len(components) == covariance.shape[-1]:
+        return covariance
+    return covariance[..., components, :][..., components]
+
+
 def nees(trace: Trace) -> Array:
-    """(T, L): ``e^T S^-1 e / n``; mean 1 if consistent, above 1 if overconfident. NaN without a covariance."""
-    error = errors(trace)
-    if not trace.has_covariance:
+    """(T, L): ``e^T S^-1 e / n`` of the n known components; mean 1 if consistent, above 1 if overconfident.
+
+    NaN without a covariance or a true state.
+    """
+    error, known = errors(trace), known_components(trace)
+    if not trace.has_covariance or not known:
         return np.full(error.shape[:2], np.nan)
-    white = np.linalg.solve(covariances(trace), error[..., None])[..., 0]
-    return np.einsum("tln,tln->tl", error, white) / error.shape[-1]
+    error = error[..., known]
+    white = np.linalg.solve(of_components(covariances(trace), known), error[..., None])[..., 0]
+    return np.einsum("tln,tln->tl", error, white) / len(known)
 
 
 def nll(trace: Trace) -> Array:
-    """(T, L) nats: ``-ln N(x; m, S)`` of the true state x, in m and rad; NaN without a covariance."""
-    ratio, n = nees(trace), len(trace.task.components)
+    """(T, L) nats: ``-ln N(x; m, S)`` of the known components x, in m and rad; NaN without a covariance."""
+    ratio, known = nees(trace), known_components(trace)
     if not trace.has_covariance:
         return ratio
+    n = len(known)
     with np.errstate(invalid="ignore"):  # covariances of updates that are not reported are NaN
-        volume = np.linalg.slogdet(covariances(trace)).logabsdet
+        volume = np.linalg.slogdet(of_components(covariances(trace), known)).logabsdet
     return np.asarray(0.5 * (n * ratio + volume + n * math.log(2.0 * math.pi)))
 
 

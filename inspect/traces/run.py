@@ -302,7 +302,9 @@ def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence)
         fused = torch.cat([s.estimate.covariance for s in steps])
         shares = (fused.unsqueeze(1) @ information).diagonal(dim1=-2, dim2=-1)
         present = evidence.present
-        arrays["effective_weights"] = shares if present is None else shares * powers_of_present(present[:, 0])[..., None]
+        arrays["effective_weights"] = (
+            shares if present is None else shares * powers_of_present(present[:, 0])[..., None]
+        )
     return arrays
 
 

@@ -74,7 +74,7 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
             axes.set_xlim(axis.edges[0], axis.edges[-1])
             if trace is traces[-1] or any(other.episode.time is None for other in traces) == (axis.label != "step"):
                 axes.set_xlabel(axis.label)
-            axes.set_ylim(0.0, 1.15 * float(np.nanmax(error)) or 1.0)
+            axes.set_ylim(0.0, 1.15 * float(np.max(error[np.isfinite(error)], initial=0.0)) or 1.0)
             draw_legend(axes, f"episode {trace.episode_index}")
     return figure
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -125,12 +125,16 @@ def accuracy(traces: Sequence[Trace], standalone: Mapping[str, Sequence[Trace]] 
     Args:
         standalone: modality -> its standalone runs over the same episodes, with a row each.
     """
-    table = _accuracy(traces)
-    rows = [(f"{name} standalone", *_accuracy(runs).rows[-1][1:]) for name, runs in (standalone or {}).items()]
-    return replace(table, rows=(*table.rows, *rows))
+    rows = _accuracy(traces)
+    rows += [_accuracy(runs)[-1] | {"estimate": f"{name} standalone"} for name, runs in (standalone or {}).items()]
+    columns = dict.fromkeys([*rows[0], *rows[-1]])
+    return Table.from_rows(
+        "RMSE and calibration of the covariance", [{name: row.get(name) for name in columns} for row in rows]
+    )
 
 
-def _accuracy(traces: Sequence[Trace]) -> Table:
+def _accuracy(traces: Sequence[Trace]) -> list[dict[str, Value]]:
+    """A row for each estimate."""
     task, first = traces[0].task, traces[0]
     counted = [measures.counted(trace) for trace in traces]
     error = torch.from_numpy(np.concatenate([measures.errors(t)[c] for t, c in zip(traces, counted, strict=True)]))
@@ -139,8 +143,7 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
         for trace, c in zip(traces, counted, strict=True)
     ]
     covariance = torch.from_numpy(np.concatenate(covariances))
-    rows: list[tuple[Value, ...]] = []
-    columns = ["estimate"]
+    rows: list[dict[str, Value]] = []
     for i, layer in enumerate(measures.layers(first)):
         if layer != "fused" and layer not in first.modalities_with_posterior:
             continue
@@ -150,9 +153,8 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
         values: dict[str, Value] = {titles[key]: value for key, value in result.rmse.items()}
         if first.has_covariance:
             values |= {"NEES/n": result.nees, "95 % coverage": result.coverage95, "NLL (nats)": result.nll}
-        columns = ["estimate", *values]
-        rows.append((measures.layer_label(layer), *values.values()))
-    return Table("RMSE and calibration of the covariance", tuple(columns), tuple(rows))
+        rows.append({"estimate": measures.layer_label(layer), **values})
+    return rows
 
 
 def _reach(map_: LikelihoodMap) -> NDArray[Any]:

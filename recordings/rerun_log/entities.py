@@ -15,7 +15,7 @@ from beliefscope.datasets.simulation.outline import Outline
 from beliefscope.datasets.task import Component, Task, with_unit
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.palette import colour
-from beliefscope.inspect.statistics.measures import contours, deviations, layer_label
+from beliefscope.inspect.statistics.measures import contours, deviations, layer_label, starts_at_truth
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
 
@@ -306,7 +306,9 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     length = plural(steps, "step") if steps >= 0 else "a live run, in steps"
-    start = "It starts at the true state" if has_truth(trace) else "The true state is unknown"
+    start = "The true state is unknown"
+    if has_truth(trace):
+        start = f"It starts {'at the true state' if starts_at_truth(trace) else 'at an offset from the true state'}"
     faults = f"\nSensor faults: `{trace.faults}`.\n" if trace.faults else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
 
