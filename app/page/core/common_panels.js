@@ -8,7 +8,7 @@ import { setPanelState } from '../widgets/panel_state.js';
 import { element, html, messageOf } from './dom.js';
 import { swatch } from './colours.js';
 import { stats } from './measurements.js';
-import { displayName, sentence } from './units.js';
+import { sentence } from './units.js';
 
 const LOADING_DELAY = 150; // ms until a panel shows that it loads
 

@@ -181,17 +181,9 @@ export class DisplayedRun {
       (component) => this.#store.set({ component }),
     );
     const hasBoth = trace.has('weights') && trace.has('effective_weights');
-    choice(
-      html('#weights'),
-      hasBoth
-        ? [
-            ['raw', 'fusion β'],
-            ['effective', 'effective'],
-          ]
-        : [],
-      state.weights,
-      (weights) => this.#store.set({ weights }),
-    );
+    /** @type {Record<string, string>} */
+    const kinds = hasBoth ? { raw: 'fusion β', effective: 'effective' } : {};
+    choice(html('#weights'), kinds, state.weights, (weights) => this.#store.set({ weights }));
     page.timeline.redraw();
     page.stepTable.show(trace, state.component);
     page.stepTable.move(state.step);

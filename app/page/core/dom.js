@@ -37,12 +37,31 @@ export function create(tag, properties = {}, ...children) {
 }
 
 /**
- * Replaces the options of a select.
+ * Replaces the options of a select, and enables it.
  * @param {HTMLSelectElement} select
- * @param {string[][]} options [value, text]
+ * @param {(string | number)[][] | Record<string, string>} options [value, text], or texts by value
+ * @param {string | number} [selected] value, the first one by default
  */
-export function setOptions(select, options) {
-  select.replaceChildren(...options.map(([value, text]) => new Option(text, value)));
+export function setOptions(select, options, selected) {
+  const entries = Array.isArray(options) ? options : Object.entries(options);
+  select.replaceChildren(
+    ...entries.map(([value, text]) => new Option(String(text), String(value))),
+  );
+  if (selected !== undefined) select.value = String(selected);
+  select.disabled = false;
+}
+
+/**
+ * Creates a button.
+ * @param {string} className
+ * @param {string} textContent
+ * @param {(event: MouseEvent) => void} press
+ * @param {Partial<Omit<HTMLButtonElement, 'style'>>} [properties]
+ */
+export function createButton(className, textContent, press, properties) {
+  const button = create('button', { type: 'button', className, textContent, ...properties });
+  button.addEventListener('click', press);
+  return button;
 }
 
 /**

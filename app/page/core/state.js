@@ -83,8 +83,8 @@ export const TABS = [
   'recordings',
 ];
 
-/** Keys with a fixed set of values, the default first. @type {Record<string, readonly string[]>} */
-const CHOICES = {
+/** Keys with a fixed set of values, in the order of menus, the default first. @type {Record<string, readonly string[]>} */
+export const CHOICES = {
   ...SCENE_CHOICES,
   tab: ['scene', ...TABS],
   weights: ['effective', 'raw'],
@@ -166,7 +166,7 @@ const HISTORY_KEYS = [
 const LINK_DELAY = 250; // ms; browsers limit how often a page may change its address
 
 /** @typedef {'page' | 'rerun' | 'clock' | 'live'} Origin of a change of the step */
-/** @typedef {(state: State, changed: Set<string>) => void} Listener */
+/** @typedef {(state: State, changed: Set<string>) => unknown} Listener */
 
 /** Holds the state and notifies listeners of changes once per frame. */
 export class Store {
@@ -194,6 +194,14 @@ export class Store {
   /** @param {Listener} listener called in a frame after one or more changes */
   listen(listener) {
     this.#listeners.push(listener);
+  }
+
+  /**
+   * @param {(keyof State)[]} keys
+   * @param {(state: State) => void} listener called in a frame after changes of some of the keys
+   */
+  when(keys, listener) {
+    this.listen((state, changed) => keys.some((key) => changed.has(key)) && listener(state));
   }
 
   /**

@@ -35,9 +35,7 @@ export class AngleSlider {
       store.set({ angle }, { inputTime: event.timeStamp });
     });
     reset.addEventListener('click', () => store.set({ angle: null }));
-    store.listen((state, changed) => {
-      if (changed.has('angle')) this.move(state.step);
-    });
+    store.when(['angle'], ({ step }) => this.move(step));
   }
 
   /** @param {Trace} trace */

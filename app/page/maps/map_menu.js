@@ -5,90 +5,29 @@
 /** @import { MapPanel } from './map_panel.js' */
 
 import { create, element, html } from '../core/dom.js';
+import { CHOICES } from '../core/state.js';
 import { displayName } from '../core/units.js';
-import { choice } from '../widgets/pickers.js';
+import { choice, choiceHost } from '../widgets/pickers.js';
 import { bindExport } from './export_map.js';
 import { mapPlane } from './map_choices.js';
 
 const GAP = 6; // px between the menu and the panel
 
-/** @type {{key: keyof State, label: string, options: [value: string, label: string][]}[]} */
-const OPTIONS = [
-  {
-    key: 'tiles',
-    label: 'Steps',
-    options: [
-      ['one', 'current step'],
-      ['several', 'several'],
-    ],
-  },
-  {
-    key: 'others',
-    label: 'Other components',
-    options: [
-      ['auto', 'automatic'],
-      ['fixed', 'at the truth'],
-      ['marginal', 'integrated out'],
-    ],
-  },
-  {
-    key: 'scale',
-    label: 'Scale',
-    options: [
-      ['normalised', 'relative to the peak'],
-      ['log', 'logarithm'],
-    ],
-  },
-  {
-    key: 'range',
-    label: 'Colour range',
-    options: [
-      ['own', 'per map'],
-      ['same', 'common'],
-    ],
-  },
-  {
-    key: 'colours',
-    label: 'Colour map',
-    options: [
-      ['viridis', 'viridis'],
-      ['cividis', 'cividis'],
-    ],
-  },
-  {
-    key: 'zoom',
-    label: 'Zoom',
-    options: [
-      ['fit', 'automatic'],
-      ['1', 'full'],
-      ['4', 'centre, 4 ×'],
-    ],
-  },
-  {
-    key: 'axes',
-    label: 'Axes',
-    options: [
-      ['offset', 'offset from truth'],
-      ['world', 'world'],
-    ],
-  },
-  {
-    key: 'regions',
-    label: '50 and 95 % regions',
-    options: [
-      ['shown', 'visible'],
-      ['hidden', 'hidden'],
-    ],
-  },
-  {
-    key: 'cloud',
-    label: 'Particles',
-    options: [
-      ['hidden', 'hidden'],
-      ['shown', 'by weight'],
-    ],
-  },
-];
+/** Label of each option and of its values. @type {Record<string, [label: string, values: Record<string, string>]>} */
+const OPTIONS = {
+  tiles: ['Steps', { one: 'current step', several: 'several' }],
+  others: [
+    'Other components',
+    { auto: 'automatic', fixed: 'at the truth', marginal: 'integrated out' },
+  ],
+  scale: ['Scale', { normalised: 'relative to the peak', log: 'logarithm' }],
+  range: ['Colour range', { own: 'per map', same: 'common' }],
+  colours: ['Colour map', { viridis: 'viridis', cividis: 'cividis' }],
+  zoom: ['Zoom', { fit: 'automatic', 1: 'full', 4: 'centre, 4 ×' }],
+  axes: ['Axes', { offset: 'offset from truth', world: 'world' }],
+  regions: ['50 and 95 % regions', { shown: 'visible', hidden: 'hidden' }],
+  cloud: ['Particles', { hidden: 'hidden', shown: 'by weight' }],
+};
 
 /**
  * Fills the menu.
@@ -99,14 +38,12 @@ const OPTIONS = [
  * @returns {(trace: Trace) => void} adapts the menu to a trace
  */
 export function mapMenu(menu, button, store, maps) {
-  const rows = OPTIONS.map((option) => optionRow(option, store));
+  const rows = Object.fromEntries(Object.keys(OPTIONS).map((key) => [key, optionRow(key, store)]));
   const plane = create('select', { ariaLabel: 'Components of the axes' });
   const planeRow = create('label', {}, create('span', { textContent: 'Components' }), plane);
   plane.addEventListener('change', () => store.set({ plane: plane.value, angle: null }));
-  html('.map-options', menu).append(planeRow, ...rows);
-  store.listen(({ plane: names }, changed) => {
-    if (changed.has('plane') && names) plane.value = names;
-  });
+  html('.map-options', menu).append(planeRow, ...Object.values(rows));
+  store.when(['plane'], ({ plane: names }) => names && (plane.value = names));
   const pin = element('.pin', HTMLButtonElement, menu);
   pin.addEventListener('click', () => maps.togglePin());
   maps.changed = () => {
@@ -117,17 +54,14 @@ export function mapMenu(menu, button, store, maps) {
   const setLayers = bindExport(html('.export', menu), () => maps.displayed);
   const restrict = () => {
     const tiled = store.state.tiles === 'several';
-    const cloud = rows[OPTIONS.findIndex(({ key }) => key === 'cloud')];
-    for (const control of [pin, ...cloud.querySelectorAll('input')]) control.disabled = tiled;
-    cloud.title = tiled ? 'Particles are drawn on the maps of the current step only' : '';
+    for (const control of [pin, ...rows.cloud.querySelectorAll('input')]) control.disabled = tiled;
+    rows.cloud.title = tiled ? 'Particles are drawn on the maps of the current step only' : '';
     pin.title = tiled
       ? 'Changes are shown on the maps of the current step only'
       : 'Show other maps relative to those of this step (m)';
   };
   restrict();
-  store.listen((_, changed) => {
-    if (changed.has('tiles') || changed.has('cloud')) restrict();
-  });
+  store.when(['tiles', 'cloud'], restrict);
   menu.addEventListener('beforetoggle', (event) => {
     if (/** @type {ToggleEvent} */ (event).newState !== 'open') return;
     maps.showMeasures();
@@ -137,11 +71,9 @@ export function mapMenu(menu, button, store, maps) {
   });
   return (trace) => {
     const isCurve = mapPlane(store.state, trace).length === 1;
-    OPTIONS.forEach(({ key }, i) => {
-      if (key === 'cloud') rows[i].hidden = !trace.has('effective_sample_size') || isCurve;
-      if (['tiles', 'range', 'colours', 'regions'].includes(key)) rows[i].hidden = isCurve;
-      if (key === 'others') rows[i].hidden = trace.components.length < 3;
-    });
+    for (const key of ['tiles', 'range', 'colours', 'regions']) rows[key].hidden = isCurve;
+    rows.cloud.hidden = !trace.has('effective_sample_size') || isCurve;
+    rows.others.hidden = trace.components.length < 3;
     plane.replaceChildren(...planeOptions(trace));
     planeRow.hidden = plane.options.length < 2;
     plane.value = mapPlane(store.state, trace).join();
@@ -164,21 +96,16 @@ function planeOptions({ components, task }) {
 }
 
 /**
- * @param {typeof OPTIONS[number]} option
+ * @param {string} key
  * @param {Store} store
  */
-function optionRow({ key, label, options }, store) {
-  const host = create('div', {
-    id: `maps-${key}`,
-    className: 'choice',
-    role: 'radiogroup',
-    ariaLabel: label,
-  });
-  const show = () =>
-    choice(host, options, String(store.state[key]), (value) => store.set({ [key]: value }));
-  show();
-  store.listen((_, changed) => {
-    if (changed.has(key)) show();
-  });
+function optionRow(key, store) {
+  const [label, labels] = OPTIONS[key];
+  const host = choiceHost(`maps-${key}`, label);
+  const options = CHOICES[key].map((value) => [value, labels[value]]);
+  const show = (/** @type {State} */ state) =>
+    choice(host, options, String(Object(state)[key]), (value) => store.set({ [key]: value }));
+  show(store.state);
+  store.when([/** @type {keyof State} */ (key)], show);
   return create('div', {}, create('span', { textContent: label }), host);
 }

@@ -34,9 +34,7 @@ export class Camera {
     this.#context = context2d(element('canvas', HTMLCanvasElement, figure), {
       willReadFrequently: true,
     });
-    store.listen((_, changed) => {
-      if (changed.has('sensor') && this.#trace) this.show(this.#trace);
-    });
+    store.when(['sensor'], () => this.#trace && this.show(this.#trace));
   }
 
   /** @param {Trace} trace */

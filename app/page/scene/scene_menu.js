@@ -4,12 +4,11 @@
 /** @import { Trace } from '../data/trace.js' */
 
 import { SCENE_LAYERS, VIEWPOINTS } from '../core/constants.js';
-import { create } from '../core/dom.js';
+import { create, createButton } from '../core/dom.js';
 import { lineSample, swatch } from '../core/colours.js';
-import { choice } from '../widgets/pickers.js';
+import { choice, choiceHost } from '../widgets/pickers.js';
 
 /** @typedef {typeof SCENE_LAYERS[number]} SceneLayer */
-/** @typedef {[value: string, label: string]} Option */
 
 /** @type {Record<SceneLayer, string>} */
 const LABELS = {
@@ -30,17 +29,8 @@ const LAYER_OPTIONS = {
     ['height', 'Height of the map'],
   ],
 };
-/** @type {Record<'tint' | 'height', Option[]>} */
-const CHOICES = {
-  tint: [
-    ['weight', 'by weight'],
-    ['share', 'by modality'],
-  ],
-  height: [
-    ['floor', 'on the floor'],
-    ['belief', 'below the belief'],
-  ],
-};
+const TINTS = { weight: 'by weight', share: 'by modality' };
+const HEIGHTS = { floor: 'on the floor', belief: 'below the belief' };
 /** @type {Record<typeof VIEWPOINTS[number], string>} */
 const VIEWPOINT_LABELS = { first: 'initial', above: 'top', camera: 'camera' };
 /** Keys of the state that the scene depends on. @type {(keyof State)[]} */
@@ -88,8 +78,7 @@ export class SceneMenu {
       const { bottom, left } = button.getBoundingClientRect();
       [menu.style.top, menu.style.left] = [`${bottom + 4}px`, `${left}px`];
     });
-    store.listen((_, changed) => {
-      if (!STATE_KEYS.some((key) => changed.has(key))) return;
+    store.when(STATE_KEYS, () => {
       this.#update();
       setScene(this.options);
     });
@@ -131,13 +120,13 @@ export class SceneMenu {
       maps.map((name) => [name, name]),
       ground,
     );
-    this.#choose('height', CHOICES.height, state.height);
-    this.#choose('tint', trace.has('effective_weights') ? CHOICES.tint : [], state.tint);
+    this.#choose('height', HEIGHTS, state.height);
+    this.#choose('tint', trace.has('effective_weights') ? TINTS : {}, state.tint);
   }
 
   /**
    * @param {'ground' | 'height' | 'tint'} key
-   * @param {Option[]} options
+   * @param {Parameters<typeof choice>[1]} options
    * @param {string} value
    */
   #choose(key, options, value) {
@@ -156,12 +145,7 @@ export class SceneMenu {
     if (layer === 'force')
       row.title = 'The arrow has a ring every few newtons, as its label states';
     for (const [key, label] of LAYER_OPTIONS[layer] ?? []) {
-      const host = create('div', {
-        id: `scene-${key}`,
-        className: 'choice',
-        role: 'radiogroup',
-        ariaLabel: label,
-      });
+      const host = choiceHost(`scene-${key}`, label);
       this.#choices.set(key, host);
       row.append(host);
     }
@@ -174,8 +158,7 @@ export class SceneMenu {
     const row = create('div', { className: 'viewpoints' });
     row.append(create('span', { textContent: 'View' }));
     for (const at of VIEWPOINTS) {
-      const button = create('button', { type: 'button', textContent: VIEWPOINT_LABELS[at] });
-      button.addEventListener('click', () => setViewpoint(at));
+      const button = createButton('', VIEWPOINT_LABELS[at], () => setViewpoint(at));
       this.#viewpoints.set(at, button);
       row.append(button);
     }

@@ -50,7 +50,7 @@ export class ComparisonTab {
     this.#gainBox.addEventListener('change', () =>
       store.set({ beside: this.#gainBox.checked ? 'gain' : 'alone' }),
     );
-    store.listen((_, changed) => changed.has('beside') && this.#showGain());
+    store.when(['beside'], () => this.#showGain());
     this.#figures = new Figures(html('.figures', host), store);
     const form = element('form', HTMLFormElement, host);
     this.#form = new ComparisonForm(form, catalog, store, dialog, (against) =>

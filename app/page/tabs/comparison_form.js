@@ -11,15 +11,14 @@ import { displayName, fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
 
-/** @typedef {'filter' | 'faults' | 'only' | 'intervention'} Kind of comparison */
+/** @typedef {keyof typeof KINDS} Kind of comparison */
 
-/** @type {[Kind, string][]} */
-const KINDS = [
-  ['filter', 'another filter'],
-  ['faults', 'other sensor faults'],
-  ['only', 'one modality'],
-  ['intervention', 'an intervention'],
-];
+const KINDS = {
+  filter: 'another filter',
+  faults: 'other sensor faults',
+  only: 'one modality',
+  intervention: 'an intervention',
+};
 const DEFAULT_SPAN = 20; // steps of an intervention
 
 /**
@@ -229,7 +228,7 @@ export class ComparisonForm {
   #showKind() {
     const hasOthers = this.#filter.options.length > 0;
     choice(html('#against-kind', this.#form), KINDS, this.#kind, (kind) => {
-      this.#kind = KINDS.find(([value]) => value === kind)?.[0] ?? 'filter';
+      this.#kind = /** @type {Kind} */ (kind);
       this.#showFields();
     });
     html('[data-kind="filter"] .why-not', this.#form).textContent = hasOthers

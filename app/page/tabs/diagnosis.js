@@ -20,11 +20,7 @@ import { Repair } from './repair.js';
 
 /** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
 
-/** @type {[string, string][]} */
-const OVER = [
-  ['episode', 'this episode'],
-  ['held-out', 'held-out episodes'],
-];
+const OVER = { episode: 'this episode', 'held-out': 'held-out episodes' };
 const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN} or no evidence.`;
 const WITHIN =
   'The largest deviations of all statistics; healthy episodes also have some outside these ranges.';

@@ -20,16 +20,9 @@ import { choice } from '../widgets/pickers.js';
  * @typedef {JobResult<DiagnosticResult> | {state: 'refused', error: string, job?: undefined}} Result
  */
 
-/** @type {[string, string][]} */
-const OVER = [
-  ['episode', 'this episode'],
-  ['held-out', 'all held-out'],
-];
-/** Of live and imported runs. @type {[string, string][]} */
-const OVER_RUNS = [
-  ['episode', 'this run'],
-  ['held-out', 'all its runs'],
-];
+const OVER = { episode: 'this episode', 'held-out': 'all held-out' };
+/** Of live and imported runs. */
+const OVER_RUNS = { episode: 'this run', 'held-out': 'all its runs' };
 const MAX_RESULTS = 48;
 /** Labels of the button by state. @type {Partial<Record<Result['state'], string>>} */
 const ACTIONS = { absent: 'Compute', ended: 'Try again', active: 'Cancel' };

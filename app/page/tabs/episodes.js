@@ -143,7 +143,7 @@ export class Episodes {
     this.#head = element('thead', HTMLTableSectionElement, table);
     this.#body = element('tbody', HTMLTableSectionElement, table);
     navigateRows(this.#body);
-    store.listen((_, changed) => changed.has('episode') && this.#markEpisode());
+    store.when(['episode'], () => this.#markEpisode());
   }
 
   /**

@@ -5,7 +5,7 @@
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
-import { element, html, messageOf } from '../core/dom.js';
+import { element, html, messageOf, setOptions } from '../core/dom.js';
 import { download } from '../core/download.js';
 import { plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -218,8 +218,11 @@ export class Experiments {
       /** @type {string} */ value,
     ) => {
       const picker = element(selector, HTMLSelectElement, this.#host);
-      picker.replaceChildren(...names.map((name) => new Option(titles[name] ?? name, name)));
-      picker.value = value;
+      setOptions(
+        picker,
+        names.map((name) => [name, titles[name] ?? name]),
+        value,
+      );
       return picker;
     };
     const names = (this.#sweeps ?? []).map(({ name }) => name);

@@ -18,17 +18,8 @@ import { EventTable } from './event_table.js';
 import { formatScore, scoreName, viewOf } from './failure_scores.js';
 import { SliceTable } from './slice_table.js';
 
-/** @type {[string, string][]} */
-const LISTS = [
-  ['events', 'Events'],
-  ['episodes', 'Episodes'],
-  ['slices', 'Slices'],
-];
-/** @type {[string, string][]} */
-const AMONG = [
-  ['held-out', 'held-out'],
-  ['all', 'all'],
-];
+const LISTS = { events: 'Events', episodes: 'Episodes', slices: 'Slices' };
+const AMONG = { 'held-out': 'held-out', all: 'all' };
 /** Button of each state. @type {Record<string, string>} */
 const ACTIONS = {
   absent: 'Search for failures',
@@ -162,7 +153,8 @@ export class Failures {
     const set = (key) => (/** @type {string} */ value) => this.#store.set({ [key]: value });
     choice(html('#list', this.#host), LISTS, state.list, set('list'));
     choice(html('#among', this.#host), this.#isLive ? [] : AMONG, state.among, set('among'));
-    for (const [name] of LISTS) html(`.${name}`, this.#host).hidden = state.list !== name;
+    for (const name of Object.keys(LISTS))
+      html(`.${name}`, this.#host).hidden = state.list !== name;
     this.#host.dataset.state = result.state;
     this.#host.ariaBusy = String(result.state === 'loading' || result.state === 'active');
     showJobButton(html('.doing', this.#host), result, {

@@ -205,12 +205,12 @@ export class FinetuneForm {
     const select = this.#select('criterion');
     const trained = this.#slice.name;
     const names = [...new Set([trained, ...(this.#offer?.criterion_slices ?? [])])];
-    const chosen = select.value;
+    const isKept = this.#hasOwnCriterion && names.includes(select.value);
     setOptions(
       select,
       names.map((name) => [name, displayName(name)]),
+      isKept ? select.value : trained,
     );
-    select.value = this.#hasOwnCriterion && names.includes(chosen) ? chosen : trained;
   }
 
   /** Sets the weight of clean data to that of the suggested slice, or to that of any other one. */

@@ -8,7 +8,6 @@ import {
   displayName,
   fixed,
   mainText,
-  mainUnit,
   percent,
   significant,
   withUnit,

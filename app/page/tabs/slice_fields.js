@@ -11,12 +11,8 @@ import { faultPicker } from '../widgets/fault_dialog.js';
 
 const CLEAN = 'clean'; // name of the slice of clean data
 const CUSTOM = 'custom'; // value of a slice without a name
-/** @type {[string, string][]} */
-const PHASES = [
-  ['', 'all steps'],
-  ['yes', 'contact'],
-  ['no', 'free motion'],
-];
+/** @type {Record<string, string>} */
+const PHASES = { '': 'all steps', yes: 'contact', no: 'free motion' };
 
 export class SliceFields {
   #form;
@@ -139,7 +135,7 @@ export class SliceFields {
  * @param {string} only
  */
 function customSlice(faults, contact, only) {
-  const phase = PHASES.find(([value]) => contact && value === contact)?.[1];
+  const phase = contact && PHASES[contact];
   const parts = [faults.replace(/[:=]/g, ' ') || 'no faults', phase, only && `${only} only`];
   const values = [`faults=${faults}`, contact && `contact=${contact}`, only && `only=${only}`];
   return [parts.filter(Boolean).join(', '), ...values].filter(Boolean).join(':');

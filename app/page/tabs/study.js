@@ -8,7 +8,7 @@
 /** @import { Quantity } from './study_quantities.js' */
 /** @import { FilterResults, StudyView } from './study_table.js' */
 
-import { element, html, messageOf } from '../core/dom.js';
+import { element, html, messageOf, setOptions } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { fixed, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -81,10 +81,7 @@ export class Study {
     host.addEventListener('click', (event) => this.#followLink(event));
     html('.cells button', host).addEventListener('click', () => this.#trainOrCancel());
     jobs.listen(() => this.#followJobs());
-    store.listen((_, changed) => {
-      if (['task', 'study', 'quantity', 'start', 'data'].some((key) => changed.has(key)))
-        this.#draw();
-    });
+    store.when(['task', 'study', 'quantity', 'start', 'data'], () => this.#draw());
   }
 
   /** Whether the tab is selected. */
@@ -130,11 +127,11 @@ export class Study {
     if (!study || !this.#studies) return;
     const { state } = this.#store;
     const picker = element('select', HTMLSelectElement, this.#host);
-    const options = this.#studies.map(
-      ({ name }) => new Option(name === BUILT_IN ? 'built-in study' : name, name),
-    );
-    picker.replaceChildren(...options);
-    picker.value = study.name;
+    const options = this.#studies.map(({ name }) => [
+      name,
+      name === BUILT_IN ? 'built-in study' : name,
+    ]);
+    setOptions(picker, options, study.name);
     html('.picker', this.#host).hidden = this.#studies.length < 2;
     html('.problems', this.#host).textContent = this.#problems.map(sentence).join(' ');
     this.#drawCells(study);

@@ -52,11 +52,7 @@ export class ChartMenu {
   #draw() {
     const trace = this.#trace;
     if (!trace) return;
-    /** @type {[string, string][]} */
-    const axes = [
-      ['steps', 'steps'],
-      ['seconds', 'seconds'],
-    ];
+    const axes = { steps: 'steps', seconds: 'seconds' };
     choice(html('#time-axis'), axes, this.#store.state.time, (time) => this.#store.set({ time }));
     const { track } = this.#store.state;
     const options = trackOptions(trace, track).filter(([key]) => key !== track);

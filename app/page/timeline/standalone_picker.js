@@ -19,7 +19,7 @@ export class StandalonePicker {
       const { value } = this.#select;
       store.set({ against: value && PREFIX + value });
     });
-    store.listen((_, changed) => changed.has('against') && this.#update());
+    store.when(['against'], () => this.#update());
   }
 
   /** @param {Trace} trace */

@@ -9,7 +9,7 @@
 /** @import { StepAxis } from './step_axis.js' */
 /** @import { StepWindow } from './step_window.js' */
 
-import { create, element, html } from '../core/dom.js';
+import { create, element, html, setOptions } from '../core/dom.js';
 import { fixed, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { GUTTER, chart, chartData } from './chart.js';
@@ -106,8 +106,8 @@ export class Timeline {
     this.#trackSelect.addEventListener('change', () =>
       store.set({ track: this.#trackSelect.value }),
     );
-    store.listen(({ window }, changed) => {
-      if (this.#trace && changed.has('window') && window !== this.#windowText)
+    store.when(['window'], ({ window }) => {
+      if (this.#trace && window !== this.#windowText)
         this.#setWindow(parseWindow(window, this.#allSteps));
     });
     new ResizeObserver(() => this.#build()).observe(body);
@@ -155,8 +155,7 @@ export class Timeline {
       : `step, ${stepText} each`;
     this.#tracks = tracks(this.#trace, state, comparison);
     const options = trackOptions(this.#trace, state.track);
-    this.#trackSelect.replaceChildren(...options.map(([key, label]) => new Option(label, key)));
-    [this.#trackSelect.value, this.#trackSelect.disabled] = [state.track, false];
+    setOptions(this.#trackSelect, options, state.track);
     this.#showComparison();
     this.#build();
   }

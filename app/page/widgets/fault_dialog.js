@@ -2,7 +2,7 @@
 
 /** @import { Fault } from '../data/api.js' */
 
-import { create, element, html, messageOf } from '../core/dom.js';
+import { create, element, html, messageOf, setOptions } from '../core/dom.js';
 
 const OTHER = 'other';
 
@@ -81,13 +81,12 @@ export function faultPicker(select, dialog, { none, selected, choose, check }) {
     const faults = selected();
     const isPreset = !faults || presets.some((preset) => preset.faults === faults);
     const options = [
-      { name: none, faults: '' },
-      ...presets,
-      ...(isPreset ? [] : [{ name: faults, faults }]),
-      { name: 'other …', faults: OTHER },
+      ['', none],
+      ...presets.map((preset) => [preset.faults, preset.name]),
+      ...(isPreset ? [] : [[faults, faults]]),
+      [OTHER, 'other …'],
     ];
-    select.replaceChildren(...options.map((option) => new Option(option.name, option.faults)));
-    [select.value, select.disabled] = [faults, false];
+    setOptions(select, options, faults);
     select.title = `Sensor faults${faults && `: ${faults}`}`;
   };
   /** @param {string} faults */

@@ -4,7 +4,7 @@
 /** @import { Catalog, DataSet, EpisodeSummary, Task } from '../types/server.js' */
 /** @import { FaultDialog } from './fault_dialog.js' */
 
-import { create, element } from '../core/dom.js';
+import { create, element, setOptions } from '../core/dom.js';
 import { filtersOf, firstData, isComplete } from '../core/episodes.js';
 import { SPEEDS } from '../core/state.js';
 import { percent, plural } from '../core/units.js';
@@ -16,8 +16,6 @@ const NEARBY = 100; // listed episodes around the selected one, of a large data 
 /** Value of the option that opens the search. */
 export const FIND = 'find';
 
-/** @typedef {[value: string | number, label: string | number]} Option */
-
 /**
  * Connects the pickers of the header.
  * @param {Catalog} catalog
@@ -27,29 +25,25 @@ export const FIND = 'find';
  * @returns {() => void} to be called when the catalog has changed
  */
 export function connectPickers(catalog, store, dialog, findEpisode) {
-  const selects = {
-    task: element('#task', HTMLSelectElement),
-    filter: element('#filter', HTMLSelectElement),
-    data: element('#data', HTMLSelectElement),
-    episode: element('#episode', HTMLSelectElement),
-    speed: element('#speed', HTMLSelectElement),
-  };
-  const { task, filter, data, episode, speed } = selects;
+  const ids = ['task', 'filter', 'data', 'episode', 'speed', 'faults'];
+  const [task, filter, data, episode, speed, faultSelect] = ids.map((id) =>
+    element(`#${id}`, HTMLSelectElement),
+  );
   const currentTask = () => byName(catalog.tasks, store.state.task) ?? catalog.tasks[0];
-  const showFaults = faultPicker(element('#faults', HTMLSelectElement), dialog, {
+  const showFaults = faultPicker(faultSelect, dialog, {
     none: 'as recorded',
     selected: () => store.state.faults,
     choose: (faults) => store.set({ faults, ...swapped(store.state, 'faults', faults) }),
     check: (faults) => checkSelection({ ...store.state, faults, against: '' }),
   });
-  fill(
+  setOptions(
     speed,
     SPEEDS.map((factor) => [factor, `${factor}×`]),
   );
   const refill = () => {
-    fill(task, names(catalog.tasks));
-    fill(filter, names(filtersOf(currentTask(), store.state.data)));
-    fill(data, names(currentTask().data));
+    setOptions(task, names(catalog.tasks));
+    setOptions(filter, names(filtersOf(currentTask(), store.state.data)));
+    setOptions(data, names(currentTask().data));
     for (const select of [task, data])
       if (select.parentElement) select.parentElement.hidden = select.length < 2;
   };
@@ -81,18 +75,16 @@ export function connectPickers(catalog, store, dialog, findEpisode) {
     if (!set) return;
     const { task: taskName, data: dataName, episode: index } = store.state;
     if (!isComplete(set) && !set.episodes.some((entry) => entry.index === index)) {
-      fill(episode, [[index, index]]);
+      setOptions(episode, [[index, index]]);
       const first = Math.max(0, index - NEARBY / 2);
       const list = await episodes(taskName, dataName, { first, limit: NEARBY }).catch(() => null);
       if (list) set.episodes = list.episodes;
       if (set !== byName(currentTask().data, store.state.data) || index !== store.state.episode)
         return;
     }
-    /** @type {Option[]} */
-    const options = set.episodes.map((entry) => [entry.index, episodeLabel(entry)]);
-    if (!isComplete(set)) options.unshift([FIND, `Find one of ${set.count} episodes…`]);
-    fill(episode, options);
-    episode.value = String(index);
+    const find = isComplete(set) ? [] : [[FIND, `Find one of ${set.count} episodes…`]];
+    const options = [...find, ...set.episodes.map((entry) => [entry.index, episodeLabel(entry)])];
+    setOptions(episode, options, index);
     episode.title = selectedLabel(episode); // where the picker is narrow
   };
   episode.addEventListener('change', () => {
@@ -124,10 +116,7 @@ export function connectPickers(catalog, store, dialog, findEpisode) {
  */
 const byName = (list, name) => list.find((entry) => entry.name === name);
 
-/**
- * @param {{name: string}[]} list
- * @returns {Option[]}
- */
+/** @param {{name: string}[]} list */
 const names = (list) => list.map(({ name }) => [name, name]);
 
 /** @param {HTMLSelectElement} select */
@@ -175,45 +164,37 @@ export function episodeLabel({ index, policy, split, steps, contact_fraction, la
   return parts.filter((part) => part !== '').join(' · ');
 }
 
-/**
- * @param {HTMLSelectElement} select
- * @param {Option[]} options
- */
-function fill(select, options) {
-  select.replaceChildren(
-    ...options.map(([value, label]) => new Option(String(label), String(value))),
-  );
-  select.disabled = false;
-}
-
 /** Handlers of the radio groups. @type {WeakMap<HTMLElement, (value: string) => void>} */
 const handlers = new WeakMap();
 
 /**
+ * Creates the element of a radio group.
+ * @param {string} id
+ * @param {string} ariaLabel
+ */
+export const choiceHost = (id, ariaLabel) =>
+  create('div', { id, className: 'choice', role: 'radiogroup', ariaLabel });
+
+/**
  * Shows a radio group. Its buttons are replaced only where the options have changed, so that the focus stays.
  * @param {HTMLElement} host hidden if there are fewer than two options
- * @param {[value: string, label: string][]} options
+ * @param {string[][] | Record<string, string>} options [value, label], or labels by value
  * @param {string} selected
  * @param {(value: string) => void} choose
  */
 export function choice(host, options, selected, choose) {
-  host.hidden = options.length < 2;
+  const entries = Array.isArray(options) ? options : Object.entries(options);
+  host.hidden = entries.length < 2;
   handlers.set(host, choose);
-  const key = JSON.stringify(options);
+  const key = JSON.stringify(entries);
   if (host.dataset.options !== key) {
     host.dataset.options = key;
-    host.replaceChildren(...options.map(([value, label]) => radioButton(host, value, label)));
+    const labels = entries.map(([value, label]) => {
+      const input = create('input', { type: 'radio', name: host.id, value });
+      input.addEventListener('change', () => handlers.get(host)?.(value));
+      return create('label', {}, input, label);
+    });
+    host.replaceChildren(...labels);
   }
   for (const input of host.querySelectorAll('input')) input.checked = input.value === selected;
-}
-
-/**
- * @param {HTMLElement} host
- * @param {string} value
- * @param {string} label
- */
-function radioButton(host, value, label) {
-  const input = create('input', { type: 'radio', name: host.id, value });
-  input.addEventListener('change', () => handlers.get(host)?.(value));
-  return create('label', {}, input, label);
 }
