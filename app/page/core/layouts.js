@@ -1,11 +1,8 @@
 /** Saved layouts: sizes of the panels and a tab, in a menu. */
 
-/** @import { Splitters } from './splitters.js' */
-/** @import { Store } from './state.js' */
-
 /** @import { Sizes } from './pane_sizes.js' */
 
-import { create, html, openBelow } from './dom.js';
+import { create, createButton, html, openBelow } from './dom.js';
 
 /** @typedef {{name: string, help: string, sizes: Sizes, tab: string}} Layout */
 
@@ -40,31 +37,14 @@ export const LAYOUTS = [
  */
 export function layoutMenu(menu, button, apply) {
   const rows = LAYOUTS.map((layout) => {
-    const help = create('small', { textContent: layout.help });
-    const row = create(
-      'button',
-      { type: 'button' },
-      create('b', { textContent: layout.name }),
-      help,
-    );
-    row.addEventListener('click', () => {
+    const row = createButton('', '', () => {
       apply(layout);
       menu.hidePopover();
     });
+    const help = create('small', { textContent: layout.help });
+    row.append(create('b', { textContent: layout.name }), help);
     return row;
   });
   html('.rows', menu).append(...rows);
   openBelow(menu, button);
 }
-
-/**
- * @param {Store} store
- * @param {Splitters} splitters
- * @returns {(layout: Layout) => void}
- */
-export const layoutSetter =
-  (store, splitters) =>
-  ({ sizes, tab }) => {
-    splitters.set(sizes);
-    store.set({ tab });
-  };

@@ -1,16 +1,12 @@
 /** Maximises a panel: it fills the page below the header until Escape, its button or a double click on its bar. */
 
-import { create, html } from './dom.js';
-
-const NAMES = { maximise: 'Maximise', restore: 'Restore' };
+import { createButton, html } from './dom.js';
 
 /** Adds the buttons to the bars of all panels. */
 export function bindMaximise() {
   for (const panel of panels()) {
     const bar = html('.bar', panel);
-    const button = create('button', { type: 'button', className: 'text quiet maximise' });
-    button.addEventListener('click', () => toggle(panel));
-    bar.append(button);
+    bar.append(createButton('text quiet maximise', '', () => toggle(panel)));
     bar.addEventListener('dblclick', ({ target }) => {
       const isControl =
         target instanceof Element && target.closest('button, select, input, label, a');
@@ -54,9 +50,9 @@ function toggle(panel) {
 
 /** @param {HTMLElement} panel */
 function label(panel) {
-  const name = panel.classList.contains('maximised') ? NAMES.restore : NAMES.maximise;
+  const [text, name] = panel.classList.contains('maximised') ? ['⤡', 'Restore'] : ['⤢', 'Maximise'];
   const button = html('.maximise', panel);
-  button.textContent = panel.classList.contains('maximised') ? '⤡' : '⤢';
+  button.textContent = text;
   button.ariaLabel = `${name}: ${panel.ariaLabel}`;
   button.title = `${name} (x)`;
 }

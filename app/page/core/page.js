@@ -4,6 +4,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Tabs } from '../tabs/tabs.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */
+/** @import { Layout } from './layouts.js' */
 /** @import { Store } from './state.js' */
 
 import * as api from '../data/api.js';
@@ -33,7 +34,7 @@ import { bindControls } from './controls.js';
 import { useful } from './common_panels.js';
 import { DisplayedRun, delayed } from './displayed_run.js';
 import { element, html, messageOf } from './dom.js';
-import { layoutMenu, layoutSetter } from './layouts.js';
+import { layoutMenu } from './layouts.js';
 import { Splitters } from './splitters.js';
 import { parsePermalink } from './state.js';
 import { stats } from './measurements.js';
@@ -74,8 +75,7 @@ export class Page {
     this.intro = new Intro(html('#intro'), catalog, store, () => this.tour.start());
     this.tour = new Tour();
     this.splitters = new Splitters();
-    this.setLayout = layoutSetter(store, this.splitters);
-    layoutMenu(html('#layouts'), html('#layout'), this.setLayout);
+    layoutMenu(html('#layouts'), html('#layout'), (layout) => this.setLayout(layout));
     this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#changeTheme(dark));
     this.clock = new Clock(store);
@@ -245,6 +245,12 @@ export class Page {
   /** @param {string} tab */
   openTab(tab) {
     this.#store.set({ tab });
+  }
+
+  /** @param {Layout} layout */
+  setLayout({ sizes, tab }) {
+    this.splitters.set(sizes);
+    this.openTab(tab);
   }
 
   goToLargestError() {

@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { SHOWN } from '../core/constants.js';
-import { create, html, setOptions } from '../core/dom.js';
+import { create, createButton, html, setOptions } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { affectedComponent, largest } from '../step/finding.js';
@@ -371,11 +371,9 @@ export class Diagnosis {
   }
 
   #finetuneButton() {
-    const textContent = 'Fine-tune the filter …';
+    const open = () => this.#store.set({ tab: 'finetune', run: '' });
     const title = 'Set up a fine-tuning run for this cause';
-    const button = create('button', { type: 'button', className: 'text', textContent, title });
-    button.addEventListener('click', () => this.#store.set({ tab: 'finetune', run: '' }));
-    return button;
+    return createButton('text', 'Fine-tune the filter …', open, { title });
   }
 }
 

@@ -2,7 +2,7 @@
 
 /** @import { DiagnosisCause, Evidence } from '../types/server.js' */
 
-import { create } from '../core/dom.js';
+import { create, createButton } from '../core/dom.js';
 import { fixed, percent, probabilityText, sentence, stepLabel, typeset } from '../core/units.js';
 import { copyButton } from '../widgets/copy_button.js';
 
@@ -52,9 +52,10 @@ export function evidenceItem({ text, episode, step, time }, alone, open) {
   const item = create('li', { textContent: typeset(sentence(text)) });
   const label = placeLabel({ episode, step, time }, alone);
   if (episode === null || !label) return item;
-  const link = create('button', { type: 'button', className: 'text quiet', textContent: label });
-  link.addEventListener('click', () => open(episode, step));
-  item.append(' ', link);
+  item.append(
+    ' ',
+    createButton('text quiet', label, () => open(episode, step)),
+  );
   return item;
 }
 

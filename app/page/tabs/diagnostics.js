@@ -6,7 +6,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
-import { create, element, html, isAbort, messageOf } from '../core/dom.js';
+import { create, createButton, element, html, isAbort, messageOf } from '../core/dom.js';
 import { sentence, typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
@@ -204,8 +204,7 @@ export class Diagnostics {
   #buildRows() {
     if (this.#rows.size) return;
     for (const { name, title, question } of this.#entries) {
-      const button = create('button', { type: 'button', className: 'title', textContent: title });
-      button.addEventListener('click', () => {
+      const button = createButton('title', title, () => {
         this.#store.set({ diagnostic: name, options: '' });
         this.#store.flush();
         this.#backButton.focus();
@@ -279,8 +278,7 @@ export class Diagnostics {
     });
     const label = create('label', {}, name, input);
     if (name !== 'step') return label;
-    const button = create('button', { type: 'button', className: 'text quiet' }, 'current step');
-    button.addEventListener('click', () => {
+    const button = createButton('text quiet', 'current step', () => {
       input.value = String(this.#store.state.step);
       this.#setOptions();
     });

@@ -4,7 +4,7 @@
 /** @import { Catalog, DataSet, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
-import { create, element, html } from '../core/dom.js';
+import { create, createButton, element, html } from '../core/dom.js';
 import { isComplete } from '../core/episodes.js';
 import { fixed, mainText, mainUnit, percent, withUnit } from '../core/units.js';
 import { episodes } from '../data/api.js';
@@ -243,9 +243,8 @@ export class Episodes {
    * @param {EpisodeColumn[]} columns
    */
   #more(count, columns) {
-    const textContent = `Show ${Math.min(PAGE, count - this.#limit)} more of ${count} episodes`;
-    const button = create('button', { type: 'button', className: 'text', textContent });
-    button.addEventListener('click', () => {
+    const text = `Show ${Math.min(PAGE, count - this.#limit)} more of ${count} episodes`;
+    const button = createButton('text', text, () => {
       const scrolled = this.#table.parentElement;
       const top = scrolled?.scrollTop ?? 0;
       this.#limit += PAGE;
@@ -271,14 +270,8 @@ export class Episodes {
   #row(task, columns, episode, scale, i) {
     const { index } = episode.summary;
     const row = document.createElement('tr');
-    const button = create('button', {
-      type: 'button',
-      className: 'title',
-      textContent: String(index),
-      ariaLabel: `Episode ${index}`,
-      tabIndex: i ? -1 : 0,
-    });
-    button.addEventListener('click', () => this.#open(index, 0));
+    const properties = { ariaLabel: `Episode ${index}`, tabIndex: i ? -1 : 0 };
+    const button = createButton('title', String(index), () => this.#open(index, 0), properties);
     for (const { name, number, content } of columns) {
       const cell = row.insertCell();
       cell.className = number ? 'number' : '';

@@ -3,7 +3,7 @@
 /** @import { FailureEvent, FailureScore, Failures } from '../types/server.js' */
 
 import { copyText } from '../core/clipboard.js';
-import { create, element } from '../core/dom.js';
+import { create, createButton, element } from '../core/dom.js';
 import { displayName, fixed, percent, significant, stepLabel, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
@@ -92,13 +92,10 @@ export class EventTable {
   #row(columns, event, score, i) {
     const { episode, step, time, phase } = event;
     const row = document.createElement('tr');
-    const button = create('button', {
-      type: 'button',
-      className: 'title',
-      textContent: columns[0].content(event),
+    const open = (/** @type {MouseEvent} */ { timeStamp }) => this.#open(event, timeStamp);
+    const button = createButton('title', columns[0].content(event), open, {
       ariaLabel: `Episode ${episode}, ${stepLabel(step, time)}: ${score.title} ${formatScore(score, event.value)}, ${phase}`,
     });
-    button.addEventListener('click', ({ timeStamp }) => this.#open(event, timeStamp));
     columns.forEach(({ content, hint, number }, c) => {
       const cell = row.insertCell();
       if (number) cell.className = 'number';

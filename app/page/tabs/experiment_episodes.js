@@ -5,7 +5,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { HASH_DIGITS } from '../core/constants.js';
-import { create, html, messageOf } from '../core/dom.js';
+import { create, createButton, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { fixed, significant, stepLabel } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -121,10 +121,8 @@ export class EpisodePanel {
     html('h4', this.#section).textContent =
       `${name}${faults}: ${members.length === 1 ? 'one checkpoint' : `mean of ${members.length} checkpoints, the worst first`}`;
     const items = sortRows(members, ({ error }) => error, true).map((row) => {
-      const button = create('button', { type: 'button', className: 'text' }, row.name);
-      button.addEventListener('click', () =>
-        this.#store.set({ rows: 'checkpoints', cell: rowKey(row) }),
-      );
+      const open = () => this.#store.set({ rows: 'checkpoints', cell: rowKey(row) });
+      const button = createButton('text', row.name, open);
       const values = `RMSE ${fixed(row.error, 2)} ${row.unit}, NEES/n ${significant(row.nees)}`;
       return create('li', {}, button, create('span', { textContent: values }));
     });

@@ -6,7 +6,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 /** @typedef {{rows: (ExperimentRow | SeedGroup)[], columns: Column[], pinned: string[], sort: Sort, filters: string[]}} Contents */
 
-import { create, element } from '../core/dom.js';
+import { create, createButton, element } from '../core/dom.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading } from '../widgets/sorting.js';
 import { cellOf } from './experiment_groups.js';
@@ -92,15 +92,15 @@ export class ExperimentTable {
   #pinButton(key, title) {
     const { pinned } = this.#contents;
     const isPinned = pinned.includes(key);
-    const button = create('button', { type: 'button', className: 'quiet pin', textContent: '⇤' });
-    button.title = isPinned ? 'Unpin this column' : 'Pin this column at the left';
-    button.ariaLabel = `Pin ${title}`;
-    button.ariaPressed = String(isPinned);
-    button.addEventListener('click', () => {
+    const toggle = () => {
       const others = pinned.filter((name) => name !== key);
       this.#on.pin(isPinned ? others : [...others, key]);
+    };
+    return createButton('quiet pin', '⇤', toggle, {
+      title: isPinned ? 'Unpin this column' : 'Pin this column at the left',
+      ariaLabel: `Pin ${title}`,
+      ariaPressed: String(isPinned),
     });
-    return button;
   }
 
   /** Keeps the first column and those pinned at the left of the table when it scrolls. */

@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, Success, Task } from '../types/server.js' */
 
-import { create, element, html } from '../core/dom.js';
+import { create, createButton, element, html } from '../core/dom.js';
 import {
   displayName,
   fixed,
@@ -160,25 +160,20 @@ export class FinetuneRun {
   /** @param {number} steps */
   #longerButton(steps) {
     const title = `Fine-tune the base checkpoint again, with ${steps} steps; this run is kept`;
-    const textContent = 'Train longer';
-    const button = create('button', { type: 'button', className: 'text', textContent, title });
-    button.addEventListener('click', this.#handlers.trainLonger);
-    return button;
+    return createButton('text', 'Train longer', this.#handlers.trainLonger, { title });
   }
 
   /**
    * @param {Decision} decision
-   * @param {string} textContent
+   * @param {string} text
    * @param {string} title
    * @param {boolean} disabled
    * @param {string} [primary] decision
    */
-  #decisionButton(decision, textContent, title, disabled, primary) {
-    const properties = { textContent, title, disabled };
+  #decisionButton(decision, text, title, disabled, primary) {
     const className = decision === primary ? 'text primary' : 'text';
-    const button = create('button', { type: 'button', className, ...properties });
-    button.addEventListener('click', () => this.#handlers.decide(decision));
-    return button;
+    const decide = () => this.#handlers.decide(decision);
+    return createButton(className, text, decide, { title, disabled });
   }
 
   /**

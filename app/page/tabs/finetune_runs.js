@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Job, Plot } from '../types/server.js' */
 
-import { create } from '../core/dom.js';
+import { create, createButton } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { jobSummary } from '../widgets/jobs.js';
@@ -81,8 +81,7 @@ export class FinetuneRuns {
       settings,
       saved_as: place,
     } = run.run === current?.run ? { ...run, job: current.job } : run; // the list is older
-    const link = create('button', { type: 'button', className: 'title', textContent: name });
-    link.addEventListener('click', () => this.#store.set({ run: run.run }));
+    const link = createButton('title', name, () => this.#store.set({ run: run.run }));
     const [target, ...others] = success?.slices ?? [];
     const worst = others.sort((a, b) => Number(b.change) - Number(a.change))[0];
     const state = run.finetuned ? 'no criterion' : job ? stateOf(job) : 'removed';

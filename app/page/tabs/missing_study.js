@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog, StudyInfo } from '../types/server.js' */
 
-import { create } from '../core/dom.js';
+import { createButton } from '../core/dom.js';
 import { emptyNote } from '../widgets/empty_note.js';
 import { firstRun } from '../widgets/pickers.js';
 
@@ -22,12 +22,9 @@ export function missingStudy(study, catalog, store) {
   const selected = catalog.tasks.find((task) => task.name === name);
   const buttons = catalog.tasks
     .filter((task) => study.tasks.some((other) => other.name === task.name))
-    .map((task) => {
-      const textContent = `Show ${task.name}`;
-      const button = create('button', { type: 'button', className: 'text', textContent });
-      button.addEventListener('click', () => store.set(firstRun(task, store.state)));
-      return button;
-    });
+    .map((task) =>
+      createButton('text', `Show ${task.name}`, () => store.set(firstRun(task, store.state))),
+    );
   const source = study.name === 'shipped' ? 'built-in study' : `study ${study.name}`;
   return emptyNote({
     title: `No study of ${name} yet`,

@@ -2,7 +2,7 @@
 
 /** @import { ModuleInfo } from '../types/server.js' */
 
-import { create } from '../core/dom.js';
+import { create, createButton } from '../core/dom.js';
 import { significant } from '../core/units.js';
 
 /**
@@ -109,14 +109,15 @@ export class ModuleDiagram {
     // A module with a single part is drawn as one box.
     if (children.length === 1) return this.#box(children[0], label);
     const text = [description || kind, `${parameters.toLocaleString('en')} parameters`];
-    const button = create(
-      'button',
-      { type: 'button', role: 'checkbox', ariaLabel: `Train ${name}` },
+    const button = createButton('', '', () => this.#toggle(name), {
+      role: 'checkbox',
+      ariaLabel: `Train ${name}`,
+      title: [name, ...text, changeSummary(module)].filter(Boolean).join('\n'),
+    });
+    button.append(
       create('b', { textContent: label.replaceAll('_', ' ') }),
       create('small', { textContent: shortCount(parameters) }),
     );
-    button.title = [name, ...text, changeSummary(module)].filter(Boolean).join('\n');
-    button.addEventListener('click', () => this.#toggle(name));
     this.#boxes.push({ module, parameters: this.#within(name), button });
     const inside = children.map((child) => this.#box(child));
     const box = create('div', { className: inside.length ? 'module group' : 'module' }, button);

@@ -7,7 +7,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
-import { create, html, messageOf } from '../core/dom.js';
+import { create, createButton, html, messageOf } from '../core/dom.js';
 import { recordingRequest } from '../data/api.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { writeRecording } from '../widgets/save_button.js';
@@ -55,9 +55,7 @@ export class Rerun {
     this.#host = host;
     this.#jobs = jobs;
     this.#onMove = onMove;
-    const back = create('button', { type: 'button', className: 'text' }, 'Back to the current run');
-    back.addEventListener('click', () => this.files(null));
-    this.#bar.append(back);
+    this.#bar.append(createButton('text', 'Back to the current run', () => this.files(null)));
     host.append(this.#bar);
   }
 

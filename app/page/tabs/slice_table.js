@@ -2,7 +2,7 @@
 
 /** @import { FailureScore, ErrorSlice, Condition } from '../types/server.js' */
 
-import { create, element } from '../core/dom.js';
+import { create, createButton, element } from '../core/dom.js';
 import { percent, sentence, significant, withUnit } from '../core/units.js';
 import { navigateRows } from '../widgets/row_navigation.js';
 import { markRow } from './event_table.js';
@@ -73,20 +73,18 @@ export class SliceTable {
     const { inside, outside, episodes, steps, share, worst } = slice;
     const [episode, step] = worst;
     const row = document.createElement('tr');
-    const button = create('button', {
-      type: 'button',
-      className: 'title',
-      textContent: sliceText(slice),
+    const open = (/** @type {MouseEvent} */ { timeStamp }) =>
+      this.#open({ episode, step }, timeStamp);
+    const button = createButton('title', sliceText(slice), open, {
       title: `Open the worst step: episode ${episode}, step ${step}`,
       ariaLabel: `${sliceSentence(slice, score, count)} Worst: episode ${episode}, step ${step}`,
       tabIndex: i ? -1 : 0,
     });
-    button.addEventListener('click', ({ timeStamp }) => this.#open({ episode, step }, timeStamp));
     row.insertCell().append(button);
     const texts = [
       significant(inside && scale * inside),
       significant(outside && scale * outside),
-      ratioText(slice),
+      ratioText(slice, ' ×'),
       `${episodes.length} of ${count}`,
       `${steps} (${percent(share)})`,
     ];
@@ -118,22 +116,23 @@ function headingsOf(score) {
  * @param {number} count of searched episodes
  */
 export function sliceSentence(slice, score, count) {
-  const { ratio, low, high, episodes, share } = slice;
-  const interval = low === null || high === null ? '' : ` (${factor(low)} to ${factor(high)})`;
-  const size = `${episodes.length} of ${count} episodes, ${percent(share)} of steps`;
-  const where = slice.conditions.map(conditionText).join(' and ');
+  const size = `${slice.episodes.length} of ${count} episodes, ${percent(slice.share)} of steps`;
   return sentence(
-    `${score.title} is ${factor(ratio)} times as large${interval} where ${where}: ${size}`,
+    `${score.title} is ${ratioText(slice, ' times as large')} where ${sliceText(slice)}: ${size}`,
   );
 }
 
 /** @param {ErrorSlice} slice */
 const sliceText = ({ conditions }) => conditions.map(conditionText).join(' and ');
 
-/** @param {ErrorSlice} slice */
-function ratioText({ ratio, low, high }) {
+/**
+ * Returns the ratio with its unit, and its interval.
+ * @param {ErrorSlice} slice
+ * @param {string} unit
+ */
+function ratioText({ ratio, low, high }, unit) {
   const interval = low === null || high === null ? '' : ` (${factor(low)} to ${factor(high)})`;
-  return `${factor(ratio)} ×${interval}`;
+  return `${factor(ratio)}${unit}${interval}`;
 }
 
 /** @param {string} number without zeros at its end */

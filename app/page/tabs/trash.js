@@ -2,7 +2,7 @@
 
 /** @import { DeletedFile } from '../types/server.js' */
 
-import { create, element, html } from '../core/dom.js';
+import { create, createButton, element, html } from '../core/dom.js';
 import { formatBytes, plural } from '../core/units.js';
 import { formatDate, smallNote } from './recording_columns.js';
 
@@ -66,14 +66,10 @@ export class Trash {
 
   /** @param {DeletedFile & TrashedFile} file */
   #item(file) {
-    const button = create('button', {
-      type: 'button',
-      className: 'text quiet',
-      textContent: 'Restore',
+    const button = createButton('text quiet', 'Restore', () => this.#restore(file), {
       ariaLabel: `Restore ${file.name}`,
       disabled: Boolean(this.#disabledReason),
     });
-    button.addEventListener('click', () => this.#restore(file));
     const date = formatDate(new Date(1000 * file.deleted));
     const note = smallNote(`${formatBytes(file.bytes)}, deleted ${date}`);
     return create('li', {}, button, file.name, note);

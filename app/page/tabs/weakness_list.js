@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Weakness } from '../types/server.js' */
 
-import { create, html } from '../core/dom.js';
+import { create, createButton, html } from '../core/dom.js';
 import { typeset } from '../core/units.js';
 
 export class WeaknessList {
@@ -42,13 +42,10 @@ export class WeaknessList {
       create('p', { textContent: typeset(evidence) }),
     );
     if (episode !== null) {
-      const textContent = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;
-      const link = create('button', { type: 'button', className: 'text quiet', textContent });
-      link.title = 'Show this step';
-      link.addEventListener('click', () =>
-        this.#store.set({ episode, step: step ?? 0, tab: 'diagnosis', playing: false }),
-      );
-      item.append(link);
+      const text = step === null ? `episode ${episode}` : `episode ${episode}, step ${step}`;
+      const open = () =>
+        this.#store.set({ episode, step: step ?? 0, tab: 'diagnosis', playing: false });
+      item.append(createButton('text quiet', text, open, { title: 'Show this step' }));
     }
     return item;
   }

@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
-import { create, html } from '../core/dom.js';
+import { create, createButton, html } from '../core/dom.js';
 import { choice } from '../widgets/pickers.js';
 import { FIXED_CHARTS, chartKeys, formatCharts, moved, toggled } from './chart_list.js';
 import { trackOptions } from './tracks.js';
@@ -85,15 +85,13 @@ export class ChartMenu {
       ['↓', 'down', 1],
     ]);
     for (const [text, direction, places] of arrows) {
-      const name = `Move ${label} ${direction}`;
-      const button = create('button', { type: 'button', textContent: text, ariaLabel: name });
-      button.className = direction;
-      button.disabled = keys.at(places < 0 ? 0 : -1) === key;
-      button.addEventListener('click', () => {
+      const move = () => {
         this.#set(moved(keys, key, places));
         this.#focus(key, `.${direction}`);
-      });
-      row.append(button);
+      };
+      const ariaLabel = `Move ${label} ${direction}`;
+      const disabled = keys.at(places < 0 ? 0 : -1) === key;
+      row.append(createButton(direction, text, move, { ariaLabel, disabled }));
     }
     return row;
   }

@@ -2,7 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 
-import { create } from '../core/dom.js';
+import { createButton } from '../core/dom.js';
 import { stepLabel } from '../core/units.js';
 
 /**
@@ -77,16 +77,15 @@ export class EventMarks {
   #mark({ step, time, label, measure }) {
     const name = stepLabel(step, time);
     const prefix = measure && !label.startsWith(measure) ? `${measure}, ` : '';
-    const button = create('button', {
-      type: 'button',
+    const press = (/** @type {MouseEvent} */ event) => {
+      this.#store.set({ step, playing: false }, { inputTime: event.timeStamp });
+      if (event.detail) button.blur(); // after a mouse click the page's keys work again
+    };
+    const button = createButton('', '', press, {
       tabIndex: -1,
       ariaLabel: `${name[0].toUpperCase()}${name.slice(1)}: ${prefix}${label}`,
     });
     button.addEventListener('pointerdown', (event) => event.stopPropagation()); // no scrubbing
-    button.addEventListener('click', (event) => {
-      this.#store.set({ step, playing: false }, { inputTime: event.timeStamp });
-      if (event.detail) button.blur(); // after a mouse click the page's keys work again
-    });
     return { step, button, current: false };
   }
 

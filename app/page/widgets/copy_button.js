@@ -1,7 +1,7 @@
 /** Buttons that copy a text. */
 
 import { copyText } from '../core/clipboard.js';
-import { create } from '../core/dom.js';
+import { createButton } from '../core/dom.js';
 
 const MESSAGE_TIME = 1500; // ms
 
@@ -11,11 +11,10 @@ const MESSAGE_TIME = 1500; // ms
  * @param {() => string} content what it copies
  */
 export function copyButton(text, label, content) {
-  const button = create('button', { type: 'button', className: 'text quiet', textContent: text });
-  button.ariaLabel = label;
-  button.addEventListener('click', async () => {
+  const copy = async () => {
     button.textContent = (await copyText(content())) ? 'Copied' : 'Not permitted';
     setTimeout(() => (button.textContent = text), MESSAGE_TIME);
-  });
+  };
+  const button = createButton('text quiet', text, copy, { ariaLabel: label });
   return button;
 }

@@ -2,7 +2,7 @@
 
 /** @import { Fault } from '../data/api.js' */
 
-import { create, element, html, messageOf, setOptions } from '../core/dom.js';
+import { createButton, element, html, messageOf, setOptions } from '../core/dom.js';
 
 const OTHER = 'other';
 
@@ -106,18 +106,13 @@ export function faultPicker(select, dialog, { none, selected, choose, check }) {
  */
 function faultRow({ fault, meaning, parameters }, input) {
   const specific = parameters.slice(0, -2); // without `from` and `to`, which every fault has
-  const button = create('button', {
-    type: 'button',
-    className: 'text quiet',
-    textContent: fault,
-    title: 'Add this fault',
-  });
-  button.addEventListener('click', () => {
+  const add = () => {
     const value = parameters[0].default ?? '';
     input.value = [input.value.trim(), `${fault}=${value}`].filter(Boolean).join(',');
     input.dispatchEvent(new Event('input'));
     input.focus();
-  });
+  };
+  const button = createButton('text quiet', fault, add, { title: 'Add this fault' });
   const defaults = specific.map((p) => (p.default === null ? p.name : `${p.name}=${p.default}`));
   const row = document.createElement('tr');
   for (const cell of [button, defaults.join(' '), meaning]) row.insertCell().append(cell);

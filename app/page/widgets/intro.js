@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog } from '../types/server.js' */
 
-import { create, html, openBelow } from '../core/dom.js';
+import { create, createButton, html, openBelow } from '../core/dom.js';
 import { parsePermalink } from '../core/state.js';
 import { emptyNote } from './empty_note.js';
 
@@ -21,16 +21,9 @@ export class Intro {
   constructor(host, catalog, store, startTour) {
     this.#host = host;
     const chips = catalog.examples.map((example) => {
-      const chip = create(
-        'button',
-        { type: 'button', className: 'chip', title: example.help },
-        example.title,
-      );
+      const open = () => example.setup || store.set(parsePermalink(example.link, catalog).state);
+      const chip = createButton('chip', example.title, open, { title: example.help });
       if (example.setup) openSetup(chip, example);
-      else
-        chip.addEventListener('click', () =>
-          store.set(parsePermalink(example.link, catalog).state),
-        );
       return chip;
     });
     if (!chips.length) this.#isShown = false;

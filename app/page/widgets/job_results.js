@@ -3,7 +3,7 @@
 /** @import { Job, JobReply } from '../types/server.js' */
 /** @import { Jobs } from './jobs.js' */
 
-import { create, html, messageOf } from '../core/dom.js';
+import { create, createButton, html, messageOf } from '../core/dom.js';
 import { ServerError } from '../data/server_error.js';
 import { isActive } from './jobs.js';
 
@@ -171,9 +171,8 @@ export function showJobButton(host, { state, job, isRefusal }, button) {
     host.replaceChildren();
     if (state === 'active') host.append(create('progress', { ariaLabel: progress }));
     if (action) {
-      const start = create('button', { type: 'button', className: 'text', textContent: action });
+      const start = createButton('text', action, press);
       if (label) start.ariaLabel = label;
-      start.addEventListener('click', press);
       host.append(start);
     }
     if (hadFocus) (action ? html('button', host) : next)?.focus();

@@ -1,6 +1,6 @@
 /** States of a panel without content, and the messages at the top of the page. */
 
-import { create, html } from '../core/dom.js';
+import { create, createButton, html } from '../core/dom.js';
 import { sentence } from '../core/units.js';
 
 /**
@@ -27,9 +27,7 @@ export function setPanelState(body, state, text = '', share = null) {
  */
 export function setPanelError(body, text, retry) {
   setPanelState(body, 'error', text);
-  const button = create('button', { type: 'button', className: 'text', textContent: 'Try again' });
-  button.addEventListener('click', retry);
-  html('.note', body).append(button);
+  html('.note', body).append(createButton('text', 'Try again', retry));
 }
 
 /** Messages at the top of the page, one per key; each stays until it is replaced, cleared or dismissed. */
@@ -60,10 +58,9 @@ export class Messages {
    * @param {string} text
    */
   #append(key, text) {
-    const close = create('button', { type: 'button', textContent: '×', ariaLabel: 'Dismiss' });
+    const close = createButton('', '×', () => line.remove(), { ariaLabel: 'Dismiss' });
     const line = create('p', {}, create('span', { textContent: text }), close);
     line.dataset.key = key;
-    close.addEventListener('click', () => line.remove());
     this.#host.append(line);
   }
 }

@@ -3,7 +3,7 @@
 /** @import { ReportOptions, Selection } from '../data/api.js' */
 /** @import { Trace } from '../data/trace.js' */
 
-import { create, element, html, messageOf } from '../core/dom.js';
+import { create, createButton, element, html, messageOf } from '../core/dom.js';
 
 const STEP = /^\d+$/;
 const BODY = `
@@ -104,11 +104,9 @@ export class ReportDialog {
     /** @type {[string, number][]} */
     const steps = [[`current step ${step}`, step]];
     if (isPinned) steps.push([`pinned step ${pinned.maps.step}`, pinned.maps.step]);
-    const buttons = steps.map(([textContent, value]) => {
-      const button = create('button', { type: 'button', className: 'text quiet', textContent });
-      button.addEventListener('click', () => this.#add(value));
-      return button;
-    });
+    const buttons = steps.map(([text, value]) =>
+      createButton('text quiet', text, () => this.#add(value)),
+    );
     html('.offered', this.#form).replaceChildren('Add ', ...buttons);
   }
 

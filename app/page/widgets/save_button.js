@@ -1,10 +1,9 @@
 /** "Save .rrd": writes a recording, shows the progress and downloads the file; resumes after a reload. */
 
-/** @import { Job, Recording } from '../data/api.js' */
-/** @import { RecordingRequest } from '../data/api.js' */
+/** @import { Job, Recording, RecordingRequest } from '../data/api.js' */
 /** @import { Jobs } from './jobs.js' */
 
-import { create, messageOf } from '../core/dom.js';
+import { create, createButton, messageOf } from '../core/dom.js';
 import { fixed, formatBytes, percent } from '../core/units.js';
 import * as api from '../data/api.js';
 import { jobSummary } from './jobs.js';
@@ -44,8 +43,7 @@ export async function writeRecording(request, jobs, progress) {
 export function connectSaveButton(button, host, jobs, { request, openRerun, openRecordings }) {
   /** @param {...(Node | string)} children */
   const show = (...children) => {
-    const close = action('×', () => host.replaceChildren(), '');
-    close.ariaLabel = 'Dismiss';
+    const close = createButton('', '×', () => host.replaceChildren(), { ariaLabel: 'Dismiss' });
     host.replaceChildren(create('p', {}, ...children, close));
   };
   let isWriting = false;
@@ -56,7 +54,7 @@ export function connectSaveButton(button, host, jobs, { request, openRerun, open
     sessionStorage.setItem(PENDING_REQUEST, JSON.stringify(body));
     [button.disabled, button.textContent] = [true, 'Writing …'];
     const progress = create('progress', { ariaLabel: 'Progress of the recording', hidden: true });
-    const cancel = action('Cancel', () => jobs.cancel(cancel.value));
+    const cancel = createButton('text', 'Cancel', () => jobs.cancel(cancel.value));
     cancel.hidden = true;
     show('Writing the recording …', progress, cancel);
     try {
@@ -72,8 +70,9 @@ export function connectSaveButton(button, host, jobs, { request, openRerun, open
       show(
         link,
         ` ${formatBytes(bytes)}, ${duration} `,
-        action('Open in Rerun tab', leave(openRerun)),
-        action(
+        createButton('text', 'Open in Rerun tab', leave(openRerun)),
+        createButton(
+          'text',
           'Recordings',
           leave(() => openRecordings(name)),
         ),
@@ -92,16 +91,4 @@ export function connectSaveButton(button, host, jobs, { request, openRerun, open
   const unfinished = sessionStorage.getItem(PENDING_REQUEST);
   if (unfinished) save(JSON.parse(unfinished));
   return saveDisplayed;
-}
-
-/**
- * Creates a button.
- * @param {string} textContent
- * @param {() => void} handler
- * @param {string} [className]
- */
-function action(textContent, handler, className = 'text') {
-  const button = create('button', { type: 'button', className, textContent });
-  button.addEventListener('click', handler);
-  return button;
 }

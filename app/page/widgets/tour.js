@@ -1,6 +1,6 @@
 /** A tour of the page in six steps, each beside the part that it explains. */
 
-import { create } from '../core/dom.js';
+import { create, createButton } from '../core/dom.js';
 
 /** @typedef {{part: string, title: string, text: string}} TourStep part: selector */
 
@@ -69,20 +69,16 @@ export class Tour {
   #title = create('h2', { id: 'tour-title' });
   #text = create('p');
   #count = create('span');
-  #back = create('button', { type: 'button', className: 'text', textContent: 'Back' });
-  #next = create('button', { type: 'button', className: 'text next' });
+  #back = createButton('text', 'Back', () => this.#show(this.#step - 1));
+  #next = createButton('text next', '', () => this.#show(this.#step + 1));
   #box;
   #step = 0;
   /** Has the focus again at the end. @type {HTMLElement | null} */
   #opener = null;
 
   constructor() {
-    const close = create('button', {
-      type: 'button',
-      className: 'text quiet close',
-      ariaLabel: 'End the tour',
-      textContent: '×',
-    });
+    const label = { ariaLabel: 'End the tour' };
+    const close = createButton('text quiet close', '×', () => this.end(), label);
     const buttons = create('div', { className: 'buttons' }, this.#count, this.#back, this.#next);
     this.#box = create(
       'div',
@@ -94,9 +90,6 @@ export class Tour {
     );
     this.#box.setAttribute('aria-labelledby', 'tour-title');
     this.#text.ariaLive = 'polite';
-    this.#back.addEventListener('click', () => this.#show(this.#step - 1));
-    this.#next.addEventListener('click', () => this.#show(this.#step + 1));
-    close.addEventListener('click', () => this.end());
     this.#box.addEventListener('keydown', (event) => {
       const direction = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
       if (event.key === 'Escape') this.end();

@@ -2,7 +2,7 @@
 
 /** @import { RecordingEntry } from '../types/server.js' */
 
-import { create, messageOf } from '../core/dom.js';
+import { create, createButton, messageOf } from '../core/dom.js';
 import { formatBytes, percent } from '../core/units.js';
 import { ServerError } from '../data/server_error.js';
 
@@ -48,16 +48,15 @@ export class Uploads {
       textContent: `${file.name}, ${formatBytes(file.size)}: waiting`,
     });
     const bar = create('progress', { max: 1, value: 0, ariaLabel: `Progress of ${file.name}` });
-    const button = create('button', { type: 'button', className: 'text quiet' }, 'Cancel');
-    const line = create('li', {}, text, bar, button);
-    this.#host.append(line);
     const request = new XMLHttpRequest();
     let cancelled = false;
-    button.addEventListener('click', () => {
+    const button = createButton('text quiet', 'Cancel', () => {
       cancelled = true;
       request.abort();
       line.remove();
     });
+    const line = create('li', {}, text, bar, button);
+    this.#host.append(line);
     await previous;
     if (cancelled) return;
     try {
