@@ -2,7 +2,7 @@
 
 import { Trace } from '../../app/page/data/trace.js';
 
-/** @type {import('../../app/page/data/api.js').Task} */
+/** @type {import('../../app/page/types/server.js').Task} */
 export const TASK = {
   name: 'door',
   components: [
@@ -40,7 +40,7 @@ export const TASK = {
   ],
 };
 
-/** @type {import('../../app/page/data/api.js').Catalog} */
+/** @type {import('../../app/page/types/server.js').Catalog} */
 export const CATALOG = {
   version: '0',
   read_only: false,
@@ -77,7 +77,7 @@ export function makeTrace(arrays, header = {}, images = null) {
   return new Trace(
     TASK,
     selection,
-    /** @type {import('../../app/page/data/api.js').TraceHeader} */ ({
+    /** @type {import('../../app/page/types/server.js').TraceHeader} */ ({
       steps: arrays.truth.shape[0],
       dt: 0.1,
       kind: 'ekf',

@@ -2,7 +2,6 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { ServerError } from '../../app/page/data/server_error.js';
 import { isTrainable, placeLabel, recoveredText } from '../../app/page/tabs/diagnosis_cause.js';
 import { JobResults } from '../../app/page/widgets/job_results.js';
 
@@ -10,6 +9,18 @@ const { signal } = new AbortController();
 
 /** @param {string} state */
 const job = (state) => /** @type {any} */ ({ id: 'a', state });
+
+/**
+ * Lets the server answer all requests in the same way.
+ * @param {object | null} body JSON; null: the request is not expected
+ * @param {number} [status]
+ */
+function answer(body, status = 200) {
+  globalThis.fetch = async (_, options) => {
+    options?.signal?.throwIfAborted();
+    return body ? Response.json(body, { status }) : assert.fail('the result is known');
+  };
+}
 
 /** Results with a list of jobs that the test controls. */
 function setUp(capacity = 2) {
@@ -28,46 +39,55 @@ function setUp(capacity = 2) {
 
 test('a job is started, followed and cancelled; its result is loaded again when it is done', async () => {
   const { results, cancelled, finished, update } = setUp();
-  await results.load('run', async () => ({ job: null }), signal);
+  answer({ job: null });
+  await results.load('run', '/run', signal);
   assert.equal(results.get('run').state, 'absent');
-  await results.startOrCancel('run', async () => ({ job: job('waiting') }));
+  answer({ job: job('waiting') });
+  await results.startOrCancel('run', '/run');
   assert.equal(results.get('run').state, 'active');
-  await results.startOrCancel('run', () => assert.fail('it is active'));
+  answer(null);
+  await results.startOrCancel('run', '/run');
   assert.deepEqual(cancelled, ['a']);
   update(job('failed'));
   assert.equal(results.get('run').state, 'ended');
   update(job('done'));
   assert.deepEqual(finished, ['run']);
-  await results.load('run', async () => ({ value: 1 }), signal);
+  answer({ value: 1 });
+  await results.load('run', '/run', signal);
   assert.deepEqual(results.get('run'), { state: 'ready', result: { value: 1 } });
-  await results.load('run', () => assert.fail('it is known'), signal);
+  answer(null);
+  await results.load('run', '/run', signal);
 });
 
 test('a preliminary result is kept until the result replaces it', async () => {
   const { results, update } = setUp();
   const preliminary = { value: 0 };
-  await results.load('run', async () => ({ job: null, preliminary }), signal);
-  await results.startOrCancel('run', async () => ({ job: job('waiting') }));
+  answer({ job: null, preliminary });
+  await results.load('run', '/run', signal);
+  answer({ job: job('waiting') });
+  await results.startOrCancel('run', '/run');
   for (const state of ['running', 'done']) {
     update(job(state));
-    assert.equal(results.get('run').preliminary, preliminary);
+    assert.deepEqual(results.get('run').preliminary, preliminary);
   }
-  await results.load('run', async () => ({ value: 1 }), signal);
+  answer({ value: 1 });
+  await results.load('run', '/run', signal);
   assert.deepEqual(results.get('run'), { state: 'ready', result: { value: 1 } });
 });
 
 test('an error is kept, an aborted request is not, and the oldest result is dropped', async () => {
   const { results } = setUp();
-  const fail = () => Promise.reject(new Error('no such filter'));
-  await results.load('one', fail, signal);
+  answer({ error: 'no such filter' }, 404);
+  await results.load('one', '/one', signal);
   assert.deepEqual(results.get('one'), {
     state: 'error',
-    error: 'no such filter',
+    error: 'No such filter.',
     isRefusal: false,
   });
-  await results.load('two', fail, AbortSignal.abort());
+  await results.load('two', '/two', AbortSignal.abort());
   assert.equal(results.get('two').state, 'loading');
-  await results.load('three', async () => ({}), signal);
+  answer({});
+  await results.load('three', '/three', signal);
   assert.equal(results.get('one').state, 'loading');
 });
 
@@ -76,10 +96,10 @@ test('a request that the server refused cannot be tried again, unlike one that f
   for (const [status, isRefusal] of [
     [400, true],
     [429, false],
-    [0, false],
+    [500, false],
   ]) {
-    const error = new ServerError('5 held-out episodes', Number(status));
-    await results.startOrCancel('run', () => Promise.reject(error));
+    answer({ error: '5 held-out episodes' }, Number(status));
+    await results.startOrCancel('run', '/run');
     assert.deepEqual(results.get('run'), {
       state: 'error',
       error: '5 held-out episodes.',

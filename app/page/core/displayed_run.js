@@ -1,6 +1,6 @@
 /** The displayed run: its trace, which follows the selection in the state, and the panels, which follow both. */
 
-/** @import { Catalog } from '../data/api.js' */
+/** @import { Catalog } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Handlers } from '../data/view_socket.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */

@@ -1,6 +1,6 @@
 /** The page: its panels, tabs and commands. */
 
-/** @import { Catalog, LiveList, Selection } from '../data/api.js' */
+/** @import { Catalog, LiveList, Selection } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Tabs } from '../tabs/tabs.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */

@@ -1,6 +1,6 @@
 /** The state of the page and its permalink: opening the link restores the state. */
 
-/** @import { Catalog } from '../data/api.js' */
+/** @import { Catalog } from '../types/server.js' */
 /** @import { DataSet, LiveList } from '../types/server.js' */
 
 import { SCALAR, TRACKS } from '../timeline/tracks.js';

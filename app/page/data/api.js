@@ -1,6 +1,10 @@
 /** Requests to the server (docs/api.md). */
 
 /** @import { State } from '../core/state.js' */
+/** @import { Catalog, Comparison, EpisodeList, EpisodeResults, ExperimentRow, Experiments, FineTuneDetails } from '../types/server.js' */
+/** @import { FineTuneOffer, FineTuneRunInfo, Job, JobWithLog, Lineage, LiveList, RecordingEntry, RecordingList } from '../types/server.js' */
+/** @import { ReportList, Selection, StartedJob, StudyList, SweepList, Task, TraceDiagnosticInfo, TraceHeader } from '../types/server.js' */
+/** @import { Weakness, WrittenRecording } from '../types/server.js' */
 
 import { isAbort } from '../core/dom.js';
 import { loadLiveTrace } from './live_stream.js';
@@ -9,40 +13,6 @@ import { Trace } from './trace.js';
 
 export { ServerError };
 
-/**
- * @typedef {import('../types/server.js').Catalog} Catalog
- * @typedef {import('../types/server.js').Comparison} Comparison
- * @typedef {import('../types/server.js').DiagnosticResult} DiagnosticResult
- * @typedef {import('../types/server.js').FailureEvent} FailureEvent
- * @typedef {import('../types/server.js').Diagnosis} Diagnosis
- * @typedef {import('../types/server.js').EpisodeList} EpisodeList
- * @typedef {import('../types/server.js').EpisodeResults} EpisodeResults
- * @typedef {import('../types/server.js').ExperimentRow} ExperimentRow
- * @typedef {import('../types/server.js').Experiments} Experiments
- * @typedef {import('../types/server.js').Failures} Failures
- * @typedef {import('../types/server.js').FineTuneDetails} FineTuneDetails
- * @typedef {import('../types/server.js').FineTuneOffer} FineTuneOffer
- * @typedef {import('../types/server.js').Weakness} Weakness
- * @typedef {import('../types/server.js').FineTuneRunInfo} FineTuneRunInfo
- * @typedef {import('../types/server.js').Job} Job
- * @typedef {import('../types/server.js').JobReply} JobReply
- * @typedef {import('../types/server.js').JobWithLog} JobWithLog
- * @typedef {import('../types/server.js').Lineage} Lineage
- * @typedef {import('../types/server.js').LiveList} LiveList
- * @typedef {import('../types/server.js').LiveRun} LiveRun
- * @typedef {import('../types/server.js').RecordingEntry} RecordingEntry
- * @typedef {import('../types/server.js').RecordingList} RecordingList
- * @typedef {import('../types/server.js').ReportList} ReportList
- * @typedef {import('../types/server.js').Selection} Selection
- * @typedef {import('../types/server.js').StartedJob} StartedJob
- * @typedef {import('../types/server.js').StudyList} StudyList
- * @typedef {import('../types/server.js').SweepList} SweepList
- * @typedef {import('../types/server.js').Task} Task
- * @typedef {import('../types/server.js').TraceDiagnosticInfo} TraceDiagnosticInfo
- * @typedef {import('../types/server.js').TraceHeader} TraceHeader
- * @typedef {import('../types/server.js').WrittenRecording} Recording
- * @typedef {import('../types/server.js').FaultInfo} Fault
- */
 /** @typedef {Selection & {maps: number, quantity: State['map']}} RecordingRequest maps: steps from one map of the quantity to the next */
 
 const POLL_INTERVAL = 150; // ms
@@ -90,11 +60,12 @@ async function send(url, body, method = 'POST') {
 }
 
 /**
- * Gets JSON, and waits while the server computes the trace that it depends on.
+ * Gets JSON, such as the result of a job or the job itself, and waits while the server computes the trace that it
+ * depends on.
  * @param {string} url
  * @param {AbortSignal} [signal]
  */
-async function poll(url, signal) {
+export async function poll(url, signal) {
   for (;;) {
     const body = await get(url, signal);
     if (!('progress' in body)) return body;
@@ -102,12 +73,19 @@ async function poll(url, signal) {
   }
 }
 
+/**
+ * Starts the job that computes the result at an address.
+ * @param {string} url
+ * @returns {Promise<StartedJob>}
+ */
+export const startJob = (url) => send(url);
+
 const pause = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL));
 
 /**
  * Joins parts of a path, encoded, and a query.
  * @param {(string | number)[]} parts
- * @param {Record<string, string>} [query]
+ * @param {Record<string, string> | string[][]} [query]
  */
 function path(parts, query) {
   const text = parts.map((part) => encodeURIComponent(part)).join('/');
@@ -122,9 +100,10 @@ function path(parts, query) {
  */
 export const catalog = (task, filters = []) =>
   get(
-    task
-      ? `/api/catalog?${new URLSearchParams([['task', task], ...filters.map((name) => ['filter', name])])}`
-      : '/api/catalog',
+    path(
+      ['catalog'],
+      task ? [['task', task], ...filters.map((name) => ['filter', name])] : undefined,
+    ),
   );
 
 /**
@@ -135,7 +114,7 @@ export const catalog = (task, filters = []) =>
  */
 export const episodes = (task, data, part) => {
   const texts = Object.entries(part).map(([key, value]) => [key, String(value)]);
-  return get(`${path(['episodes', task])}?${new URLSearchParams([['data', data], ...texts])}`);
+  return get(path(['episodes', task], [['data', data], ...texts]));
 };
 
 /**
@@ -177,13 +156,22 @@ export const sensorImages = async (selection, sensor) =>
 export const checkSelection = (selection) => request(traceUrl(selection));
 
 /**
+ * Returns the address of a result for a run.
+ * @param {string[]} result
+ * @param {Selection} selection
+ * @param {Record<string, string>} [query]
+ */
+const runUrl = (result, { task, filter, data, episode, faults }, query) =>
+  path([...result, task, filter, episode], { data, faults, ...query });
+
+/**
  * Compares a run with another one.
  * @param {Selection} selection with `against`
  * @param {AbortSignal} [signal]
  * @returns {Promise<Comparison>}
  */
-export const comparison = ({ task, filter, data, episode, faults, against = '' }, signal) =>
-  poll(path(['compare', task, filter, episode], { data, faults, against }), signal);
+export const comparison = (selection, signal) =>
+  poll(runUrl(['compare'], selection, { against: selection.against ?? '' }), signal);
 
 /**
  * Loads a trace with its columns and images, and waits while the server computes it.
@@ -217,130 +205,49 @@ export async function loadTrace(task, selection, progress, signal) {
 }
 
 /**
- * @param {Selection} selection
- * @param {string[]} name of a diagnostic, or nothing
- * @param {Record<string, string>} [query]
- */
-const diagnosticUrl = ({ task, filter, data, episode, faults }, name, query = {}) =>
-  path(['diagnostics', ...name, task, filter, episode], { data, faults, ...query });
-
-/**
  * Lists the diagnostics of a run.
  * @param {Selection} selection
  * @param {AbortSignal} [signal]
  * @returns {Promise<TraceDiagnosticInfo[]>}
  */
-export const diagnostics = (selection, signal) => poll(diagnosticUrl(selection, []), signal);
+export const diagnostics = (selection, signal) => poll(runUrl(['diagnostics'], selection), signal);
 
 /**
- * Gets the result of a diagnostic, or its job.
+ * Returns the address of the result of a diagnostic.
  * @param {Selection} selection
  * @param {string} name
  * @param {Record<string, string>} query options, and `episodes`
- * @param {AbortSignal} [signal]
- * @returns {Promise<DiagnosticResult | JobReply>}
  */
-export const diagnostic = (selection, name, query, signal) =>
-  poll(diagnosticUrl(selection, [name], query), signal);
+export const diagnosticUrl = (selection, name, query) =>
+  runUrl(['diagnostics', name], selection, query);
 
 /**
- * Starts a diagnostic as a job.
- * @param {Selection} selection
- * @param {string} name
- * @param {Record<string, string>} query options, and `episodes`
- * @returns {Promise<StartedJob>}
- */
-export const startDiagnostic = (selection, name, query) =>
-  send(diagnosticUrl(selection, [name], query));
-
-/**
+ * Returns the address of the diagnosis of a filter.
  * @param {Selection} selection
  * @param {string} over episodes: `episode` or `held-out`
  */
-const diagnosisUrl = ({ task, filter, episode, data, faults }, over) =>
-  path(['diagnosis', task, filter, episode], { data, faults, over });
+export const diagnosisUrl = (selection, over) => runUrl(['diagnosis'], selection, { over });
 
 /**
+ * Returns the address of the healthy record of a filter, measured from the held-out episodes of a run's data.
  * @param {Selection} run
  * @param {string} healthyFilter runs over the healthy episodes; empty: the filter of the run
  */
-const recordUrl = ({ task, filter, data }, healthyFilter) =>
+export const recordUrl = ({ task, filter, data }, healthyFilter) =>
   path(['healthy-record', task, filter], { data, healthy_filter: healthyFilter });
 
 /**
- * Gets the healthy record that was measured for a filter, or the job that measures it.
- * @param {Selection} run
- * @param {string} healthyFilter
- * @param {AbortSignal} signal
- * @returns {Promise<import('../types/server.js').HealthyRecord | JobReply>}
- */
-export const healthyRecord = (run, healthyFilter, signal) =>
-  get(recordUrl(run, healthyFilter), signal);
-
-/**
- * Starts the measurement of a filter's healthy record from the held-out episodes of a run's data.
- * @param {Selection} run
- * @param {string} healthyFilter
- * @returns {Promise<JobReply>}
- */
-export const measureHealthyRecord = (run, healthyFilter) => send(recordUrl(run, healthyFilter));
-
-/**
- * Gets the diagnosis of a filter, or its job.
+ * Returns the address of the smallest repair of a run.
  * @param {Selection} selection
- * @param {string} over
- * @param {AbortSignal} [signal]
- * @returns {Promise<Diagnosis | import('../types/server.js').JobReply<Diagnosis>>}
  */
-export const diagnosis = (selection, over, signal) => poll(diagnosisUrl(selection, over), signal);
+export const repairUrl = (selection) => runUrl(['repair'], selection);
 
 /**
- * Starts the diagnosis as a job.
- * @param {Selection} selection
- * @param {string} over
- * @returns {Promise<StartedJob>}
+ * Returns the address of the failures of a filter over a data set.
+ * @param {Pick<State, 'task' | 'filter' | 'data' | 'faults' | 'among'>} query
  */
-export const startDiagnosis = (selection, over) => send(diagnosisUrl(selection, over));
-
-/** @param {Selection} selection */
-const repairUrl = ({ task, filter, episode, data, faults }) =>
-  path(['repair', task, filter, episode], { data, faults });
-
-/**
- * Gets the smallest repair of a run, or the job of its search.
- * @param {Selection} selection
- * @param {AbortSignal} [signal]
- * @returns {Promise<import('../types/server.js').SmallestRepair | JobReply>}
- */
-export const repair = (selection, signal) => get(repairUrl(selection), signal);
-
-/**
- * Starts the search for the smallest repair of a run.
- * @param {Selection} selection
- * @returns {Promise<StartedJob>}
- */
-export const startRepair = (selection) => send(repairUrl(selection));
-
-/** @typedef {Pick<State, 'task' | 'filter' | 'data' | 'faults' | 'among'>} FailureQuery */
-
-/** @param {FailureQuery} query */
-const failuresUrl = ({ task, filter, data, faults, among }) =>
+export const failuresUrl = ({ task, filter, data, faults, among }) =>
   path(['failures', task, filter], { data, faults, among });
-
-/**
- * Gets the failures of a filter over a data set, or the job of the search.
- * @param {FailureQuery} query
- * @param {AbortSignal} [signal]
- * @returns {Promise<Failures | JobReply>}
- */
-export const failures = (query, signal) => poll(failuresUrl(query), signal);
-
-/**
- * Starts the search for failures as a job.
- * @param {FailureQuery} query
- * @returns {Promise<StartedJob>}
- */
-export const startFailureSearch = (query) => send(failuresUrl(query));
 
 /**
  * Lists the recordings of the workspace.
@@ -416,8 +323,7 @@ export const cancelJob = (id, onlyActive) =>
  * @param {ReportOptions & {quantity: State['map']}} options quantity: of the maps
  * @returns {Promise<StartedJob>}
  */
-export const createReport = ({ task, filter, episode, data, faults }, options) =>
-  send(path(['reports', task, filter, episode], { data, faults }), options);
+export const createReport = (selection, options) => send(runUrl(['reports'], selection), options);
 
 /**
  * Returns the request for a recording of a trace, with likelihood maps at regular steps.
@@ -434,7 +340,7 @@ export const recordingRequest = (trace, quantity = 'likelihood') => ({
 /**
  * Writes a recording. Returns the job that does it if it takes long; repeat the request once the job is done.
  * @param {RecordingRequest} body
- * @returns {Promise<Recording | StartedJob>}
+ * @returns {Promise<WrittenRecording | StartedJob>}
  */
 export const createRecording = (body) => send('/api/recordings', body);
 
@@ -455,8 +361,7 @@ export const finetuneOptions = (selection, signal) => get(finetuneUrl(selection)
  * @param {AbortSignal} [signal]
  * @returns {Promise<Weakness[]>}
  */
-export const weaknesses = ({ task, filter, episode, data, faults }, signal) =>
-  poll(path(['weaknesses', task, filter, episode], { data, faults }), signal);
+export const weaknesses = (selection, signal) => poll(runUrl(['weaknesses'], selection), signal);
 
 /**
  * Starts fine-tuning, or resumes the run with the same settings.
@@ -526,8 +431,7 @@ export const sweeps = () => get('/api/experiments');
  * @param {string} phase
  * @returns {Promise<Experiments>}
  */
-export const experiments = (sweep, phase) =>
-  get(`${path(['experiments', sweep])}?${new URLSearchParams({ phase })}`);
+export const experiments = (sweep, phase) => get(path(['experiments', sweep], { phase }));
 
 /**
  * Gets the results of a checkpoint by episode.
@@ -536,10 +440,8 @@ export const experiments = (sweep, phase) =>
  * @param {string} phase
  * @returns {Promise<EpisodeResults>}
  */
-export const experimentEpisodes = (sweep, { checkpoint, data, faults }, phase) => {
-  const query = new URLSearchParams({ checkpoint, data, faults, phase });
-  return get(`${path(['experiments', sweep, 'episodes'])}?${query}`);
-};
+export const experimentEpisodes = (sweep, { checkpoint, data, faults }, phase) =>
+  get(path(['experiments', sweep, 'episodes'], { checkpoint, data, faults, phase }));
 
 /**
  * Adds a checkpoint of a sweep to the catalog.

@@ -1,6 +1,6 @@
 /** The steps of a live run, received block by block on request (docs/api.md). */
 
-/** @import { LiveRun, Selection, Task, TraceHeader } from './api.js' */
+/** @import { LiveRun, Selection, Task, TraceHeader } from '../types/server.js' */
 /** @import { Column } from '../types/server.js' */
 
 import { ServerError } from './server_error.js';

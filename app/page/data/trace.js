@@ -1,6 +1,6 @@
 /** A trace as the page displays it: columns over time, in units for display. */
 
-/** @import { LiveRun, Selection, Task, TraceHeader } from './api.js' */
+/** @import { LiveRun, Selection, Task, TraceHeader } from '../types/server.js' */
 /** @import { Column, Series } from './arrays.js' */
 /** @import { Block, LiveStream } from './live_stream.js' */
 

@@ -2,7 +2,7 @@
 
 /** @import { MapChoices } from '../maps/map_choices.js' */
 /** @import { Maps } from '../maps/map_values.js' */
-/** @import { Selection } from './api.js' */
+/** @import { Selection } from '../types/server.js' */
 
 import { MAP_SIZE } from '../core/constants.js';
 import { messageOf } from '../core/dom.js';

@@ -1,6 +1,6 @@
 /** Texts about likelihood maps: measures, colours, and the values at the crosshair. */
 
-/** @import { Task } from '../data/api.js' */
+/** @import { Task } from '../types/server.js' */
 /** @import { Maps, Range, Scale, Shade } from './map_values.js' */
 /** @import { Reference } from './reference_maps.js' */
 

@@ -1,6 +1,6 @@
 /** The pinned step of the likelihood maps, as text in the state. */
 
-/** @import { Selection } from '../data/api.js' */
+/** @import { Selection } from '../types/server.js' */
 
 /**
  * Writes a step of the page's task as URL parameters.

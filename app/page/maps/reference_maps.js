@@ -1,7 +1,7 @@
 /** Maps to which the displayed ones are compared: those of a pinned step, or of the comparison run. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Selection } from '../data/api.js' */
+/** @import { Selection } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { Maps } from './map_values.js' */

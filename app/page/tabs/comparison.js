@@ -2,7 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
-/** @import { Catalog, Comparison } from '../data/api.js' */
+/** @import { Catalog, Comparison } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { element, html, isAbort, messageOf } from '../core/dom.js';

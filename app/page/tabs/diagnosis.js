@@ -12,8 +12,7 @@ import { create, createButton, html, setOptions } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { affectedComponent, largest } from '../step/finding.js';
-import { JobResults, showJobButton } from '../widgets/job_results.js';
-import { jobSummary } from '../widgets/jobs.js';
+import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { choice } from '../widgets/pickers.js';
 import { causeItem, evidenceItem, isTrainable, withCode } from './diagnosis_cause.js';
 import { Repair } from './repair.js';
@@ -24,8 +23,7 @@ const OVER = { episode: 'this episode', 'held-out': 'held-out episodes' };
 const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN} or no evidence.`;
 const WITHIN =
   'The largest deviations of all statistics; healthy episodes also have some outside these ranges.';
-/** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
-const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
+const LIVE = { live: 'The live run is in progress. It is diagnosed when it has ended.' };
 const MEASURE = 'Measure a healthy record';
 const MAX_RESULTS = 24; // in the cache
 const LISTED = 3; // statistics that were not measured
@@ -124,9 +122,9 @@ export class Diagnosis {
     if (this.#liveState) return this.#draw();
     if (trace.header.no_diagnosis) return this.#loadRecord(trace, signal);
     if (isOpen && !this.#isLive)
-      this.#records.load(this.#recordKey, () => this.#getRecord(trace, signal), signal);
-    const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
-    await this.#results.load(this.#key, get, signal);
+      this.#records.load(this.#recordKey, this.#recordUrl(trace), signal);
+    const url = api.diagnosisUrl(trace.selection, this.#store.state.over);
+    await this.#results.load(this.#key, url, signal);
     if (this.#entry.state !== 'absent' || !this.#canStart) return;
     const settling = isOpen ? SETTLING.open : SETTLING.closed;
     await new Promise((resolve) => setTimeout(resolve, settling));
@@ -140,7 +138,7 @@ export class Diagnosis {
    */
   async #loadRecord(trace, signal) {
     const key = this.#recordKey;
-    await this.#records.load(key, () => this.#getRecord(trace, signal), signal);
+    await this.#records.load(key, this.#recordUrl(trace), signal);
     if (signal.aborted || this.#records.get(key).state !== 'ready' || this.#announced.has(key))
       return;
     this.#announced.add(key);
@@ -164,12 +162,9 @@ export class Diagnosis {
     return JSON.stringify([task, filter, data, this.#healthyFilter]);
   }
 
-  /**
-   * @param {Trace} trace
-   * @param {AbortSignal} signal
-   */
-  #getRecord(trace, signal) {
-    return api.healthyRecord(trace.selection, this.#healthyFilter, signal);
+  /** @param {Trace} trace */
+  #recordUrl({ selection }) {
+    return api.recordUrl(selection, this.#healthyFilter);
   }
 
   /** @returns {NodeListOf<HTMLSelectElement>} */
@@ -208,8 +203,8 @@ export class Diagnosis {
   #startOrCancel() {
     const trace = this.#trace;
     if (!trace) return;
-    const start = () => api.startDiagnosis(trace.selection, this.#store.state.over);
-    this.#results.startOrCancel(this.#key, start);
+    const url = api.diagnosisUrl(trace.selection, this.#store.state.over);
+    this.#results.startOrCancel(this.#key, url);
   }
 
   #draw() {
@@ -226,7 +221,7 @@ export class Diagnosis {
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? findingOf(result) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
-    const state = stateOf(entry);
+    const state = resultText(entry, LIVE);
     this.#writeHeadline(result?.headline ?? state);
     const { episode } = this.#store.state;
     const preliminary = this.#isLive
@@ -234,7 +229,7 @@ export class Diagnosis {
       : `Preliminary, from episode ${episode} alone and before any cause is undone.`;
     html('.status', this.#host).textContent = entry.preliminary ? `${preliminary} ${state}` : '';
     showJobButton(html('.doing', this.#host), entry, {
-      action: this.#trace && !this.#isLive ? (ACTIONS[entry.state] ?? '') : '',
+      action: this.#trace && !this.#isLive ? jobAction(entry.state, 'Diagnose') : '',
       progress: 'Progress of the diagnosis',
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
@@ -299,14 +294,14 @@ export class Diagnosis {
     const other = sets.length > 1 ? ' If they are not, choose another data set above first.' : '';
     const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy.${other} This and later episodes are then compared with them. More held-out episodes mean fewer false alarms for a single episode.`;
     const state = this.#starts
-      ? stateOf(entry) || about
+      ? resultText(entry) || about
       : 'Read-only server: the record cannot be measured here.';
     html('.status', this.#host).textContent = isReady ? '' : state;
     this.#drawHealthyFilter(this.#host, trace, entry);
     showJobButton(html('.doing', this.#host), entry, {
-      action: this.#starts ? ({ ...ACTIONS, absent: MEASURE }[entry.state] ?? '') : '',
+      action: this.#starts ? jobAction(entry.state, MEASURE) : '',
       progress: 'Progress of the healthy record',
-      press: () => this.#startOrCancelRecord(trace),
+      press: () => this.#records.startOrCancel(this.#recordKey, this.#recordUrl(trace)),
       next: html('.scroll', this.#host),
     });
   }
@@ -330,12 +325,12 @@ export class Diagnosis {
       ? 'The healthy record lacks some statistics of this version.'
       : 'The record was measured in this workspace; it hides faults that its own episodes contain.';
     const about = `${source} Another measurement, over the held-out episodes of ${data}, replaces it; these must be healthy.`;
-    html('.verdict', host).textContent = stateOf(entry) || (isInUse || isOld ? about : '');
+    html('.verdict', host).textContent = resultText(entry) || (isInUse || isOld ? about : '');
     this.#drawHealthyFilter(host, trace, entry);
     showJobButton(html('.doing', host), entry, {
       action: entry.state === 'active' ? 'Cancel' : 'Measure again',
       progress: 'Progress of the healthy record',
-      press: () => this.#startOrCancelRecord(trace),
+      press: () => this.#records.startOrCancel(this.#recordKey, this.#recordUrl(trace)),
       next: html('.scroll', this.#host),
     });
   }
@@ -355,12 +350,6 @@ export class Diagnosis {
     const select = /** @type {HTMLSelectElement} */ (html('select', label));
     setOptions(select, [['', 'this filter'], ...others.map(({ name }) => [name, name])]);
     select.value = this.#healthyFilter;
-  }
-
-  /** @param {Trace} trace */
-  #startOrCancelRecord(trace) {
-    const start = () => api.measureHealthyRecord(trace.selection, this.#healthyFilter);
-    this.#records.startOrCancel(this.#recordKey, start);
   }
 
   /** @param {string} text */
@@ -384,19 +373,6 @@ export class Diagnosis {
 function findingOf({ state, masked, miscalibrated }) {
   if (state === 'healthy') return miscalibrated ? 'miscalibrated' : state;
   return masked ? 'masked' : state;
-}
-
-/**
- * The state of a diagnosis that is not ready.
- * @param {Entry | JobResult<HealthyRecord>} entry
- */
-function stateOf(entry) {
-  if (entry.state === 'error') return sentence(entry.error);
-  if (entry.state === 'live')
-    return 'The live run is in progress. It is diagnosed when it has ended.';
-  if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
-  if (entry.state === 'loading') return 'Loading …';
-  return '';
 }
 
 /** @param {Result} result */

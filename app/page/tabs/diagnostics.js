@@ -7,11 +7,10 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, createButton, element, html, isAbort, messageOf } from '../core/dom.js';
-import { sentence, typeset } from '../core/units.js';
+import { typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
-import { JobResults, showJobButton } from '../widgets/job_results.js';
-import { jobSummary } from '../widgets/jobs.js';
+import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
 
@@ -24,8 +23,7 @@ const OVER = { episode: 'this episode', 'held-out': 'all held-out' };
 /** Of live and imported runs. */
 const OVER_RUNS = { episode: 'this run', 'held-out': 'all its runs' };
 const MAX_RESULTS = 48;
-/** Labels of the button by state. @type {Partial<Record<Result['state'], string>>} */
-const ACTIONS = { absent: 'Compute', ended: 'Try again', active: 'Cancel' };
+const STATES = { absent: 'Slow: computed on request.', loading: 'Computing …' };
 
 export class Diagnostics {
   #host;
@@ -145,28 +143,23 @@ export class Diagnostics {
     const { signal } = (this.#loading = new AbortController());
     const selected = this.#selected;
     for (const entry of selected ? [selected] : this.#entries) {
-      if (!entry.why_not) await this.#requestEntry(entry, signal);
+      if (!entry.why_not && this.#trace)
+        await this.#results.load(this.#key(entry), this.#url(entry, this.#trace), signal);
       if (signal.aborted) return;
     }
   }
 
-  /**
-   * @param {TraceDiagnosticInfo} entry
-   * @param {AbortSignal} signal
-   */
-  async #requestEntry(entry, signal) {
-    const trace = this.#trace;
-    if (!trace) return;
-    const get = () => api.diagnostic(trace.selection, entry.name, this.#query(entry), signal);
-    await this.#results.load(this.#key(entry), get, signal);
-  }
-
   /** @param {TraceDiagnosticInfo} entry */
   #computeOrCancel(entry) {
-    const trace = this.#trace;
-    if (!trace) return;
-    const start = () => api.startDiagnostic(trace.selection, entry.name, this.#query(entry));
-    this.#results.startOrCancel(this.#key(entry), start);
+    if (this.#trace) this.#results.startOrCancel(this.#key(entry), this.#url(entry, this.#trace));
+  }
+
+  /**
+   * @param {TraceDiagnosticInfo} entry
+   * @param {Trace} trace
+   */
+  #url(entry, { selection }) {
+    return api.diagnosticUrl(selection, entry.name, this.#query(entry));
   }
 
   /** @param {boolean} hasFinished whether jobs have finished, whose results are loaded */
@@ -317,11 +310,13 @@ export class Diagnostics {
   #drawState(host, entry, result) {
     const verdict = html('.verdict', host);
     const { state } = result;
-    const text = typeset(summary(result));
+    const text = typeset(
+      result.state === 'ready' ? result.result.verdict : resultText(result, STATES),
+    );
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
     host.dataset.state = state;
     host.setAttribute('aria-busy', String(state === 'loading' || state === 'active'));
-    const action = ACTIONS[state] ?? '';
+    const action = state === 'error' ? '' : jobAction(state, 'Compute');
     showJobButton(html('.doing', host), result, {
       action,
       label: `${action}: ${entry.title}`,
@@ -330,15 +325,4 @@ export class Diagnostics {
       next: this.#backButton,
     });
   }
-}
-
-/**
- * Returns the state of a result in a sentence.
- * @param {Result} result
- */
-function summary(result) {
-  if (result.state === 'ready') return result.result.verdict;
-  if (result.state === 'refused' || result.state === 'error') return sentence(result.error);
-  if (result.state === 'active' || result.state === 'ended') return jobSummary(result.job);
-  return result.state === 'absent' ? 'Slow: computed on request.' : 'Computing …';
 }

@@ -10,8 +10,7 @@
 import { element, html } from '../core/dom.js';
 import { fixed, percent, sentence, significant } from '../core/units.js';
 import * as api from '../data/api.js';
-import { JobResults, showJobButton } from '../widgets/job_results.js';
-import { jobSummary } from '../widgets/jobs.js';
+import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { choice } from '../widgets/pickers.js';
 import { Episodes } from './episodes.js';
 import { EventTable } from './event_table.js';
@@ -20,12 +19,9 @@ import { SliceTable } from './slice_table.js';
 
 const LISTS = { events: 'Events', episodes: 'Episodes', slices: 'Slices' };
 const AMONG = { 'held-out': 'held-out', all: 'all' };
-/** Button of each state. @type {Record<string, string>} */
-const ACTIONS = {
-  absent: 'Search for failures',
-  ended: 'Try again',
-  error: 'Try again',
-  active: 'Cancel',
+const STATES = {
+  live: 'The live run is in progress. Its failures are listed when it has ended.',
+  absent: 'No search yet. A search runs the filter over all these episodes.',
 };
 const SLICES_NOTE =
   'A slice is one condition, or two, under which the score is larger, tested over episodes. A click opens its worst step.';
@@ -107,7 +103,7 @@ export class Failures {
     this.#last = -1;
     if (this.#targetKey !== key) this.#targetKey = '';
     if (this.#liveState) return this.draw();
-    await this.#results.load(key, () => api.failures(this.#store.state, signal), signal);
+    await this.#results.load(key, api.failuresUrl(this.#store.state), signal);
     if (signal.aborted) return;
     this.#openTarget();
   }
@@ -158,13 +154,13 @@ export class Failures {
     this.#host.dataset.state = result.state;
     this.#host.ariaBusy = String(result.state === 'loading' || result.state === 'active');
     showJobButton(html('.doing', this.#host), result, {
-      action: ACTIONS[result.state] ?? '',
+      action: jobAction(result.state, 'Search for failures'),
       progress: 'Progress of the search for failures',
       press: () => this.#searchOrCancel(),
       next: html('.scroll', this.#host),
     });
     this.#drawScores(failures?.scores ?? []);
-    const text = score ? scoreSummary(score, state.list) : statusText(result);
+    const text = score ? scoreSummary(score, state.list) : resultText(result, STATES);
     const verdict = html('.verdict', this.#host);
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
     this.#drawPhases(score);
@@ -215,7 +211,7 @@ export class Failures {
   }
 
   #searchOrCancel() {
-    this.#results.startOrCancel(this.#key, () => api.startFailureSearch(this.#store.state));
+    this.#results.startOrCancel(this.#key, api.failuresUrl(this.#store.state));
   }
 
   /**
@@ -312,15 +308,4 @@ export class Failures {
 function scoreSummary(score, list) {
   if (score.why_not) return `No ${scoreName(score)}: ${score.why_not}.`;
   return (list === 'slices' ? score.slices?.summary : score.verdict) ?? '';
-}
-
-/** @param {Result} result */
-function statusText(result) {
-  if (result.state === 'error') return result.error;
-  if (result.state === 'active' || result.state === 'ended') return jobSummary(result.job);
-  if (result.state === 'live')
-    return 'The live run is in progress. Its failures are listed when it has ended.';
-  if (result.state === 'absent')
-    return 'No search yet. A search runs the filter over all these episodes.';
-  return 'Loading …';
 }

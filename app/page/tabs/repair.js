@@ -6,14 +6,10 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { html } from '../core/dom.js';
-import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
-import { JobResults, showJobButton } from '../widgets/job_results.js';
-import { jobSummary } from '../widgets/jobs.js';
+import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 
 const MAX_RESULTS = 24; // in the cache
-/** Label of the button by state. @type {Record<string, string>} */
-const ACTIONS = { absent: 'Search', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const ABOUT =
   'The fewest sensors and the shortest interval to drop or restore so that the largest failure disappears.';
 
@@ -57,7 +53,7 @@ export class Repair {
     const isLive = trace.selection.data.startsWith('live:'); // of no data set, which a search needs
     this.#host.hidden = isLive || Boolean(trace.header.no_diagnosis);
     if (this.#host.hidden) return;
-    this.#results.load(this.#key, () => api.repair(trace.selection, signal), signal);
+    this.#results.load(this.#key, api.repairUrl(trace.selection), signal);
   }
 
   get #key() {
@@ -68,23 +64,16 @@ export class Repair {
     const trace = this.#trace;
     if (!trace || this.#host.hidden) return;
     const entry = this.#results.get(this.#key);
-    html('.verdict', this.#host).textContent = textOf(entry);
+    const result = entry.state === 'ready' ? entry.result : null;
+    html('.verdict', this.#host).textContent =
+      result?.sentence ?? resultText(entry, { absent: ABOUT, loading: ABOUT });
     showJobButton(html('.doing', this.#host), entry, {
-      action: ACTIONS[entry.state] ?? '',
+      action: jobAction(entry.state, 'Search'),
       label: entry.state === 'absent' ? 'Find the smallest repair' : '',
       progress: 'Progress of the search for the smallest repair',
-      press: () => this.#results.startOrCancel(this.#key, () => api.startRepair(trace.selection)),
+      press: () => this.#results.startOrCancel(this.#key, api.repairUrl(trace.selection)),
     });
-    const result = entry.state === 'ready' ? entry.result : null;
     if (result !== this.#drawn) this.#timeline.showRepair(result);
     this.#drawn = result;
   }
-}
-
-/** @param {import('../widgets/job_results.js').JobResult<SmallestRepair>} entry */
-function textOf(entry) {
-  if (entry.state === 'ready') return entry.result.sentence;
-  if (entry.state === 'error') return sentence(entry.error);
-  if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
-  return ABOUT;
 }

@@ -1,7 +1,7 @@
 /** All tabs except the 3D scene. The page imports this module when the run is displayed. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog } from '../data/api.js' */
+/** @import { Catalog } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */

@@ -1,6 +1,6 @@
 /** Sensor faults: presets, and a dialog for any other fault injection as text (docs/data.md). */
 
-/** @import { Fault } from '../data/api.js' */
+/** @import { FaultInfo } from '../types/server.js' */
 
 import { createButton, element, html, messageOf, setOptions } from '../core/dom.js';
 
@@ -23,7 +23,7 @@ export class FaultDialog {
 
   /**
    * @param {HTMLDialogElement} dialog
-   * @param {Fault[]} faults
+   * @param {FaultInfo[]} faults
    */
   constructor(dialog, faults) {
     this.#dialog = dialog;
@@ -101,7 +101,7 @@ export function faultPicker(select, dialog, { none, selected, choose, check }) {
 
 /**
  * Creates the row of a fault in the dialog; its button adds the fault to the text.
- * @param {Fault} fault
+ * @param {FaultInfo} fault
  * @param {HTMLInputElement} input
  */
 function faultRow({ fault, meaning, parameters }, input) {

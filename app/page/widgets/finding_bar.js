@@ -56,7 +56,8 @@ export class FindingBar {
     if (trace.live || trace.header.no_diagnosis) return;
     await useful;
     if (signal.aborted) return;
-    const reply = await api.diagnosis(trace.selection, 'episode', signal).catch(() => null);
+    const url = api.diagnosisUrl(trace.selection, 'episode');
+    const reply = await api.poll(url, signal).catch(() => null);
     const result = reply && 'job' in reply ? reply.preliminary : reply;
     if (result && !signal.aborted) this.#draw(trace, result);
   }

@@ -4,8 +4,9 @@
 /** @import { Jobs } from './jobs.js' */
 
 import { create, createButton, html, messageOf } from '../core/dom.js';
-import { ServerError } from '../data/server_error.js';
-import { isActive } from './jobs.js';
+import { sentence } from '../core/units.js';
+import * as api from '../data/api.js';
+import { isActive, jobSummary } from './jobs.js';
 
 /**
  * A result, or why there is none yet. absent: not requested; active: its job waits or runs; ended: without a result.
@@ -60,15 +61,16 @@ export class JobResults {
   /**
    * Loads a result, unless it is known, or the state of its job.
    * @param {string} key
-   * @param {() => Promise<T | JobReply<T>>} request
+   * @param {string} url
    * @param {AbortSignal} signal of the request
    */
-  async load(key, request, signal) {
+  async load(key, url, signal) {
     if (!this.#results.has(key)) this.#set(key, { state: 'loading' });
     this.#changed([]);
     if (this.get(key).state === 'ready') return;
     try {
-      const reply = await request();
+      /** @type {T | JobReply<T>} */
+      const reply = await api.poll(url, signal);
       if ('job' in reply) this.#wait(key, jobState(reply.job), reply.preliminary);
       else this.#set(key, { state: 'ready', result: reply });
     } catch (error) {
@@ -81,13 +83,13 @@ export class JobResults {
   /**
    * Starts the job of a result, or cancels it if it is active.
    * @param {string} key
-   * @param {() => Promise<JobReply>} request
+   * @param {string} url
    */
-  async startOrCancel(key, request) {
+  async startOrCancel(key, url) {
     const { job } = this.get(key);
     if (job && isActive(job)) return this.#jobs.cancel(job.id);
     try {
-      this.#wait(key, jobState((await request()).job));
+      this.#wait(key, jobState((await api.startJob(url)).job));
     } catch (error) {
       this.#wait(key, failure(error));
     }
@@ -130,13 +132,34 @@ export class JobResults {
   }
 }
 
+/** @type {Record<string, string>} */
+const ACTIONS = { ended: 'Try again', error: 'Try again', active: 'Cancel' };
+
+/**
+ * Returns the text of the button of a result; empty for no button.
+ * @param {string} state
+ * @param {string} start text while the result is not requested
+ */
+export const jobAction = (state, start) => (state === 'absent' ? start : (ACTIONS[state] ?? ''));
+
+/**
+ * Describes a result that is not ready.
+ * @param {{state: string, error?: string, job?: Job}} result
+ * @param {Record<string, string>} [texts] by state, for results without an error and without a job
+ */
+export function resultText({ state, error, job }, texts) {
+  if (error !== undefined) return sentence(error);
+  if (job) return jobSummary(job);
+  return { loading: 'Loading …', ...texts }[state] ?? '';
+}
+
 /**
  * Returns the state of a result whose request failed.
  * @param {unknown} error
  * @returns {{state: 'error', error: string, isRefusal: boolean, job?: undefined}}
  */
 function failure(error) {
-  const isRefusal = error instanceof ServerError && error.isRefusal;
+  const isRefusal = error instanceof api.ServerError && error.isRefusal;
   return { state: 'error', error: messageOf(error), isRefusal };
 }
 

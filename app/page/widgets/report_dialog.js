@@ -1,7 +1,8 @@
 /** Dialog with the options of a report of the current run; Enter accepts the defaults. */
 
-/** @import { ReportOptions, Selection } from '../data/api.js' */
+/** @import { ReportOptions } from '../data/api.js' */
 /** @import { Trace } from '../data/trace.js' */
+/** @import { Selection } from '../types/server.js' */
 
 import { create, createButton, element, html, messageOf } from '../core/dom.js';
 

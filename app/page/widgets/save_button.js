@@ -1,6 +1,7 @@
 /** "Save .rrd": writes a recording, shows the progress and downloads the file; resumes after a reload. */
 
-/** @import { Job, Recording, RecordingRequest } from '../data/api.js' */
+/** @import { RecordingRequest } from '../data/api.js' */
+/** @import { Job, WrittenRecording } from '../types/server.js' */
 /** @import { Jobs } from './jobs.js' */
 
 import { create, createButton, messageOf } from '../core/dom.js';
@@ -15,7 +16,7 @@ const PENDING_REQUEST = 'recording'; // key in the session storage
  * @param {RecordingRequest} request
  * @param {Jobs} jobs one of them computes the maps
  * @param {(job: Job) => void} progress
- * @returns {Promise<Recording>}
+ * @returns {Promise<WrittenRecording>}
  */
 export async function writeRecording(request, jobs, progress) {
   const reply = await api.createRecording(request);
