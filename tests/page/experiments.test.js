@@ -27,7 +27,8 @@ import {
   sortValue,
   unknownChoice,
 } from '../../app/page/tabs/experiment_rows.js';
-import { niceStep, scale } from '../../app/page/tabs/scatter.js';
+import { niceStep } from '../../app/page/core/units.js';
+import { scale } from '../../app/page/tabs/scatter.js';
 import { RECORDED, ROW } from './fixtures.js';
 
 const ROWS = [ROW, { ...ROW, name: 'run-2', faults: '', nees: null, error: 0.7 }];

@@ -1,5 +1,7 @@
 /** Colours, dashes and colour maps. The colours of lines are defined in page.css, for light and dark. */
 
+import { svgElement } from './dom.js';
+
 /** @typedef {'viridis' | 'cividis' | 'diverging'} ColourMap */
 
 /**
@@ -69,12 +71,9 @@ function colourTable(stops) {
   return new Uint32Array(bytes.buffer);
 }
 
-/** @type {Record<ColourMap, Uint32Array>} */
-export const COLOUR_TABLES = {
-  viridis: colourTable(STOPS.viridis),
-  cividis: colourTable(STOPS.cividis),
-  diverging: colourTable(STOPS.diverging),
-};
+export const COLOUR_TABLES = /** @type {Record<ColourMap, Uint32Array>} */ (
+  Object.fromEntries(Object.entries(STOPS).map(([name, stops]) => [name, colourTable(stops)]))
+);
 
 /**
  * Returns a colour map as a CSS gradient from left to right.
@@ -157,15 +156,7 @@ export function swatch(name) {
  * @param {number} width
  */
 export function lineSample(property, dash, width) {
-  const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
-  svg.setAttribute('class', 'swatch');
-  svg.setAttribute('viewBox', '0 0 20 8');
-  svg.setAttribute('aria-hidden', 'true');
-  const path = document.createElementNS('http://www.w3.org/2000/svg', 'path');
-  path.setAttribute('d', 'M0 4h20');
-  path.setAttribute('stroke-dasharray', dash.join(' '));
-  path.setAttribute('stroke-width', String(width));
-  path.style.stroke = `var(${property})`;
-  svg.append(path);
-  return svg;
+  const line = { d: 'M0 4h20', 'stroke-dasharray': dash.join(' '), 'stroke-width': width };
+  const path = svgElement('path', { ...line, style: `stroke: var(${property})` });
+  return svgElement('svg', { class: 'swatch', viewBox: '0 0 20 8', 'aria-hidden': 'true' }, path);
 }

@@ -22,13 +22,13 @@ import {
   useful,
 } from './common_panels.js';
 import { assignSpareColours } from './colours.js';
-import { html } from './dom.js';
+import { html, pause } from './dom.js';
 import { addLatency, stats } from './measurements.js';
 import { displayName } from './units.js';
 
 const MAX_DELAY = 1000; // ms until tabs and 3D scene load, which would slow down the other panels
 
-export const delayed = new Promise((resolve) => setTimeout(resolve, MAX_DELAY));
+export const delayed = pause(MAX_DELAY);
 
 export class DisplayedRun {
   #page;

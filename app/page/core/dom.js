@@ -89,6 +89,9 @@ export function context2d(canvas, settings) {
   return context;
 }
 
+/** @param {number} ms */
+export const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
 /**
  * Returns the message of anything thrown.
  * @param {unknown} error

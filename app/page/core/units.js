@@ -148,6 +148,15 @@ export const percent = (share) =>
 export const wrapDegrees = (degrees) => degrees - 360 * Math.round(degrees / 360);
 
 /**
+ * Returns the smallest of 1, 2 and 5 times a power of ten that is at least a value.
+ * @param {number} value
+ */
+export function niceStep(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return power * ([1, 2, 5].find((factor) => factor * power >= value) ?? 10);
+}
+
+/**
  * Formats a size in bytes.
  * @param {number} count
  */

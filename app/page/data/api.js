@@ -6,7 +6,7 @@
 /** @import { ReportList, Selection, StartedJob, StudyList, SweepList, Task, TraceDiagnosticInfo, TraceHeader } from '../types/server.js' */
 /** @import { Weakness, WrittenRecording } from '../types/server.js' */
 
-import { isAbort } from '../core/dom.js';
+import { isAbort, pause } from '../core/dom.js';
 import { loadLiveTrace } from './live_stream.js';
 import { ServerError } from './server_error.js';
 import { Trace } from './trace.js';
@@ -69,7 +69,7 @@ export async function poll(url, signal) {
   for (;;) {
     const body = await get(url, signal);
     if (!('progress' in body)) return body;
-    await pause();
+    await pause(POLL_INTERVAL);
   }
 }
 
@@ -79,8 +79,6 @@ export async function poll(url, signal) {
  * @returns {Promise<StartedJob>}
  */
 export const startJob = (url) => send(url);
-
-const pause = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL));
 
 /**
  * Joins parts of a path, encoded, and a query.
@@ -187,7 +185,7 @@ export async function loadTrace(task, selection, progress, signal) {
     let response = await request(traceUrl(selection, part), { signal });
     while (response.status === 202) {
       progress((await response.json()).progress);
-      await pause();
+      await pause(POLL_INTERVAL);
       response = await request(traceUrl(selection, part), { signal });
     }
     return response;

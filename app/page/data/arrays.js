@@ -4,6 +4,17 @@
 /** @typedef {Float32Array} Series one value per step */
 
 /**
+ * Decodes the header of a binary message: its length, and JSON (docs/api.md).
+ * @param {ArrayBuffer} message
+ * @returns {{header: any, end: number}} end: place of the data after it
+ */
+export function decodeHeader(message) {
+  const length = new DataView(message).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
+  return { header, end: 4 + Math.ceil(length / 4) * 4 };
+}
+
+/**
  * Returns the number of values of a step in a column.
  * @param {number[]} shape
  */

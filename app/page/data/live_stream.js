@@ -3,6 +3,8 @@
 /** @import { LiveRun, Selection, Task, TraceHeader } from '../types/server.js' */
 /** @import { Column } from '../types/server.js' */
 
+import { pause } from '../core/dom.js';
+import { decodeHeader } from './arrays.js';
 import { ServerError } from './server_error.js';
 import { Trace } from './trace.js';
 
@@ -53,7 +55,7 @@ export class LiveStream {
           socket.send(JSON.stringify({ from: first, state }));
         });
       } catch {
-        if (!this.#closed) await new Promise((resolve) => setTimeout(resolve, RECONNECT_DELAY));
+        if (!this.#closed) await pause(RECONNECT_DELAY);
       }
     }
     return null;
@@ -87,9 +89,7 @@ export class LiveStream {
  * @returns {Block}
  */
 export function decodeBlock(message) {
-  const length = new DataView(message).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
-  const start = 4 + Math.ceil(length / 4) * 4;
+  const { header, end: start } = decodeHeader(message);
   const { image_bytes: imageBytes, ...block } = header;
   const end = message.byteLength - imageBytes;
   return {

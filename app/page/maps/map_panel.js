@@ -1,7 +1,7 @@
 /** The panel with the likelihood maps, one per layer. */
 
 /** @import { ColourMap } from '../core/colours.js' */
-/** @import { Store } from '../core/state.js' */
+/** @import { State, Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { Layer, MapOptions } from './draw_map.js' */
@@ -37,6 +37,7 @@ import {
 import { REGION_SHARES, borders, isCurve, shades } from './map_values.js';
 import { References } from './reference_maps.js';
 
+/** @type {(keyof State)[]} */
 const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom', 'tiles']; // keys of the state
 const EXPLANATIONS = {
   likelihood: 'Likelihood of the observation given the state',
@@ -89,12 +90,10 @@ export class MapPanel {
       (offset) => this.#announce(offset),
     );
     new ResizeObserver(() => this.#resize()).observe(this.#host);
-    store.listen((_, changed) => {
-      if (changed.has('map')) this.#showSwitch();
-      if (changed.has('tiles')) this.#side = 0;
-      if (OPTIONS.some((key) => changed.has(key))) this.#shade();
-      if (changed.has('pin')) this.#references.restore();
-    });
+    store.when(['map'], () => this.#showSwitch());
+    store.when(['tiles'], () => (this.#side = 0));
+    store.when(OPTIONS, () => this.#shade());
+    store.when(['pin'], () => this.#references.restore());
   }
 
   /**

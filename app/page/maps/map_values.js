@@ -3,6 +3,7 @@
 /** @import { DisplayUnit } from '../core/units.js' */
 
 import { CELL_STEPS, LOG_RANGE } from '../core/constants.js';
+import { decodeHeader } from '../data/arrays.js';
 import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
 
 /**
@@ -66,7 +67,6 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
 
 const MAX_RANGE = { log: 40, ratio: 12 }; // nats between the ends of the colours
 export const REGION_SHARES = [0.5, 0.95]; // of the likelihood within the borders on maps
-const decoder = new TextDecoder();
 
 /**
  * Decodes a message with maps.
@@ -74,10 +74,8 @@ const decoder = new TextDecoder();
  * @returns {Maps}
  */
 export function readMaps(buffer) {
-  const length = new DataView(buffer).getUint32(0, true);
-  const maps = JSON.parse(decoder.decode(new Uint8Array(buffer, 4, length)));
+  let { header: maps, end: offset } = decodeHeader(buffer);
   const { particles, layers, size, rows } = maps;
-  let offset = 4 + Math.ceil(length / 4) * 4;
   /** @param {number} count */
   const floats = (count) => {
     const array = new Float32Array(buffer, offset, count);

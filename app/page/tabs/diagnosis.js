@@ -8,7 +8,7 @@
 /** @import { Jobs } from '../widgets/jobs.js' */
 
 import { SHOWN } from '../core/constants.js';
-import { create, createButton, html, setOptions } from '../core/dom.js';
+import { create, createButton, html, pause, setOptions } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { affectedComponent, largest } from '../step/finding.js';
@@ -126,8 +126,7 @@ export class Diagnosis {
     const url = api.diagnosisUrl(trace.selection, this.#store.state.over);
     await this.#results.load(this.#key, url, signal);
     if (this.#entry.state !== 'absent' || !this.#canStart) return;
-    const settling = isOpen ? SETTLING.open : SETTLING.closed;
-    await new Promise((resolve) => setTimeout(resolve, settling));
+    await pause(isOpen ? SETTLING.open : SETTLING.closed);
     if (!signal.aborted && this.#entry.state === 'absent') this.#startOrCancel();
   }
 

@@ -4,7 +4,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Catalog, ListedLiveRun, LiveList } from '../types/server.js' */
 
-import { create, element, html } from '../core/dom.js';
+import { create, element, html, pause } from '../core/dom.js';
 import { filtersOf } from '../core/episodes.js';
 import { displayName, plural } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -342,6 +342,3 @@ function statusLine(run) {
 
 /** Resolves after the next paint; waits while the page is hidden. */
 const nextPaint = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
-
-const pause = (/** @type {number} */ ms) =>
-  new Promise((resolve) => setTimeout(resolve, Math.max(0, ms)));

@@ -7,7 +7,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
-import { create, createButton, html, messageOf } from '../core/dom.js';
+import { create, createButton, html, messageOf, pause } from '../core/dom.js';
 import { recordingRequest } from '../data/api.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { writeRecording } from '../widgets/save_button.js';
@@ -245,7 +245,7 @@ export class Rerun {
       }
       this.#echo = null;
       // The viewer draws in this thread: leave the same time to the rest of the page.
-      await new Promise((resolve) => setTimeout(resolve, performance.now() - start));
+      await pause(performance.now() - start);
     }
     this.#busy = false;
   }

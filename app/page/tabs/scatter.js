@@ -6,7 +6,7 @@
 
 import { svgElement } from '../core/dom.js';
 import { scaled } from '../core/colours.js';
-import { fixed, significant } from '../core/units.js';
+import { fixed, niceStep, significant } from '../core/units.js';
 import { colourOf, estimatorOf } from '../widgets/filter_colours.js';
 import { extent, padded } from '../widgets/plots.js';
 import { cellOf, faultLevel } from './experiment_groups.js';
@@ -226,12 +226,6 @@ const powersOfTen = (low, high) => ({
  */
 const integers = (low, high) =>
   Array.from({ length: Math.floor(high) - Math.ceil(low) + 1 }, (_, i) => Math.ceil(low) + i);
-
-/** The smallest of 1, 2 and 5 times a power of ten that is at least this. @param {number} step */
-export function niceStep(step) {
-  const power = 10 ** Math.floor(Math.log10(step));
-  return power * ([1, 2, 5].find((factor) => factor * power >= step) ?? 10);
-}
 
 /**
  * @param {string} className

@@ -46,7 +46,13 @@ import { STEPS } from './step_axis.js';
 
 /** px beside and below the plot; a label of the step axis needs more. */
 export const GUTTER = { left: scaled(46), right: scaled(12), axis: scaled(19) };
-export const FONT = `${scaled(10)}px system-ui, sans-serif`;
+const FONT = `${scaled(10)}px system-ui, sans-serif`;
+/** Options of all charts, which have neither a cursor nor a legend nor a selection of their own. */
+export const PLAIN = {
+  cursor: { show: false },
+  legend: { show: false },
+  select: { show: false, left: 0, top: 0, width: 0, height: 0 },
+};
 /** Style of axis labels. */
 export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
 const BLACKOUT_HEIGHT = scaled(8); // px
@@ -70,6 +76,17 @@ export function seriesStyle({ name, comparison = false }) {
   return { ...style, stroke, width: COMPARISON_WIDTH };
 }
 
+/** @returns {AxisStyle} */
+const plainAxis = () => ({
+  stroke: colour('muted'),
+  grid: { stroke: colour('grid'), width: 1 },
+  ticks: { stroke: colour('grid'), size: 4, width: 1 },
+  font: FONT,
+});
+
+/** Style of an axis of numbers. */
+export const axisStyle = () => ({ ...plainAxis(), values: tickLabels });
+
 /**
  * @param {HTMLElement} parent
  * @param {Track} track
@@ -81,12 +98,7 @@ export function chart(parent, track, shading, frame) {
   const hasAreas = track.series.some(({ stacked }) => stacked);
   const grid = hasAreas ? translucent(colour('surface'), AREA_GRID_OPACITY) : colour('grid');
   const shade = (/** @type {uPlot} */ plot) => shadeIntervals(plot, shading, hasAreas, axis);
-  const axisStyle = {
-    stroke: colour('muted'),
-    grid: { stroke: grid, width: 1, show: !track.note },
-    ticks: { stroke: colour('grid'), size: 4, width: 1 },
-    font: FONT,
-  };
+  const style = { ...plainAxis(), grid: { stroke: grid, width: 1, show: !track.note } };
   const { bounds } = track;
   const { axis } = frame;
   /** @returns {Interval} */
@@ -99,22 +111,14 @@ export function chart(parent, track, shading, frame) {
       width: frame.width,
       height: frame.height,
       padding: [4, GUTTER.right, frame.withAxis ? 0 : 4, 0],
-      cursor: { show: false },
-      legend: { show: false },
-      select: { show: false, left: 0, top: 0, width: 0, height: 0 },
+      ...PLAIN,
       scales: {
         x: { time: false, range },
         y: { distr: track.log ? 3 : 1, range: () => valueRange(track, frame.window()) },
       },
       axes: [
-        stepAxis(axisStyle, frame),
-        {
-          ...axisStyle,
-          size: GUTTER.left,
-          gap: 3,
-          space: scaled(14),
-          ...valueAxis(track, axisStyle),
-        },
+        stepAxis(style, frame),
+        { ...style, size: GUTTER.left, gap: 3, space: scaled(14), ...valueAxis(track, style) },
       ],
       ...lines(track),
       hooks: {

@@ -9,23 +9,15 @@ import { displayName, fixed } from '../core/units.js';
 import { chartKeys } from './chart_list.js';
 import { areShares } from './stacked_weights.js';
 
-/** Options for the lowest chart, and their labels. */
+/** Options for the lowest chart: labels and charts. @type {Record<string, [label: string, (trace: Trace, component: number) => Track]>} */
 export const TRACKS = {
-  error: 'error',
-  signed: 'signed error',
-  nees: 'NEES',
-  innovation: 'innovation',
-  particles: 'particles',
+  error: ['error', errorTrack],
+  signed: ['signed error', signedErrorTrack],
+  nees: ['NEES', neesTrack],
+  innovation: ['innovation', innovationTrack],
+  particles: ['particles', particleTrack],
 };
 
-/** @type {Record<string, (trace: Trace, component: number) => Track>} */
-const LOWEST_TRACKS = {
-  error: errorTrack,
-  signed: signedErrorTrack,
-  nees: neesTrack,
-  innovation: innovationTrack,
-  particles: particleTrack,
-};
 /** Start of the keys of an external filter's own scalars. */
 export const SCALAR = 'extra/';
 const NO_TRUTH = 'None: the true state of this run is unknown.';
@@ -58,7 +50,8 @@ function chartOf(key, run, { weights, track }, component) {
   if (key === 'weights') return weightTrack(run, weights, component);
   if (key === 'estimate') return estimateTrack(run, component);
   const quantity = key === 'track' ? track : key;
-  return (LOWEST_TRACKS[quantity] ?? scalarTrack(quantity))(run, component);
+  const build = TRACKS[quantity]?.[1] ?? scalarTrack(quantity);
+  return build(run, component);
 }
 
 /**
@@ -79,13 +72,8 @@ const shownCharts = (trace, state) =>
  * @returns {[key: string, label: string][]}
  */
 export function trackOptions(trace, selected) {
-  const keys = trace.scalars.includes(selected) || selected in TRACKS ? [] : [selected];
-  return [
-    ...Object.entries(TRACKS),
-    ...[...trace.scalars, ...keys].map(
-      (key) => /** @type {[string, string]} */ ([key, scalarName(key)]),
-    ),
-  ];
+  const keys = selected in TRACKS ? trace.scalars : [...new Set([...trace.scalars, selected])];
+  return [...Object.keys(TRACKS), ...keys].map((key) => [key, TRACKS[key]?.[0] ?? scalarName(key)]);
 }
 
 /** @param {string} key */

@@ -2,7 +2,7 @@
 
 import { svgElement } from '../core/dom.js';
 import { scaled } from '../core/colours.js';
-import { fixed } from '../core/units.js';
+import { fixed, niceStep } from '../core/units.js';
 import { estimatorOf } from './filter_colours.js';
 
 /** Texture by estimator. @type {Record<string, string>} */
@@ -148,7 +148,7 @@ export class BarChart {
  * @param {number} width px
  */
 function gridLines({ top, y }, width) {
-  const step = tickStep(top / TICKS);
+  const step = niceStep(top / TICKS);
   const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
   const values = Array.from({ length: Math.floor(top / step) + 1 }, (_, i) => i * step);
   return values.flatMap((value) => [
@@ -329,13 +329,4 @@ function scaleTop(bars, level) {
   const limit = MAX_HEIGHT * (means[Math.floor(means.length / 2)] ?? 0);
   const top = Math.min(Math.max(0, ...ends), limit) || level?.value || 1;
   return 1.04 * (level && level.value > top && level.value <= 1.3 * top ? level.value : top);
-}
-
-/**
- * Returns 1, 2 or 5 times a power of ten, no less than a value.
- * @param {number} value
- */
-function tickStep(value) {
-  const power = 10 ** Math.floor(Math.log10(value));
-  return power * ([1, 2, 5].find((factor) => factor * power >= value) ?? 10);
 }

@@ -9,10 +9,9 @@ import { csvField } from '../core/download.js';
 import { scaled, swatch } from '../core/colours.js';
 import { sentence, significant, typeset } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
-import { GUTTER, LABEL, shadeBounds, shadeIntervals } from '../timeline/chart.js';
+import { GUTTER, LABEL, PLAIN, axisStyle, shadeBounds, shadeIntervals } from '../timeline/chart.js';
 import { copyButton } from './copy_button.js';
 import {
-  axisStyle,
   drawPixelMap,
   drawPlot,
   extent,
@@ -125,9 +124,7 @@ export class Figures {
         width: this.#width,
         height: HEIGHT.chart + (last ? HEIGHT.axis - 4 : 0),
         padding: [4, GUTTER.right, last ? 0 : 4, 0],
-        cursor: { show: false },
-        legend: { show: false },
-        select: { show: false, left: 0, top: 0, width: 0, height: 0 },
+        ...PLAIN,
         scales: {
           x: { time: false, range: () => [0, Math.max(1, steps - 1)] },
           y: { range: () => limits },

@@ -7,14 +7,6 @@ import { percent, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 
 const POLL_INTERVAL = 500; // ms, while a job is active
-const STATES = {
-  waiting: 'waiting',
-  running: 'running',
-  done: 'done',
-  failed: 'failed',
-  cancelled: 'cancelled',
-  interrupted: 'interrupted',
-};
 
 /**
  * Returns whether a job is waiting or running.
@@ -196,13 +188,13 @@ export function jobSummary(job) {
       .filter(Boolean)
       .join(', ');
   if (job.error && job.error !== job.state)
-    return sentence(job.state === 'failed' ? job.error : `${STATES[job.state]}: ${job.error}`);
+    return sentence(job.state === 'failed' ? job.error : `${job.state}: ${job.error}`);
   if (job.state === 'done') {
     const seconds = Number(job.ended) - Number(job.started);
     return `Done in ${Math.max(1, Math.round(seconds))} s.`;
   }
   if (job.state === 'cancelled' && job.kind === 'finetune') return 'Paused.'; // it resumes
-  return sentence(STATES[job.state]);
+  return sentence(job.state);
 }
 
 /**

@@ -12,7 +12,7 @@ import {
   scaled,
 } from '../core/colours.js';
 import { displayName, significant, typeset } from '../core/units.js';
-import { FONT, LABEL, tickLabels } from '../timeline/chart.js';
+import { LABEL, PLAIN, axisStyle } from '../timeline/chart.js';
 
 /** @typedef {[low: number, high: number]} Range */
 /** @typedef {{property: string, stroke: string, dash: number[], width: number}} LineStyle */
@@ -55,9 +55,7 @@ export function drawPlot(parent, plot) {
       width: figure.clientWidth,
       height: PLOT_HEIGHT,
       padding: [4, 10, 0, 0],
-      cursor: { show: false },
-      legend: { show: false },
-      select: { show: false, left: 0, top: 0, width: 0, height: 0 },
+      ...PLAIN,
       scales: {
         x: { time: false, range: () => (x[1] > x[0] ? x : [x[0] - 1, x[0] + 1]) },
         y: { range: () => y },
@@ -180,16 +178,6 @@ export function lineStyles(lines) {
       width: n ? 1.5 : width,
     };
   });
-}
-
-export function axisStyle() {
-  return {
-    stroke: colour('muted'),
-    grid: { stroke: colour('grid'), width: 1 },
-    ticks: { stroke: colour('grid'), size: 4, width: 1 },
-    font: FONT,
-    values: tickLabels,
-  };
 }
 
 /**
