@@ -54,7 +54,7 @@ export function commands(page) {
       run: () => page.setLayout(layout),
     })),
     ...clickable('#intro .chip', 'Example'),
-    ...RADIOS.flatMap(([selector, group]) => radioCommands(selector, group)),
+    ...RADIOS.flatMap(([selector, group]) => clickable(`${selector} input`, group)),
     ...SELECTS.flatMap(([selector, group]) => selectCommands(selector, group)),
   ];
 }
@@ -127,33 +127,20 @@ function actionCommands(page) {
     ['Tour', '', () => page.tour.start()],
   ];
   const enabled = actions.filter(([, , , control]) => !control || isEnabled(control));
-  const listed = enabled.map(([title, keys, run, , words]) => ({
+  const group = 'Action';
+  const listed = enabled.map(([title, keys, run, , words]) => ({ group, title, keys, words, run }));
+  const exports = clickable('#maps-options .export button', 'Action').map(({ title, run }) => ({
     group: 'Action',
-    title,
-    keys,
-    words,
+    title: title === 'Copy' ? 'Copy the maps as an image' : `Export the maps as ${title}`,
+    words: 'figure download save',
     run,
   }));
   return [
     ...listed,
-    ...clickable('#report', 'Action').map((command) => ({
-      ...command,
-      words: 'figures tables pdf download export',
-    })),
-    ...exportCommands(),
-    ...clickable('#help', 'Action', 'Keyboard shortcuts', '?'),
+    ...clickable('#report', 'Action', { words: 'figures tables pdf download export' }),
+    ...exports,
+    ...clickable('#help', 'Action', { title: 'Keyboard shortcuts', keys: '?' }),
   ];
-}
-
-/** @returns {Command[]} */
-function exportCommands() {
-  const buttons = [...document.querySelectorAll('#maps-options .export button')];
-  return buttons.flatMap((button) => {
-    const format = button.textContent ?? '';
-    const title = format === 'Copy' ? 'Copy the maps as an image' : `Export the maps as ${format}`;
-    const run = () => button instanceof HTMLButtonElement && button.click();
-    return [{ group: 'Action', title, words: 'figure download save', run }];
-  });
 }
 
 /** @param {string} selector */
@@ -163,30 +150,17 @@ function isEnabled(selector) {
 }
 
 /**
- * @param {string} selector of buttons
+ * @param {string} selector of buttons and radio buttons
  * @param {string} group
- * @param {string} [title] the button's text by default
- * @param {string} [keys]
+ * @param {Partial<Command>} [properties] the title is the text of the control by default
  * @returns {Command[]}
  */
-function clickable(selector, group, title, keys = '') {
-  return [...document.querySelectorAll(selector)].flatMap((button) =>
-    button instanceof HTMLButtonElement && !button.disabled
-      ? [{ group, title: title ?? button.textContent ?? '', keys, run: () => button.click() }]
-      : [],
-  );
-}
-
-/**
- * @param {string} selector of a group
- * @param {string} group
- * @returns {Command[]}
- */
-function radioCommands(selector, group) {
-  return [...document.querySelectorAll(`${selector} label`)].flatMap((label) => {
-    const input = label.querySelector('input');
-    const title = label.textContent?.trim() ?? '';
-    return input && !input.disabled ? [{ group, title, run: () => input.click() }] : [];
+function clickable(selector, group, properties) {
+  return [...document.querySelectorAll(selector)].flatMap((control) => {
+    const isControl = control instanceof HTMLButtonElement || control instanceof HTMLInputElement;
+    if (!isControl || control.disabled) return [];
+    const title = (control.closest('label') ?? control).textContent?.trim() ?? '';
+    return [{ group, title, run: () => control.click(), ...properties }];
   });
 }
 

@@ -65,6 +65,36 @@ export function createButton(className, textContent, press, properties) {
 }
 
 /**
+ * Replaces the head and the rows of a table.
+ * @param {HTMLElement} table
+ * @param {Node[]} headings
+ * @param {Node[]} rows
+ */
+export function fillTable(table, headings, rows) {
+  html('thead', table).replaceChildren(create('tr', {}, ...headings));
+  html('tbody', table).replaceChildren(...rows);
+}
+
+/**
+ * Creates the heading of a column.
+ * @param {string} textContent
+ * @param {Partial<Omit<HTMLTableCellElement, 'style'>>} [properties]
+ */
+export const columnHeading = (textContent, properties) =>
+  create('th', { scope: 'col', textContent, ...properties });
+
+/**
+ * Returns the element with the focus if it is in a host.
+ * @param {HTMLElement} host
+ */
+export function focusedIn(host) {
+  const { activeElement } = document;
+  return activeElement instanceof HTMLElement && host.contains(activeElement)
+    ? activeElement
+    : null;
+}
+
+/**
  * Lets a popover open below a button, with the same right edge.
  * @param {HTMLElement} popover
  * @param {HTMLElement} button

@@ -2,7 +2,7 @@
 
 /** @import { Maps } from './map_values.js' */
 
-import { create, html } from '../core/dom.js';
+import { columnHeading, create, fillTable, html } from '../core/dom.js';
 import { displayName } from '../core/units.js';
 import { layerMeasures, measureColumns, pairwiseMeasures } from './map_summary.js';
 
@@ -14,9 +14,7 @@ import { layerMeasures, measureColumns, pairwiseMeasures } from './map_summary.j
  * @param {boolean} world whether the axes show world coordinates
  */
 export function showMeasures(menu, maps, layers, world) {
-  const columns = measureColumns(maps).map((textContent) =>
-    create('th', { scope: 'col', textContent }),
-  );
+  const headings = measureColumns(maps).map((title) => columnHeading(title));
   const rows = layers.map((name, layer) =>
     create(
       'tr',
@@ -27,7 +25,6 @@ export function showMeasures(menu, maps, layers, world) {
       ),
     ),
   );
-  html('thead', menu).replaceChildren(create('tr', {}, create('td'), ...columns));
-  html('tbody', menu).replaceChildren(...rows);
+  fillTable(menu, [create('td'), ...headings], rows);
   html('#maps-pairs', menu).textContent = pairwiseMeasures(maps);
 }

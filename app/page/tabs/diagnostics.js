@@ -6,7 +6,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
-import { create, createButton, element, html, isAbort, messageOf } from '../core/dom.js';
+import { create, createButton, element, focusedIn, html, isAbort, messageOf } from '../core/dom.js';
 import { typeset } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
@@ -241,11 +241,7 @@ export class Diagnostics {
     const form = this.#form;
     const key = `${name} ${this.#store.state.options}`;
     if (form.dataset.key === key) return;
-    const { activeElement } = document;
-    const focused =
-      activeElement instanceof HTMLInputElement && form.contains(activeElement)
-        ? activeElement.name
-        : '';
+    const focused = focusedIn(form)?.getAttribute('name');
     form.dataset.key = key;
     form.hidden = !options.length;
     const values = new URLSearchParams(this.#store.state.options);

@@ -4,7 +4,7 @@
 /** @import { Catalog, DataSet, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
-import { create, createButton, element, html } from '../core/dom.js';
+import { create, createButton, element, focusedIn, html } from '../core/dom.js';
 import { isComplete } from '../core/episodes.js';
 import { fixed, mainText, mainUnit, percent, withUnit } from '../core/units.js';
 import { episodes } from '../data/api.js';
@@ -194,11 +194,7 @@ export class Episodes {
     const key = JSON.stringify([...run, this.#sort, this.#listed.size, this.#limit]);
     if (key === this.#key) return;
     this.#key = key;
-    const { activeElement } = document;
-    const focused =
-      activeElement instanceof HTMLElement && this.#table.contains(activeElement)
-        ? activeElement.dataset.column
-        : undefined;
+    const focused = focusedIn(this.#head)?.dataset.part;
     const sorted = this.#episodes;
     const scale = sparklineScale(sorted.flatMap(({ errors }) => errors?.worst || []));
     const columns = columnsOf(selected).filter(
@@ -215,7 +211,7 @@ export class Episodes {
     );
     this.#body.replaceChildren(...[...this.#rows.values()].map(({ row }) => row));
     if (sorted.length > this.#limit) this.#body.append(this.#more(sorted.length, columns));
-    if (focused) html(`[data-column="${focused}"]`, this.#head).focus();
+    if (focused) html(`[data-part="${focused}"]`, this.#head).focus();
     this.#markEpisode();
     if (this.#table.parentElement) this.#table.parentElement.scrollTop = 0;
     // The default order begins at the selected episode, any other one at its first row.

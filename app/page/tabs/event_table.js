@@ -3,7 +3,7 @@
 /** @import { FailureEvent, FailureScore, Failures } from '../types/server.js' */
 
 import { copyText } from '../core/clipboard.js';
-import { create, createButton, element } from '../core/dom.js';
+import { columnHeading, createButton, element, fillTable } from '../core/dom.js';
 import { displayName, fixed, percent, significant, stepLabel, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
@@ -47,19 +47,15 @@ export class EventTable {
   show(failures, score, events) {
     const columns = failures && score?.events ? eventColumns(failures, score, score.events) : [];
     const headings = columns.map(({ title, help = '', number }) =>
-      create('th', {
-        scope: 'col',
-        className: number ? 'number' : '',
-        textContent: title,
-        title: help,
-      }),
+      columnHeading(title, { className: number ? 'number' : '', title: help }),
     );
-    const head = create('tr', {}, ...headings, create('th', { scope: 'col', ariaLabel: 'Link' }));
-    const section = element('thead', HTMLTableSectionElement, this.#table);
-    section.replaceChildren(...(columns.length ? [head] : []));
+    if (columns.length) headings.push(columnHeading('', { ariaLabel: 'Link' }));
     this.#rows = score ? events.map((event, i) => this.#row(columns, event, score, i)) : [];
-    const body = element('tbody', HTMLTableSectionElement, this.#table);
-    body.replaceChildren(...this.#rows.map(({ row }) => row));
+    fillTable(
+      this.#table,
+      headings,
+      this.#rows.map(({ row }) => row),
+    );
   }
 
   /**
@@ -127,18 +123,13 @@ export function markRow(row, button, current) {
  */
 function linkButton({ episode, step, time, link }) {
   const title = `Copy link to episode ${episode}, ${stepLabel(step, time)}`;
-  const button = create('button', {
-    type: 'button',
-    className: 'quiet link',
-    innerHTML: LINK_ICON,
-    title,
-    ariaLabel: title,
-  });
-  button.addEventListener('click', async () => {
+  const copy = async () => {
     const success = await copyText(new URL(link, location.href).href);
     button.textContent = success ? '✓' : 'not permitted';
     setTimeout(() => (button.innerHTML = LINK_ICON), COPIED_TIME);
-  });
+  };
+  const button = createButton('quiet link', '', copy, { title, ariaLabel: title });
+  button.innerHTML = LINK_ICON;
   return button;
 }
 

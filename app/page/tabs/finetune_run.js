@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, Success, Task } from '../types/server.js' */
 
-import { create, createButton, element, html } from '../core/dom.js';
+import { columnHeading, create, createButton, element, fillTable, html } from '../core/dom.js';
 import {
   displayName,
   fixed,
@@ -16,7 +16,15 @@ import {
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { trainingData } from './finetune_form.js';
-import { changeText, changes, criterionSlice, criterionText, limits } from './finetune_runs.js';
+import {
+  changeText,
+  changes,
+  criterionSlice,
+  criterionText,
+  limits,
+  linePlot,
+  plotViews,
+} from './finetune_runs.js';
 
 /** @typedef {'promote' | 'save' | 'discard'} Decision */
 
@@ -107,8 +115,6 @@ export class FinetuneRun {
     table.hidden = !success;
     if (!success) return;
     const titles = ['slice of held-out episodes', 'before', 'after', 'change', 'limit', ''];
-    const head = titles.map((textContent) => create('th', { scope: 'col', textContent }));
-    html('thead', table).replaceChildren(create('tr', {}, ...head));
     const rows = success.slices.map((slice, i) => {
       const { before, after, unit, limit, outcome } = slice;
       const values = [before, after].map((value) => withUnit(significant(value), unit));
@@ -118,7 +124,8 @@ export class FinetuneRun {
       cells[5].dataset.outcome = outcome;
       return create('tr', {}, ...cells);
     });
-    html('tbody', table).replaceChildren(...rows);
+    const headings = titles.map((title) => columnHeading(title));
+    fillTable(table, headings, rows);
   }
 
   /** @param {string} text */
@@ -262,28 +269,5 @@ function progressFigures({ losses, validations, steps }, task, settings) {
     ]),
     linePlot('Loss', '', losses.length ? [loss] : []),
   ];
-  return {
-    verdict: '',
-    curves: [],
-    bands: {},
-    tables: [],
-    images: [],
-    plots: plots.filter(({ lines }) => lines.length),
-  };
+  return plotViews(plots.filter(({ lines }) => lines.length));
 }
-
-/**
- * @param {string} title
- * @param {string} label of the y axis
- * @param {Plot['lines']} lines
- * @returns {Plot}
- */
-const linePlot = (title, label, lines) => ({
-  title,
-  x_label: 'step',
-  y_label: label,
-  kind: 'line',
-  diagonal: false,
-  names: [],
-  lines,
-});

@@ -1,9 +1,9 @@
 /** The fine-tuning runs of a task: their criterion and outcome in a table, their validations in one chart. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Job, Plot } from '../types/server.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews } from '../types/server.js' */
 
-import { create, createButton } from '../core/dom.js';
+import { columnHeading, create, createButton, fillTable } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { jobSummary } from '../widgets/jobs.js';
@@ -27,7 +27,12 @@ export class FinetuneRuns {
   #catalog;
   #store;
   #figures;
-  #table = create('table', { ariaLabel: 'Fine-tuning runs, newest first' });
+  #table = create(
+    'table',
+    { ariaLabel: 'Fine-tuning runs, newest first' },
+    create('thead'),
+    create('tbody'),
+  );
 
   /**
    * @param {HTMLElement} host hidden without runs
@@ -56,17 +61,13 @@ export class FinetuneRuns {
     this.#host.hidden = !runs.length;
     const names = new Map(runs.map(({ run }, i) => [run, `run ${runs.length - i}`]));
     const rows = runs.map((run) => this.#row(run, names.get(run.run) ?? '', current));
-    const head = COLUMNS.map((text) => create('th', { scope: 'col', textContent: text }));
-    this.#table.replaceChildren(
-      create('thead', {}, create('tr', {}, ...head)),
-      create('tbody', {}, ...rows),
-    );
+    const headings = COLUMNS.map((title) => columnHeading(title));
+    fillTable(this.#table, headings, rows);
     const base = current?.filter ?? this.#store.state.filter;
     const same = runs.filter(({ filter }) => filter === base);
     const task = this.#catalog.tasks.find(({ name }) => name === this.#store.state.task);
     const plot = task && overlay(same, names, base, task.main.key, task.main.name);
-    const empty = { verdict: '', curves: [], bands: {}, tables: [], images: [] };
-    this.#figures.show(plot ? { ...empty, plots: [plot] } : null, null);
+    this.#figures.show(plot ? plotViews([plot]) : null, null);
   }
 
   /**
@@ -129,16 +130,29 @@ function overlay(runs, names, base, key, quantity) {
     ];
   });
   if (lines.length < 2) return null;
-  return {
-    title: `Runs of ${base}`,
-    x_label: 'step',
-    y_label: `change of the ${quantity} error, %`,
-    kind: 'line',
-    diagonal: false,
-    names: [],
-    lines,
-  };
+  return linePlot(`Runs of ${base}`, `change of the ${quantity} error, %`, lines);
 }
+
+/**
+ * @param {string} title
+ * @param {string} label of the y axis
+ * @param {Plot['lines']} lines
+ * @returns {Plot}
+ */
+export const linePlot = (title, label, lines) => ({
+  ...{ title, x_label: 'step', y_label: label, lines },
+  ...{ kind: 'line', diagonal: false, names: [] },
+});
+
+/**
+ * Returns plots as the figures of a result without others.
+ * @param {Plot[]} plots
+ * @returns {ResultViews}
+ */
+export const plotViews = (plots) => ({
+  ...{ verdict: '', curves: [], bands: {}, tables: [], images: [] },
+  plots,
+});
 
 /**
  * Returns the slice of a run's success criterion; empty without one.

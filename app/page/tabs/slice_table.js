@@ -2,7 +2,7 @@
 
 /** @import { FailureScore, ErrorSlice, Condition } from '../types/server.js' */
 
-import { create, createButton, element } from '../core/dom.js';
+import { columnHeading, create, createButton, element, fillTable } from '../core/dom.js';
 import { percent, sentence, significant, withUnit } from '../core/units.js';
 import { navigateRows } from '../widgets/row_navigation.js';
 import { markRow } from './event_table.js';
@@ -39,15 +39,11 @@ export class SliceTable {
     this.#score = score;
     const slices = score?.slices?.rows ?? [];
     const headings = score && slices.length ? headingsOf(score) : [];
-    const head = headings.map(([textContent, title, className]) =>
-      create('th', { scope: 'col', textContent, title, className }),
-    );
-    element('thead', HTMLTableSectionElement, this.#table).replaceChildren(
-      create('tr', {}, ...head),
-    );
     this.#rows = score ? slices.map((slice, i) => this.#row(slice, score, episodes, i)) : [];
-    element('tbody', HTMLTableSectionElement, this.#table).replaceChildren(
-      ...this.#rows.map(({ row }) => row),
+    fillTable(
+      this.#table,
+      headings.map(([text, title, className]) => columnHeading(text, { title, className })),
+      this.#rows.map(({ row }) => row),
     );
   }
 

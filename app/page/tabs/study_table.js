@@ -5,7 +5,7 @@
 /** @import { Sort } from '../widgets/sorting.js' */
 /** @import { Quantity } from './study_quantities.js' */
 
-import { create, element } from '../core/dom.js';
+import { create, element, fillTable, html } from '../core/dom.js';
 import { fixed, percent, significant } from '../core/units.js';
 import { legendSample, navigateLinks } from '../widgets/bar_chart.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
@@ -116,14 +116,10 @@ export class StudyTable {
     const headings = columns.map((column, i) =>
       sortHeading({ ...column, number: i > 0 }, sort, (order) => this.#sortBy(order)),
     );
-    const head = create('tr', {}, ...headings);
-    element('thead', HTMLTableSectionElement, this.#table).replaceChildren(head);
-    const body = element('tbody', HTMLTableSectionElement, this.#table);
+    const rows = sortRows(filters, value, sort.down).map((filter) => tableRow(columns, filter));
+    fillTable(this.#table, headings, [...rows, ...referenceRow(view, columns)]);
+    const [body] = this.#table.tBodies;
     body.dataset.row = String(blackouts.length);
-    body.replaceChildren(
-      ...sortRows(filters, value, sort.down).map((filter) => tableRow(columns, filter)),
-      ...referenceRow(view, columns),
-    );
     body.querySelectorAll('a').forEach((link, i) => (link.tabIndex = i ? -1 : 0));
   }
 
@@ -141,8 +137,7 @@ export class StudyTable {
   #sortBy(sort) {
     this.#sort = sort;
     if (this.#view) this.show(this.#view);
-    const selector = `[data-column='${sort.name}']`;
-    element(selector, HTMLButtonElement, this.#table).focus();
+    html(`[data-part="sort ${sort.name}"]`, this.#table).focus();
   }
 }
 

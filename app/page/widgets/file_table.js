@@ -1,7 +1,10 @@
 /** Sortable table of files: each name opens its file or becomes a text field, and each row has a menu of actions. */
 
-import { create, element, html, messageOf } from '../core/dom.js';
+/** @import { Sort } from './sorting.js' */
+
+import { create, createButton, element, focusedIn, messageOf } from '../core/dom.js';
 import { navigateRows, setTabStop } from './row_navigation.js';
+import { sortHeading, sortRows } from './sorting.js';
 
 /**
  * Action on a file.
@@ -32,7 +35,7 @@ import { navigateRows, setTabStop } from './row_navigation.js';
  * @template {{name: string}} F
  * @typedef {object} FileTableOptions
  * @property {(file: F) => Action[]} actions the first one is run by a click on the name
- * @property {{name: string, down: boolean}} sort
+ * @property {Sort} sort
  * @property {{has: (name: string) => boolean, toggle: (name: string) => void}} [selection] gives each row a checkbox
  */
 
@@ -139,20 +142,11 @@ export class FileTable {
 
   get #sorted() {
     const column = this.#columns.find(({ name }) => name === this.#sort.name) ?? this.#columns[0];
-    const sign = this.#sort.down ? -1 : 1;
-    return [...this.#files].sort((a, b) => {
-      const [left, right] = [column.value(a), column.value(b)];
-      if (left === null || right === null) return Number(left === null) - Number(right === null);
-      return sign * compare(left, right);
-    });
+    return sortRows(this.#files, column.value, this.#sort.down, true);
   }
 
   #draw() {
-    const { activeElement } = document;
-    const focused =
-      activeElement instanceof HTMLElement && this.#table.contains(activeElement)
-        ? activeElement
-        : null;
+    const focused = focusedIn(this.#table);
     const [name, part] = [focused?.closest('tr')?.dataset.name, focused?.dataset.part];
     const head = document.createElement('tr');
     if (this.#selection) head.append(hiddenHeading('Selected', 'pick'));
@@ -168,28 +162,19 @@ export class FileTable {
     const row = name === undefined ? undefined : this.#rows.get(name);
     if (row) setTabStop(row, false);
     const place = name === undefined ? this.#head : row;
-    if (part) focusPart(place, part);
+    /** @type {HTMLElement | null | undefined} */
+    const control = place?.querySelector(`[data-part="${part}"]`);
+    control?.focus({ preventScroll: true });
   }
 
   /** @param {Column<F>} column */
-  #heading({ name, title, help, number }) {
-    const isSorted = this.#sort.name === name;
-    const button = namedPart(
-      create('button', {
-        type: 'button',
-        className: 'quiet sort',
-        title: `${help}. Click to sort`,
-        textContent: title,
-      }),
-      `sort ${name}`,
-    );
-    button.addEventListener('click', () => {
-      this.#sort = { name, down: isSorted ? !this.#sort.down : Boolean(number) };
+  #heading(column) {
+    const apply = (/** @type {Sort} */ sort) => {
+      this.#sort = sort;
       this.#draw();
-    });
-    const className = `${number ? 'number ' : ''}of-${name}`;
-    const cell = create('th', { scope: 'col', className }, button);
-    cell.ariaSort = isSorted ? (this.#sort.down ? 'descending' : 'ascending') : 'none';
+    };
+    const cell = sortHeading(column, this.#sort, apply, Boolean(column.number));
+    cell.classList.add(`of-${column.name}`);
     return cell;
   }
 
@@ -210,21 +195,16 @@ export class FileTable {
       if (c) cell.append(content(file));
       else cell.append(create('div', {}, this.#nameButton(file, actions[0]), content(file)));
     }
-    const more = namedPart(
-      create('button', {
-        type: 'button',
-        className: 'quiet more',
-        textContent: '⋯',
-        ariaHasPopup: 'menu',
-        title: 'Actions',
-      }),
-      'more',
-    );
-    more.setAttribute('aria-label', `Menu of ${file.name}`);
-    more.addEventListener('click', () => this.#openMenu(more, actions));
+    const more = createButton('quiet more', '⋯', () => this.#openMenu(more, actions), {
+      ariaHasPopup: 'menu',
+      title: 'Actions',
+      ariaLabel: `Menu of ${file.name}`,
+    });
+    more.dataset.part = 'more';
     row.insertCell().append(more);
-    for (const control of row.querySelectorAll('button')) control.tabIndex = i ? -1 : 0;
-    for (const control of row.querySelectorAll('input')) control.tabIndex = i ? -1 : 0;
+    /** @type {NodeListOf<HTMLElement>} */
+    const controls = row.querySelectorAll('button, input');
+    for (const control of controls) control.tabIndex = i ? -1 : 0;
     return row;
   }
 
@@ -234,14 +214,12 @@ export class FileTable {
    * @param {NonNullable<FileTableOptions<F>['selection']>} selection
    */
   #addCheckbox(row, { name }, selection) {
-    const checkbox = namedPart(
-      create('input', {
-        type: 'checkbox',
-        checked: selection.has(name),
-        ariaLabel: `Select ${name}`,
-      }),
-      'pick',
-    );
+    const checkbox = create('input', {
+      type: 'checkbox',
+      checked: selection.has(name),
+      ariaLabel: `Select ${name}`,
+    });
+    checkbox.dataset.part = 'pick';
     checkbox.addEventListener('change', () => selection.toggle(name));
     const cell = row.insertCell();
     cell.className = 'pick';
@@ -253,13 +231,12 @@ export class FileTable {
    * @param {Action} action
    */
   #nameButton(file, { name, disabledReason }) {
-    const button = namedPart(
-      create('button', { type: 'button', className: 'title', textContent: file.name }),
-      'open',
-    );
-    button.title = disabledReason ?? `${name}: ${file.name}`;
-    button.setAttribute('aria-disabled', String(Boolean(disabledReason)));
-    button.addEventListener('click', () => this.#run(file, (action) => action.name === name));
+    const run = () => this.#run(file, (action) => action.name === name);
+    const button = createButton('title', file.name, run, {
+      title: disabledReason ?? `${name}: ${file.name}`,
+      ariaDisabled: String(Boolean(disabledReason)),
+    });
+    button.dataset.part = 'open';
     return button;
   }
 
@@ -338,15 +315,6 @@ export class FileTable {
 }
 
 /**
- * @param {string | number} left
- * @param {string | number} right
- */
-const compare = (left, right) =>
-  typeof left === 'string'
-    ? left.localeCompare(String(right), 'en', { numeric: true })
-    : left - Number(right);
-
-/**
  * Creates a heading for screen readers only.
  * @param {string} text
  * @param {string} className
@@ -362,25 +330,4 @@ function actionLink({ href = '', download, newWindow }) {
   if (download !== undefined) link.download = download;
   if (newWindow) [link.target, link.rel] = ['_blank', 'noopener'];
   return link;
-}
-
-/**
- * Names a control, so that it gets the focus back when its row is redrawn.
- * @template {HTMLElement} T
- * @param {T} node
- * @param {string} name
- * @returns {T}
- */
-function namedPart(node, name) {
-  node.dataset.part = name;
-  return node;
-}
-
-/**
- * @param {HTMLElement | undefined} parent
- * @param {string} name
- */
-function focusPart(parent, name) {
-  if (parent?.querySelector(`[data-part="${name}"]`))
-    html(`[data-part="${name}"]`, parent).focus({ preventScroll: true });
 }
