@@ -119,6 +119,30 @@ export function context2d(canvas, settings) {
   return context;
 }
 
+/**
+ * Paints all pixels of a canvas.
+ * @param {HTMLCanvasElement} canvas
+ * @param {ArrayLike<number>} colours with the bytes R, G, B, A in memory
+ * @param {CanvasRenderingContext2D} [context]
+ */
+export function paintPixels(canvas, colours, context = context2d(canvas)) {
+  const image = new ImageData(canvas.width, canvas.height);
+  new Uint32Array(image.data.buffer).set(colours);
+  context.putImageData(image, 0, 0);
+}
+
+/**
+ * Opens a socket for binary messages.
+ * @param {string} path
+ */
+export function openSocket(path) {
+  const url = new URL(path, location.href);
+  url.protocol = url.protocol.replace('http', 'ws');
+  const socket = new WebSocket(url);
+  socket.binaryType = 'arraybuffer';
+  return socket;
+}
+
 /** @param {number} ms */
 export const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 

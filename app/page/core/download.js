@@ -12,8 +12,11 @@ export function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
+/** @param {unknown[][]} rows */
+export const csv = (rows) => rows.map((row) => `${row.map(csvField).join(',')}\n`).join('');
+
 /** @param {unknown} value */
-export function csvField(value) {
+function csvField(value) {
   const text = String(value ?? '');
   return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }

@@ -17,6 +17,13 @@ export const displayUnit = ({ unit, display_unit: displayed, scale }) => ({
 });
 
 /**
+ * Returns the name of a column of numbers in files, such as hinge_x_cm.
+ * @param {string} name
+ * @param {string} unit may be empty
+ */
+export const columnName = (name, unit) => (unit ? `${name}_${unit}` : name);
+
+/**
  * Returns the unit of a task's main error.
  * @param {Task} task
  */

@@ -3,7 +3,7 @@
 /** @import { LiveRun, Selection, Task, TraceHeader } from '../types/server.js' */
 /** @import { Column } from '../types/server.js' */
 
-import { pause } from '../core/dom.js';
+import { openSocket, pause } from '../core/dom.js';
 import { decodeHeader } from './arrays.js';
 import { ServerError } from './server_error.js';
 import { Trace } from './trace.js';
@@ -27,7 +27,7 @@ const NOT_FOUND = 4000; // close code if the run does not exist
 export class LiveStream {
   /** Why the run cannot be read; empty if it can. */
   error = '';
-  #url;
+  #path;
   /** @type {WebSocket | null} */
   #socket = null;
   #closed = false;
@@ -36,8 +36,7 @@ export class LiveStream {
 
   /** @param {string} name of the run */
   constructor(name) {
-    this.#url = new URL(`/api/live/${encodeURIComponent(name)}`, location.href);
-    this.#url.protocol = this.#url.protocol.replace('http', 'ws');
+    this.#path = `/api/live/${encodeURIComponent(name)}`;
   }
 
   /**
@@ -69,8 +68,7 @@ export class LiveStream {
   /** @returns {Promise<WebSocket>} */
   async #open() {
     if (this.#socket?.readyState === WebSocket.OPEN) return this.#socket;
-    const socket = (this.#socket = new WebSocket(this.#url));
-    socket.binaryType = 'arraybuffer';
+    const socket = (this.#socket = openSocket(this.#path));
     socket.onmessage = ({ data }) => this.#pending?.resolve(decodeBlock(data));
     await new Promise((resolve, reject) => {
       socket.onopen = resolve;

@@ -5,7 +5,7 @@
 /** @import { Selection } from '../types/server.js' */
 
 import { MAP_SIZE } from '../core/constants.js';
-import { messageOf } from '../core/dom.js';
+import { messageOf, openSocket } from '../core/dom.js';
 import { readMaps } from '../maps/map_values.js';
 import { openView } from './api.js';
 
@@ -183,10 +183,7 @@ export class ViewSocket {
       this.#retry(messageOf(error));
       return;
     }
-    const url = new URL(this.#view.socket, location.href);
-    url.protocol = url.protocol.replace('http', 'ws');
-    const socket = new WebSocket(url);
-    socket.binaryType = 'arraybuffer';
+    const socket = openSocket(this.#view.socket);
     let opened = false;
     socket.onopen = () => {
       opened = true;

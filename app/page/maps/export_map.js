@@ -3,10 +3,10 @@
 /** @import { Context, Layer } from './draw_map.js' */
 /** @import { DisplayedMaps } from './map_panel.js' */
 
-import { context2d, create, element, html, messageOf } from '../core/dom.js';
+import { context2d, create, element, html, messageOf, paintPixels } from '../core/dom.js';
 import { COLOUR_TABLES } from '../core/colours.js';
 import { download } from '../core/download.js';
-import { fixed, sentence } from '../core/units.js';
+import { columnName, fixed, sentence } from '../core/units.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap } from './draw_map.js';
 import { mapTitle } from './map_summary.js';
@@ -133,12 +133,6 @@ function csvRows({ maps, layers }) {
     return [...numbers, ...logs.map((values) => values[i].toFixed(4))].join(',');
   });
 }
-
-/**
- * @param {string} name
- * @param {string} unit
- */
-const columnName = (name, unit) => (unit ? `${name}_${unit}` : name);
 
 /** @param {DisplayedMaps[]} sheets */
 function svg(sheets) {
@@ -268,9 +262,7 @@ function drawSteps(context, sheets) {
  */
 function drawColourBar(context, { shade, colourMap }) {
   const canvas = create('canvas', { width: 256, height: 1 });
-  const image = new ImageData(256, 1);
-  new Uint32Array(image.data.buffer).set(COLOUR_TABLES[colourMap]);
-  context2d(canvas).putImageData(image, 0, 0);
+  paintPixels(canvas, COLOUR_TABLES[colourMap]);
   const [low, high] = rangeLabels(shade, rangeDigits(shade));
   context.font = '10px system-ui, sans-serif';
   context.drawImage(canvas, SIDE - 130, -8 - SHEET.bar, 90, SHEET.bar);

@@ -6,7 +6,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
-import { context2d, create, element, html } from '../core/dom.js';
+import { context2d, create, element, html, paintPixels } from '../core/dom.js';
 import { COLOUR_TABLES, colour } from '../core/colours.js';
 import { displayName, significant } from '../core/units.js';
 import { sensorImages } from '../data/api.js';
@@ -66,10 +66,7 @@ export class Camera {
       drawPoints(this.#context, pixels, sensor.high ?? 1);
       return;
     }
-    const { width, height } = this.#context.canvas;
-    const image = new ImageData(width, height);
-    new Uint32Array(image.data.buffer).set(colours(pixels, sensor));
-    this.#context.putImageData(image, 0, 0);
+    paintPixels(this.#context.canvas, colours(pixels, sensor), this.#context);
     const isBlack = isFirst && trace.blackout[step];
     html('.blackout', this.#figure).hidden = !isBlack;
   }

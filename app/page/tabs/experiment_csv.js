@@ -4,7 +4,7 @@
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
-import { csvField } from '../core/download.js';
+import { csv } from '../core/download.js';
 import { NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @typedef {{title: string, value: (row: ExperimentRow | SeedGroup) => unknown}} Field */
@@ -19,11 +19,8 @@ export function tableCsv(rows, columns) {
   const fields = columns.flatMap((column) => fieldsOf(rows, column));
   if (new Set(rows.map(({ unit }) => unit)).size > 1)
     fields.push({ title: 'unit', value: ({ unit }) => unit });
-  const lines = [
-    fields.map(({ title }) => title),
-    ...rows.map((row) => fields.map(({ value }) => value(row))),
-  ];
-  return lines.map((line) => `${line.map(csvField).join(',')}\n`).join('');
+  const titles = fields.map(({ title }) => title);
+  return csv([titles, ...rows.map((row) => fields.map(({ value }) => value(row)))]);
 }
 
 /**

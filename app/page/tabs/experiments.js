@@ -1,6 +1,6 @@
 /** The Experiments tab: its choices, and the loading of results for the table, the scatter plot and the list of episodes. */
 
-/** @import { State, Store } from '../core/state.js' */
+/** @import { Store } from '../core/state.js' */
 /** @import { Catalog, ExperimentRow, SweepInfo } from '../types/server.js' */
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
@@ -145,15 +145,10 @@ export class Experiments {
 
   #listenToPickers() {
     const store = this.#store;
-    const pick = (/** @type {keyof State} */ key, /** @type {string} */ selector) => {
-      const picker = element(selector, HTMLSelectElement, this.#host);
+    for (const key of ['sweep', 'rows', 'steps', 'x', 'y']) {
+      const picker = element(`.${key}`, HTMLSelectElement, this.#host);
       picker.addEventListener('change', () => store.set({ [key]: picker.value }));
-    };
-    pick('sweep', '.sweep');
-    pick('rows', '.rows');
-    pick('steps', '.steps');
-    pick('x', '.x');
-    pick('y', '.y');
+    }
     html('.csv', this.#host).addEventListener('click', () => this.#saveCsv());
     const match = element('.match', HTMLInputElement, this.#host);
     match.addEventListener('input', () => store.set({ match: match.value }));
@@ -183,14 +178,12 @@ export class Experiments {
       this.#report(this.#problems.join(' '));
       const sweep = this.#sweep;
       if (!sweep) {
-        clearTimeout(this.#loadingTimer);
         setPanelState(this.#host, 'empty');
         html('.note', this.#host).replaceChildren(...emptyNote(EMPTY));
         return;
       }
       const { rows, count } = await api.experiments(sweep.name, this.#steps);
       if (load !== this.#loads) return;
-      clearTimeout(this.#loadingTimer);
       [this.#rows, this.#count] = [rows, count];
       const { entries } = entryColumns(rows, []);
       this.#numbers = [...NUMBER_KEYS, ...entries.filter((name) => isNumeric(rows, name))];
@@ -200,8 +193,9 @@ export class Experiments {
       this.#showSelected();
     } catch (error) {
       if (load !== this.#loads) return;
-      clearTimeout(this.#loadingTimer);
       setPanelError(this.#host, messageOf(error), () => this.#load());
+    } finally {
+      if (load === this.#loads) clearTimeout(this.#loadingTimer);
     }
   }
 

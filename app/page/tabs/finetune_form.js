@@ -1,15 +1,16 @@
 /** Form for a fine-tuning run: a weakness, the modules and data to train, and the criterion of success. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneOffer, FineTuneRunInfo, FineTuneSettings, Weakness } from '../types/server.js' */
+/** @import { Catalog, FineTuneOffer, FineTuneSettings, Weakness } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { CLEAN_WEIGHT } from '../core/constants.js';
 import { create, element, html, setOptions } from '../core/dom.js';
 import { displayName } from '../core/units.js';
+import { criterionSlice, presetName } from './finetune_runs.js';
 import { ModuleDiagram } from './module_diagram.js';
 import { SliceFields } from './slice_fields.js';
-import { WeaknessList } from './weakness_list.js';
+import { showWeaknesses } from './weakness_list.js';
 
 /** @typedef {Omit<FineTuneSettings, 'mix'> & {mix?: object[]}} FineTuneRequest */
 /** @typedef {'clean_weight' | 'steps' | 'length' | 'rate' | 'l2_sp' | 'seed'} NumberName */
@@ -74,7 +75,7 @@ const BODY = `
 
 export class FinetuneForm {
   #form;
-  #weaknesses;
+  #store;
   #diagram;
   #slice;
   /** @type {FineTuneOffer | null} */
@@ -92,6 +93,7 @@ export class FinetuneForm {
    */
   constructor(form, catalog, store, faultDialog, submit) {
     this.#form = form;
+    this.#store = store;
     const body = document.createElement('template');
     body.innerHTML = BODY;
     form.prepend(body.content);
@@ -100,9 +102,6 @@ export class FinetuneForm {
       this.#showCount();
     });
     html('.numbers', form).append(...NUMBERS.map(numberField));
-    this.#weaknesses = new WeaknessList(html('.weakness', form), store, (settings) =>
-      this.#suggest(settings),
-    );
     this.#slice = new SliceFields(form, catalog, store, faultDialog, () => this.#weightClean());
     this.#select('preset').addEventListener('change', () => this.#applyPreset());
     this.#select('criterion').addEventListener('change', () => (this.#hasOwnCriterion = true));
@@ -152,7 +151,8 @@ export class FinetuneForm {
     html('.simulated', this.#form).textContent = simulated
       ? `${simulated} training episodes are simulated first, once: the sample set has test episodes only.`
       : '';
-    this.#weaknesses.show(weaknesses);
+    const suggest = (/** @type {FineTuneSettings} */ settings) => this.#suggest(settings);
+    showWeaknesses(html('.weakness', this.#form), this.#store, weaknesses, suggest);
     this.#suggest(weaknesses[0]?.settings ?? offer.settings);
   }
 
@@ -168,9 +168,8 @@ export class FinetuneForm {
     this.#applyPreset();
     this.#slice.choose(settings.mix[0]?.slice.name ?? '');
     this.#offerCriterion();
-    const [slice, ...parts] = (settings.success ?? '').split(':');
-    const given = new Map(parts.map(twoParts));
-    this.#select('measure').value = given.get('measure') ?? 'error';
+    const slice = criterionSlice(settings);
+    this.#select('measure').value = settings.success?.match(/:measure=([^:]*)/)?.[1] ?? 'error';
     if (slice) this.#select('criterion').value = slice;
   }
 
@@ -227,16 +226,10 @@ export class FinetuneForm {
   /** @returns {FineTuneRequest} */
   #settings() {
     const preset = this.#select('preset').value;
-    /** @param {NumberName} name */
-    const number = (name) => Number(this.#input(name).value);
+    const numbers = NUMBERS.map(({ name }) => [name, Number(this.#input(name).value)]);
     /** @type {FineTuneRequest} */
     const settings = {
-      clean_weight: number('clean_weight'),
-      steps: number('steps'),
-      length: number('length'),
-      rate: number('rate'),
-      l2_sp: number('l2_sp'),
-      seed: number('seed'),
+      .../** @type {Record<NumberName, number>} */ (Object.fromEntries(numbers)),
       train: preset === CUSTOM ? this.#diagram.trained : [preset],
       events: this.#input('events')
         .value.split(/[\s,]+/)
@@ -251,25 +244,8 @@ export class FinetuneForm {
   }
 }
 
-/** @param {string} name of a preset, or of a module, which is returned unchanged */
-export const presetName = (name) => name.replace(/-only$/, ' only');
-
-/**
- * Returns the names of the data slices that a run was trained on.
- * @param {FineTuneRunInfo} run
- */
-export const trainingData = ({ settings }) =>
-  settings.mix.map(({ slice }) => displayName(slice.name)).join(' and ') || 'clean data';
-
 /** @param {typeof NUMBERS[number]} field */
 function numberField({ name, text, step, title }) {
   const input = create('input', { type: 'number', name, step: String(step), min: '0' });
   return create('label', { title }, `${text} `, input);
 }
-
-/**
- * Splits `key=value`.
- * @param {string} text
- * @returns {[key: string, value: string]}
- */
-const twoParts = (text) => [text.split('=')[0], text.split('=')[1] ?? ''];

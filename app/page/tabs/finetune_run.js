@@ -15,7 +15,6 @@ import {
 } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
-import { trainingData } from './finetune_form.js';
 import {
   changeText,
   changes,
@@ -24,6 +23,7 @@ import {
   limits,
   linePlot,
   plotViews,
+  trainingData,
 } from './finetune_runs.js';
 
 /** @typedef {'promote' | 'save' | 'discard'} Decision */

@@ -1,13 +1,12 @@
 /** The fine-tuning runs of a task: their criterion and outcome in a table, their validations in one chart. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews } from '../types/server.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunInfo, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews } from '../types/server.js' */
 
 import { columnHeading, create, createButton, fillTable } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { jobSummary } from '../widgets/jobs.js';
-import { presetName, trainingData } from './finetune_form.js';
 
 const PLACES = { default: 'promoted', saved: 'saved' };
 const COLUMNS = [
@@ -103,6 +102,16 @@ export class FinetuneRuns {
     return row;
   }
 }
+
+/** @param {string} name of a preset, or of a module, which is returned unchanged */
+export const presetName = (name) => name.replace(/-only$/, ' only');
+
+/**
+ * Returns the names of the data slices that a run was trained on.
+ * @param {FineTuneRunInfo} run
+ */
+export const trainingData = ({ settings }) =>
+  settings.mix.map(({ slice }) => displayName(slice.name)).join(' and ') || 'clean data';
 
 /**
  * Returns the change of the error in each run's slice over its steps, of runs with the same base.

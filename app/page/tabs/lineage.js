@@ -73,27 +73,16 @@ export class Lineage {
     const pageLink = (text, patch, title) =>
       link(text, permalink({ ...state, run: '', ...patch }), `${title}: ${label}`);
     const baseName = base?.catalog_name;
-    const comparison = name && baseName && { filter: name, against: `filter=${baseName}` };
-    return [
-      ...(name && name !== state.filter
-        ? [pageLink('open', { filter: name, against: '' }, 'Show its runs')]
-        : []),
-      ...(comparison
-        ? [
-            pageLink(
-              'compare',
-              { ...comparison, tab: 'compare' },
-              'Compare with its base checkpoint',
-            ),
-          ]
-        : []),
-      ...(run ? [pageLink('report', { run }, 'Changes made by fine-tuning')] : []),
-      link(
-        'export',
-        `/api/lineage/${encodeURIComponent(state.task)}/${hash}.zip`,
-        `Download with its base checkpoints: ${label}`,
-      ),
-    ];
+    const links = [];
+    if (name && name !== state.filter)
+      links.push(pageLink('open', { filter: name, against: '' }, 'Show its runs'));
+    if (name && baseName) {
+      const patch = { filter: name, against: `filter=${baseName}`, tab: 'compare' };
+      links.push(pageLink('compare', patch, 'Compare with its base checkpoint'));
+    }
+    if (run) links.push(pageLink('report', { run }, 'Changes made by fine-tuning'));
+    const file = `/api/lineage/${encodeURIComponent(state.task)}/${hash}.zip`;
+    return [...links, link('export', file, `Download with its base checkpoints: ${label}`)];
   }
 }
 

@@ -269,7 +269,7 @@ export class Live {
   #draw() {
     const host = html('ol', this.#list);
     while (host.children.length > this.#runs.length) host.lastChild?.remove();
-    while (host.children.length < this.#runs.length) host.append(row());
+    while (host.children.length < this.#runs.length) host.append(create('li', { innerHTML: ROW }));
     this.#runs.forEach((run, i) => {
       const line = host.children[i];
       const button = element('button', HTMLButtonElement, line);
@@ -303,16 +303,7 @@ export class Live {
   }
 }
 
-const row = () =>
-  create(
-    'li',
-    {},
-    create(
-      'button',
-      { type: 'button' },
-      ...['b', 'span', 'small'].map((tag) => document.createElement(tag)),
-    ),
-  );
+const ROW = '<button type="button"><b></b><span></span><small></small></button>';
 
 /**
  * Returns what the pickers depend on.

@@ -17,7 +17,7 @@ import { isActive, jobSummary } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { StatusLine } from '../widgets/status_line.js';
 import { Uploads } from '../widgets/upload.js';
-import { FileActions } from './file_actions.js';
+import { fileActions } from './file_actions.js';
 import { differences, recordedRun, selectRun } from './recorded_run.js';
 import { RECORDING_COLUMNS, REPORT_COLUMNS } from './recording_columns.js';
 import { SelectionBar } from './selection_bar.js';
@@ -89,7 +89,13 @@ export class Recordings {
       compare: (files) => this.#compare(files),
       clear: () => this.#draw(),
     });
-    const actions = this.#fileActions();
+    const actions = fileActions(catalog, this.#readOnlyReason, {
+      openInRerun: (file) => this.#openInRerun([file]),
+      openRun: (run) => this.#openRun(run),
+      importRun: (file) => this.#importRun(file),
+      rename: (file) => this.#rename(file),
+      remove: (file, kind) => this.#delete(file, kind),
+    });
     this.#recordings = new FileTable(
       element('table.recordings', HTMLTableElement, host),
       RECORDING_COLUMNS,
@@ -172,16 +178,6 @@ export class Recordings {
 
   get #readOnlyReason() {
     return this.#catalog.read_only ? READ_ONLY : undefined;
-  }
-
-  #fileActions() {
-    return new FileActions(this.#catalog, this.#readOnlyReason, {
-      openInRerun: (file) => this.#openInRerun([file]),
-      openRun: (run) => this.#openRun(run),
-      importRun: (file) => this.#importRun(file),
-      rename: (file) => this.#rename(file),
-      remove: (file, kind) => this.#delete(file, kind),
-    });
   }
 
   #draw() {

@@ -3,7 +3,14 @@
 /** @import { State } from '../core/state.js' */
 /** @import { StudyRow, Task } from '../types/server.js' */
 
-import { displayName, displayUnit, mainName, mainUnit, percent } from '../core/units.js';
+import {
+  columnName,
+  displayName,
+  displayUnit,
+  mainName,
+  mainUnit,
+  percent,
+} from '../core/units.js';
 
 /**
  * @typedef {object} Quantity
@@ -25,7 +32,7 @@ export function studyQuantities(rows, task) {
   const keys = new Set(rows.flatMap((row) => Object.keys(row.mean)));
   const errors = [...keys].flatMap((key) => {
     if (key === main.key) return [{ key, component: main.name, unit: mainUnit(task).unit }];
-    const component = task.components.find((c) => key === keyOf(c));
+    const component = task.components.find((c) => key === columnName(c.name, c.display_unit));
     return component ? [{ key, component: component.name, unit: displayUnit(component).unit }] : [];
   });
   errors.sort((a, b) => Number(b.key === main.key) - Number(a.key === main.key));
@@ -38,12 +45,6 @@ export function studyQuantities(rows, task) {
     quantities.push({ key: 'nees', component: '', title: 'NEES', unit: '', description: 'NEES/n' });
   return quantities;
 }
-
-/**
- * Returns the key of a component's RMSE in metrics, such as hinge_x_cm.
- * @param {Task['components'][number]} component
- */
-const keyOf = ({ name, display_unit: unit }) => (unit ? `${name}_${unit}` : name);
 
 /**
  * Returns the changes of the state that list the failures of a filter at a share of image blackout.

@@ -62,7 +62,10 @@ const COMPARISON_OPACITY = 0.65;
 const COMPARISON_WIDTH = 1.25; // px
 const LINE_HEIGHT = 4; // px, of a failure and its repair
 const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
-const STEP_INCREMENTS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
+/** Distances of the ticks of whole numbers, such as steps. */
+export const WHOLE_STEPS = Array.from({ length: 8 }, (_, power) =>
+  [1, 2, 5].map((n) => n * 10 ** power),
+).flat();
 const INTEGER_TOLERANCE = 1e-9;
 
 /**
@@ -216,7 +219,7 @@ export const tickLabels = (_, splits) =>
  * @returns {uPlot.Axis}
  */
 function stepAxis(style, { withAxis, axis: { inSeconds } }) {
-  const increments = inSeconds ? {} : { incrs: STEP_INCREMENTS };
+  const increments = inSeconds ? {} : { incrs: WHOLE_STEPS };
   const axis = { ...style, gap: 2, space: scaled(60), ...increments };
   if (!withAxis)
     return {
@@ -353,16 +356,24 @@ function labelIntervals({ ctx, bbox, valToPos }, axis, intervals, text, top, ink
 }
 
 /**
+ * Saves the drawing state, and restricts drawing to the plot until it is restored.
+ * @param {uPlot} plot
+ */
+export function clipToPlot({ ctx, bbox }) {
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+}
+
+/**
  * Shades the interval that is expected to contain the values.
  * @param {uPlot} plot
  * @param {[number, number]} bounds
  */
 export function shadeBounds(plot, bounds) {
   const { ctx, bbox } = plot;
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
+  clipToPlot(plot);
   const [top, bottom] = bounds.map((v) => plot.valToPos(v, 'y', true)).sort((a, b) => a - b);
   ctx.globalAlpha = 0.1;
   ctx.fillStyle = colour('truth');

@@ -5,7 +5,7 @@
 /** @import { Curve, DiagnosticResult, Table } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
-import { csvField } from '../core/download.js';
+import { csv } from '../core/download.js';
 import { scaled, swatch } from '../core/colours.js';
 import { sentence, significant, typeset } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
@@ -224,9 +224,6 @@ export class Figures {
     return create('div', { className: 'table' }, head, scroll, ...explanation);
   }
 }
-
-/** @param {(string | number | null)[][]} rows */
-const csv = (rows) => rows.map((row) => row.map(csvField).join(',')).join('\n') + '\n';
 
 /**
  * Adds the unit to a title that does not name it.

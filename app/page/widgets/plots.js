@@ -2,7 +2,7 @@
 
 /** @import { PixelMap, Plot } from '../types/server.js' */
 
-import { create, context2d } from '../core/dom.js';
+import { create, paintPixels } from '../core/dom.js';
 import {
   COLOUR_TABLES,
   colour,
@@ -12,15 +12,11 @@ import {
   scaled,
 } from '../core/colours.js';
 import { displayName, significant, typeset } from '../core/units.js';
-import { LABEL, PLAIN, axisStyle } from '../timeline/chart.js';
+import { LABEL, PLAIN, WHOLE_STEPS, axisStyle, clipToPlot } from '../timeline/chart.js';
 
 /** @typedef {[low: number, high: number]} Range */
 /** @typedef {{property: string, stroke: string, dash: number[], width: number}} LineStyle */
 
-/** Distances of the ticks of whole numbers, such as steps. */
-const WHOLE_STEPS = Array.from({ length: 8 }, (_, power) =>
-  [1, 2, 5].map((n) => n * 10 ** power),
-).flat();
 const PLOT_HEIGHT = scaled(190); // px
 /** Dashes of the second line of a layer, the third, ... */
 const DASHES = [
@@ -106,14 +102,14 @@ export function drawPixelMap({ title, values, unit, signed }) {
   const table = signed ? COLOUR_TABLES.diverging : COLOUR_TABLES.viridis;
   const canvas = create('canvas', { width, height, role: 'img' });
   canvas.ariaLabel = `${title}: from ${significant(minimum)} to ${significant(maximum)} ${unit}`;
-  paint(
+  paintPixels(
     canvas,
     values
       .flat()
       .map((v) => (v === null ? 0 : table[Math.round((255 * (v - low)) / (high - low))])),
   );
   const colourBar = create('canvas', { width: 256, height: 1, className: 'bar-of-colours' });
-  paint(colourBar, table);
+  paintPixels(colourBar, table);
   const scale = create('span', {}, significant(low), colourBar, `${significant(high)} ${unit}`);
   const output = document.createElement('output');
   canvas.addEventListener('pointermove', ({ offsetX, offsetY }) => {
@@ -126,16 +122,6 @@ export function drawPixelMap({ title, values, unit, signed }) {
   canvas.addEventListener('pointerleave', () => (output.textContent = ''));
   const caption = create('figcaption', {}, scale, output);
   return create('figure', { className: 'pixel-map' }, heading(title), canvas, caption);
-}
-
-/**
- * @param {HTMLCanvasElement} canvas
- * @param {ArrayLike<number>} colours one per pixel
- */
-function paint(canvas, colours) {
-  const image = new ImageData(canvas.width, canvas.height);
-  new Uint32Array(image.data.buffer).set(colours);
-  context2d(canvas).putImageData(image, 0, 0);
 }
 
 /** Text for display, with spaces in joined names such as image+haptics, not in numbers. @param {string} text */
@@ -266,13 +252,10 @@ function smallestDistance(xs) {
  * @param {number} barWidth
  */
 function drawLines(chart, { lines, kind, diagonal }, styles, barWidth) {
-  const { ctx, bbox } = chart;
+  const { ctx } = chart;
   const x = (/** @type {number} */ value) => chart.valToPos(value, 'x', true);
   const y = (/** @type {number} */ value) => chart.valToPos(value, 'y', true);
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
+  clipToPlot(chart);
   if (diagonal) {
     strokePath(ctx, { stroke: colour('muted'), dash: [4, 3], width: 1 }, [
       [x(0), y(0)],
