@@ -1,7 +1,8 @@
 /** The state of the page and its permalink: opening the link restores the state. */
 
-/** @import { Catalog } from '../types/server.js' */
-/** @import { DataSet, LiveList } from '../types/server.js' */
+/** @import { Maps, Range, Scale } from '../maps/map_values.js' */
+/** @import { Catalog, DataSet, LiveList } from '../types/server.js' */
+/** @import { ColourMap } from './colours.js' */
 
 import { SCALAR, TRACKS } from '../timeline/tracks.js';
 import { MAP_QUANTITIES, SCENE_CHOICES } from './constants.js';
@@ -32,14 +33,14 @@ import { displayName } from './units.js';
  * @property {string} list content of the list of failures: `events`, `episodes` or `slices`
  * @property {string} by score that ranks failures
  * @property {string} phase of the failures in the list, empty for all
- * @property {'likelihood' | 'posterior'} map quantity of the maps
+ * @property {Maps['quantity']} map quantity of the maps
  * @property {string} sensor that is displayed as an image, empty for the first one
  * @property {string} plane components of the maps' axes, such as x,y; empty for those of the task's map
  * @property {string} others components off the maps: `auto`, `fixed` at the true values, or `marginal`, integrated out
- * @property {string} scale of the maps: `normalised` or `log`
- * @property {string} range of the maps' colours: `own` of each map, or the `same` for all
+ * @property {Scale} scale of the maps: `normalised` or `log`
+ * @property {Range} range of the maps' colours: `own` of each map, or the `same` for all
  * @property {string} axes of the maps: `offset` from the true position, or `world`
- * @property {string} colours of the maps: `viridis` or `cividis`
+ * @property {ColourMap} colours of the maps: `viridis` or `cividis`
  * @property {string} regions of 50 and 95 % on the maps: `shown` or `hidden`
  * @property {string} cloud of particles on the maps: `hidden` or `shown`
  * @property {string} zoom of the maps: `fit`, `1` or `4`

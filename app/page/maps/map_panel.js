@@ -1,12 +1,11 @@
 /** The panel with the likelihood maps, one per layer. */
 
-/** @import { ColourMap } from '../core/colours.js' */
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { Layer, MapOptions } from './draw_map.js' */
 /** @import { Figure } from './map_figure.js' */
-/** @import { Maps, Range, Scale } from './map_values.js' */
+/** @import { Maps } from './map_values.js' */
 /** @import { Reference } from './reference_maps.js' */
 
 import { MAP_QUANTITIES } from '../core/constants.js';
@@ -192,15 +191,10 @@ export class MapPanel {
     const reference = tiled ? null : this.#references.current;
     this.#showTitle(reference);
     if (tiled) return;
-    const layers = shades(
-      maps,
-      /** @type {Scale} */ (scale),
-      /** @type {Range} */ (range),
-      reference?.maps ?? null,
-    );
+    const layers = shades(maps, scale, range, reference?.maps ?? null);
     this.#figures.forEach((figure, layer) => {
       figure.shade = layers[layer];
-      figure.colourMap = reference ? 'diverging' : /** @type {ColourMap} */ (colours);
+      figure.colourMap = reference ? 'diverging' : colours;
       figure.borders =
         regions === 'shown' && !isCurve(maps) ? borders(maps, layer, REGION_SHARES) : [];
       if (!isCurve(maps)) paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
@@ -244,13 +238,7 @@ export class MapPanel {
       shade,
       peak: maps.log_max[i],
     }));
-    const labels = colourScale(
-      maps.quantity,
-      /** @type {Scale} */ (scale),
-      /** @type {Range} */ (range),
-      layers,
-      reference?.name ?? '',
-    );
+    const labels = colourScale(maps.quantity, scale, range, layers, reference?.name ?? '');
     showColourBar(bar, this.#figures[0].colourMap, labels);
     return labels;
   }

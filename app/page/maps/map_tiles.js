@@ -1,13 +1,12 @@
 /** Small maps of several steps: the last one in free motion beside the first one in contact, and those around the cursor. */
 
-/** @import { ColourMap } from '../core/colours.js' */
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { MapOptions } from './draw_map.js' */
 /** @import { DisplayedMaps } from './map_panel.js' */
 /** @import { MapReadout } from './map_readout.js' */
-/** @import { Maps, Range, Scale } from './map_values.js' */
+/** @import { Maps } from './map_values.js' */
 
 import { MAP_SIZE } from '../core/constants.js';
 import { context2d, create, html } from '../core/dom.js';
@@ -185,12 +184,7 @@ export class MapTiles {
     tile.dataset.cells = String(maps.size);
     const layer = maps.layers.indexOf(this.#displayed.layers[row]);
     const { zoom } = this.#displayed;
-    paintCells(
-      this.#cells,
-      this.#shade(maps, layer),
-      maps.size,
-      /** @type {ColourMap} */ (colours),
-    );
+    paintCells(this.#cells, this.#shade(maps, layer), maps.size, colours);
     const visible = maps.size / zoom;
     const start = (maps.size - visible) / 2;
     context.drawImage(this.#cells, start, start, visible, visible, 0, 0, pixels, pixels);
@@ -216,7 +210,7 @@ export class MapTiles {
    */
   #shade(maps, layer) {
     const { scale, range } = this.#store.state;
-    return tileShade(maps, layer, /** @type {Scale} */ (scale), /** @type {Range} */ (range));
+    return tileShade(maps, layer, scale, range);
   }
 
   /**
@@ -232,7 +226,7 @@ export class MapTiles {
     if (!this.#displayed) return;
     host.hidden = false;
     const { colours } = this.#store.state;
-    showColourBar(host, /** @type {ColourMap} */ (colours), this.#scale(this.#displayed.maps));
+    showColourBar(host, colours, this.#scale(this.#displayed.maps));
   }
 
   /** @param {Maps} maps of any step */
@@ -270,7 +264,7 @@ export class MapTiles {
     if (!this.#displayed) return [];
     const title = this.#scale(this.#displayed.maps).label;
     const { trace, layers, maps: current } = this.#displayed;
-    const colourMap = /** @type {ColourMap} */ (this.#store.state.colours);
+    const colourMap = this.#store.state.colours;
     return tileSteps(trace.contact, current.step).flatMap(({ step, phase }) => {
       const maps = this.#kept.get(step);
       if (!maps) return [];
