@@ -191,7 +191,9 @@ def test_key_help_is_complete() -> None:
     page = ROOT / "app" / "page"
     (table,) = re.findall(r"  bindKeys\(\{\n(.*?)\n  \}\);", (page / "core" / "controls.js").read_text(), re.DOTALL)
     keys = {key.strip("'") for key in re.findall(r"^    ('.+?'|\w+):", table, re.MULTILINE)}
-    (dialog,) = re.findall(r'<dialog id="keys".*?</dialog>', (page / "index.html").read_text(), re.DOTALL)
+    html = (page / "index.html").read_text()
+    keys |= set(re.findall(r'role="tab".*? aria-keyshortcuts="(.+?)"', html))
+    (dialog,) = re.findall(r'<dialog id="keys".*?</dialog>', html, re.DOTALL)
     documented = {unescape(key) for key in re.findall(r"<kbd>(.*?)</kbd>", dialog)}
     labels = {
         " ": "space",

@@ -10,12 +10,15 @@ import { bindMaximise, toggleMaximised } from './maximise.js';
 export function bindControls(page) {
   const { clock, timeline, undo, theme } = page;
   const showHelp = () => element('#keys', HTMLDialogElement).showModal();
-  /** @param {string} tab */
-  const openTab = (tab) => () => page.openTab(tab);
+  const tabKeys = [...document.querySelectorAll('[role=tab]')].map((tab) => [
+    tab.getAttribute('aria-keyshortcuts'),
+    () => page.openTab(tab.id.replace('tab-', '')),
+  ]);
   /** @param {number} steps */
   const stepBy = (steps) => (/** @type {KeyboardEvent} */ event) =>
     page.stepBy(event.shiftKey ? 10 * steps : steps, event.timeStamp);
   bindKeys({
+    ...Object.fromEntries(tabKeys),
     ' ': () => clock.toggle(),
     ArrowLeft: stepBy(-1),
     ArrowRight: stepBy(1),
@@ -35,16 +38,6 @@ export function bindControls(page) {
     '=': () => timeline.zoom(0.5),
     '-': () => timeline.zoom(2),
     0: () => timeline.showAll(),
-    1: openTab('scene'),
-    2: openTab('rerun'),
-    3: openTab('diagnostics'),
-    g: openTab('diagnosis'),
-    f: openTab('failures'),
-    o: openTab('compare'),
-    r: openTab('recordings'),
-    t: openTab('finetune'),
-    u: openTab('study'),
-    k: openTab('experiments'),
     n: ({ timeStamp }) => page.tabs?.failures.go(1, timeStamp),
     b: ({ timeStamp }) => page.tabs?.failures.go(-1, timeStamp),
     c: () => page.selectNextComponent(),

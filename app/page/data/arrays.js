@@ -53,6 +53,9 @@ export function append(array, used, values) {
   return array;
 }
 
+/** @param {Iterable<number>} values */
+export const sum = (values) => Array.from(values).reduce((a, b) => a + b, 0);
+
 /**
  * Returns the length of vectors over time.
  * @param {(Series | undefined)[]} components

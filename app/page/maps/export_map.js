@@ -16,6 +16,7 @@ import { SvgContext } from './svg_context.js';
 const SIDE = 300; // px of a map's square
 const SHEET = { padding: 14, title: 24, bar: 8, footer: 40, pixelRatio: 2 };
 const INK = '#222';
+const [TEXT, TITLE] = ['10px system-ui, sans-serif', '600 13px system-ui, sans-serif'];
 const LEFT = MARGIN.left + MARGIN.name;
 const COLUMN = SIDE + LEFT + MARGIN.right;
 const TILE = { side: 140, gap: 8, names: 70, head: 36 }; // px, of a sheet with several steps
@@ -193,12 +194,9 @@ function drawSheet(context, sheets, width, height) {
   context.fill();
   if (sheets.length > 1) drawSteps(context, sheets);
   else drawStep(context, sheets[0]);
-  context.fillStyle = INK;
-  context.font = '10px system-ui, sans-serif';
-  [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
   const [{ maps, title }] = sheets;
-  context.fillText(caption(sheets), padding, height - padding - 12);
-  context.fillText(`${mapTitle(maps)}. Colour: ${title}`, padding, height - padding);
+  write(context, caption(sheets), padding, height - padding - 12);
+  write(context, `${mapTitle(maps)}. Colour: ${title}`, padding, height - padding);
 }
 
 /**
@@ -211,10 +209,7 @@ function drawStep(context, sheet) {
   sheet.layers.forEach((layer, i) => {
     context.save();
     context.translate(padding + i * COLUMN + LEFT, padding + title);
-    context.fillStyle = INK;
-    context.font = '600 13px system-ui, sans-serif';
-    [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
-    context.fillText(`${layer.name} ${sheet.maps.quantity}`, 0, -8);
+    write(context, `${layer.name} ${sheet.maps.quantity}`, 0, -8, TITLE);
     if (!isCurve(sheet.maps)) drawColourBar(context, layer);
     const options = { ...sheet.options, textColour: INK, withY: true, named: true, hover: null };
     const draw = isCurve(sheet.maps) ? drawCurve : drawMap;
@@ -233,18 +228,11 @@ function drawSteps(context, sheets) {
   context.translate(SHEET.padding, SHEET.padding);
   sheets.forEach(({ maps, layers, options, phase }, column) => {
     const x = names + MARGIN.left + column * (side + gap);
-    context.fillStyle = INK;
-    [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
-    context.font = '600 13px system-ui, sans-serif';
-    context.fillText(`step ${maps.step}`, x, 12);
-    context.font = '10px system-ui, sans-serif';
-    context.fillText(phase ?? '', x, 26);
+    write(context, `step ${maps.step}`, x, 12, TITLE);
+    write(context, phase ?? '', x, 26);
     layers.forEach((layer, row) => {
       const y = head + row * (side + gap + MARGIN.bottom);
-      context.font = '600 13px system-ui, sans-serif';
-      [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
-      context.fillStyle = INK;
-      if (!column) context.fillText(layer.name, 0, y + 12);
+      if (!column) write(context, layer.name, 0, y + 12, TITLE);
       context.save();
       context.translate(x, y);
       const style = { ...options, textColour: INK, withY: !column, named: false, hover: null };
@@ -264,12 +252,24 @@ function drawColourBar(context, { shade, colourMap }) {
   const canvas = create('canvas', { width: 256, height: 1 });
   paintPixels(canvas, COLOUR_TABLES[colourMap]);
   const [low, high] = rangeLabels(shade, rangeDigits(shade));
-  context.font = '10px system-ui, sans-serif';
   context.drawImage(canvas, SIDE - 130, -8 - SHEET.bar, 90, SHEET.bar);
-  context.textAlign = 'right';
-  context.fillText(low, SIDE - 134, -8);
-  context.textAlign = 'left';
-  context.fillText(high, SIDE - 36, -8);
+  write(context, low, SIDE - 134, -8, TEXT, 'right');
+  write(context, high, SIDE - 36, -8);
+}
+
+/**
+ * @param {Context} context
+ * @param {string} text
+ * @param {number} x
+ * @param {number} y
+ * @param {string} [font]
+ * @param {CanvasTextAlign} [align]
+ */
+function write(context, text, x, y, font = TEXT, align = 'left') {
+  context.fillStyle = INK;
+  context.font = font;
+  [context.textAlign, context.textBaseline] = [align, 'alphabetic'];
+  context.fillText(text, x, y);
 }
 
 /**

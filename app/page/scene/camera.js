@@ -8,7 +8,7 @@
 
 import { context2d, create, element, html, paintPixels } from '../core/dom.js';
 import { COLOUR_TABLES, colour } from '../core/colours.js';
-import { displayName, significant } from '../core/units.js';
+import { displayName, niceStep, significant } from '../core/units.js';
 import { sensorImages } from '../data/api.js';
 import { imageAt } from '../data/trace.js';
 
@@ -114,14 +114,8 @@ function description({ width, height, low, high, points }) {
   return `${width} × ${height}${low === null ? '' : `, ${significant(low)} to ${significant(high)}`}`;
 }
 
-/**
- * Returns the distance of the rings around a sensor, at most three: 1, 2 or 5 times a power of ten.
- * @param {number} extent m
- */
-function ringStep(extent) {
-  const power = 10 ** Math.floor(Math.log10(extent / 3));
-  return power * ([1, 2, 5].find((step) => step * power >= extent / 3.5) ?? 10);
-}
+/** Returns the distance of the rings around a sensor, at most three. @param {number} extent m */
+const ringStep = (extent) => niceStep(extent / 3.5);
 
 /**
  * Draws points from above, around the sensor: x up, y to the left.

@@ -5,7 +5,7 @@
 
 import { SHOWN } from '../core/constants.js';
 import { displayName, fixed, percent, plural, sentence, typeset, withUnit } from '../core/units.js';
-import { intervals } from '../data/arrays.js';
+import { intervals, sum } from '../data/arrays.js';
 import { stepSummary, weightScope } from './step_summary.js';
 
 const MIN_STEPS = 5; // of an outage
@@ -277,4 +277,4 @@ function change(before, during) {
 }
 
 /** @param {ArrayLike<number>} values */
-const mean = (values) => Array.from(values).reduce((sum, value) => sum + value, 0) / values.length;
+const mean = (values) => sum(Array.from(values)) / values.length;

@@ -8,6 +8,7 @@
 import { create, element, html } from '../core/dom.js';
 import { filtersOf, isRecordedOnly } from '../core/episodes.js';
 import { displayName, fixed } from '../core/units.js';
+import { sum } from '../data/arrays.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
 
@@ -339,11 +340,4 @@ export class ComparisonForm {
     const beta = this.#trace?.weight('raw', modality, 0)?.slice(first, last + 1) ?? [];
     return [modality, beta.length ? sum(beta) / beta.length : 0];
   }
-}
-
-/** @param {Iterable<number>} values */
-function sum(values) {
-  let total = 0;
-  for (const value of values) total += value;
-  return total;
 }

@@ -347,8 +347,8 @@ export class Diagnosis {
     const label = html('.healthy-filter', host);
     label.hidden = !this.#starts || !others.length || entry.state === 'active';
     const select = /** @type {HTMLSelectElement} */ (html('select', label));
-    setOptions(select, [['', 'this filter'], ...others.map(({ name }) => [name, name])]);
-    select.value = this.#healthyFilter;
+    const options = [['', 'this filter'], ...others.map(({ name }) => [name, name])];
+    setOptions(select, options, this.#healthyFilter);
   }
 
   /** @param {string} text */

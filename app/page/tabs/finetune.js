@@ -15,7 +15,7 @@ import { setPanelState } from '../widgets/panel_state.js';
 import { FinetuneForm } from './finetune_form.js';
 import { FinetuneRun } from './finetune_run.js';
 import { FinetuneRuns } from './finetune_runs.js';
-import { Lineage } from './lineage.js';
+import { showLineage } from './lineage.js';
 
 const BODY = `
   <form novalidate aria-label="Fine-tuning"></form>
@@ -30,7 +30,6 @@ export class Finetune {
   #jobs;
   #form;
   #runView;
-  #lineage;
   #runs;
   /** @type {FineTuneOffer | null} */
   #offer = null;
@@ -62,7 +61,7 @@ export class Finetune {
     this.#form = new FinetuneForm(form, catalog, store, faultDialog, (settings) =>
       this.#start(store.state, settings),
     );
-    this.#lineage = new Lineage(html('.lineage', host), catalog, store);
+    html('.lineage', host).hidden = true;
     this.#runs = new FinetuneRuns(html('.runs', host), catalog, store);
     this.#runView = new FinetuneRun(html('article', host), catalog, store, {
       back: () => this.#closeRun(),
@@ -108,7 +107,9 @@ export class Finetune {
         const weaknesses = offer.why_not || run ? [] : await api.weaknesses(state, signal);
         [this.#offer, this.#offerKey] = [offer, key];
         this.#form.show(offer, weaknesses);
-        await this.#lineage.load(signal);
+        const { members } = await api.lineage(state.task, signal);
+        const task = this.#catalog.tasks.find(({ name }) => name === state.task);
+        showLineage(html('.lineage', this.#host), task, state, members);
       }
       this.#run = run ? await api.finetuneRun(run, signal) : null;
       this.#form.hidden = Boolean(this.#run);

@@ -1,89 +1,71 @@
 /** The lineage of a task's filters: fine-tuned checkpoints below their base checkpoints, with their errors. */
 
-/** @import { State, Store } from '../core/state.js' */
-/** @import { Catalog, LineageMember, Task } from '../types/server.js' */
+/** @import { State } from '../core/state.js' */
+/** @import { LineageMember, Task } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { fixed } from '../core/units.js';
-import * as api from '../data/api.js';
 
-export class Lineage {
-  #host;
-  #catalog;
-  #store;
-
-  /**
-   * @param {HTMLElement} host hidden if the task has no fine-tuned checkpoint
-   * @param {Catalog} catalog
-   * @param {Store} store
-   */
-  constructor(host, catalog, store) {
-    this.#host = host;
-    this.#catalog = catalog;
-    this.#store = store;
-    host.hidden = true;
-  }
-
-  /** @param {AbortSignal} signal */
-  async load(signal) {
-    const { members } = await api.lineage(this.#store.state.task, signal);
-    const hashes = new Set(members.map(({ hash }) => hash));
-    const bases = new Set(members.map(({ base }) => base));
-    const roots = members.filter(({ hash, base }) =>
-      base === null ? bases.has(hash) : !hashes.has(base),
-    );
-    this.#host.hidden = !roots.length;
-    const list = create('ul', {}, ...roots.map((root) => this.#branch(root, null, members)));
-    this.#host.replaceChildren(create('h4', { textContent: 'Lineage' }), list);
-  }
-
+/**
+ * Shows the lineage.
+ * @param {HTMLElement} host hidden if the task has no fine-tuned checkpoint
+ * @param {Task | undefined} task
+ * @param {State} state
+ * @param {LineageMember[]} members all checkpoints
+ */
+export function showLineage(host, task, state, members) {
+  const hashes = new Set(members.map(({ hash }) => hash));
+  const bases = new Set(members.map(({ base }) => base));
+  const roots = members.filter(({ hash, base }) =>
+    base === null ? bases.has(hash) : !hashes.has(base),
+  );
+  host.hidden = !roots.length;
   /**
    * Returns a checkpoint with the checkpoints that were fine-tuned from it.
    * @param {LineageMember} member
    * @param {LineageMember | null} base
-   * @param {LineageMember[]} members all checkpoints
    * @returns {HTMLLIElement}
    */
-  #branch(member, base, members) {
+  const branch = (member, base) => {
     const title = member.catalog_name ?? `${member.name} ${member.hash.slice(0, 6)}`;
     const name = create('b', { textContent: title, title: member.hash });
-    const task = this.#catalog.tasks.find((each) => each.name === this.#store.state.task);
-    const summary = create('span', {
-      textContent: task ? errorSummary(member, base, task.main) : '',
-    });
-    const line = create('div', {}, name, ' ', summary, ...this.#links(member, base));
+    const textContent = task ? errorSummary(member, base, task.main) : '';
+    const summary = create('span', { textContent });
+    const line = create('div', {}, name, ' ', summary, ...links(state, member, base));
     const finetuned = members.filter((other) => other.base === member.hash);
-    const branches = finetuned.map((other) => this.#branch(other, member, members));
+    const branches = finetuned.map((other) => branch(other, member));
     return create('li', {}, line, ...(branches.length ? [create('ul', {}, ...branches)] : []));
-  }
+  };
+  const list = create('ul', {}, ...roots.map((root) => branch(root, null)));
+  host.replaceChildren(create('h4', { textContent: 'Lineage' }), list);
+}
 
+/**
+ * @param {State} state
+ * @param {LineageMember} member
+ * @param {LineageMember | null} base
+ */
+function links(state, { catalog_name: name, hash, run }, base) {
+  const label = name ?? hash.slice(0, 6);
   /**
-   * @param {LineageMember} member
-   * @param {LineageMember | null} base
+   * @param {string} text
+   * @param {Partial<State>} patch
+   * @param {string} title
    */
-  #links({ catalog_name: name, hash, run }, base) {
-    const { state } = this.#store;
-    const label = name ?? hash.slice(0, 6);
-    /**
-     * @param {string} text
-     * @param {Partial<State>} patch
-     * @param {string} title
-     */
-    const pageLink = (text, patch, title) =>
-      link(text, permalink({ ...state, run: '', ...patch }), `${title}: ${label}`);
-    const baseName = base?.catalog_name;
-    const links = [];
-    if (name && name !== state.filter)
-      links.push(pageLink('open', { filter: name, against: '' }, 'Show its runs'));
-    if (name && baseName) {
-      const patch = { filter: name, against: `filter=${baseName}`, tab: 'compare' };
-      links.push(pageLink('compare', patch, 'Compare with its base checkpoint'));
-    }
-    if (run) links.push(pageLink('report', { run }, 'Changes made by fine-tuning'));
-    const file = `/api/lineage/${encodeURIComponent(state.task)}/${hash}.zip`;
-    return [...links, link('export', file, `Download with its base checkpoints: ${label}`)];
+  const pageLink = (text, patch, title) =>
+    link(text, permalink({ ...state, run: '', ...patch }), `${title}: ${label}`);
+  const baseName = base?.catalog_name;
+  const result = [];
+  if (name && name !== state.filter)
+    result.push(pageLink('open', { filter: name, against: '' }, 'Show its runs'));
+  if (name && baseName) {
+    const patch = { filter: name, against: `filter=${baseName}`, tab: 'compare' };
+    result.push(pageLink('compare', patch, 'Compare with its base checkpoint'));
   }
+  if (run) result.push(pageLink('report', { run }, 'Changes made by fine-tuning'));
+  const file = `/api/lineage/${encodeURIComponent(state.task)}/${hash}.zip`;
+  return [...result, link('export', file, `Download with its base checkpoints: ${label}`)];
 }
 
 /**

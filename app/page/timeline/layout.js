@@ -4,6 +4,7 @@
 
 import { create } from '../core/dom.js';
 import { scaled } from '../core/colours.js';
+import { sum } from '../data/arrays.js';
 import { GUTTER } from './chart.js';
 
 const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart
@@ -45,9 +46,6 @@ export const isCompact = (height) => height < COMPACT_HEIGHT;
 export const isDense = ({ series }, height) =>
   height < legendHeight(new Set(series.map(({ name }) => name)).size);
 
-/** @param {readonly number[]} values */
-const total = (values) => values.reduce((a, b) => a + b, 0);
-
 /** @param {number} rows */
 const legendHeight = (rows) => 3 + LINE_HEIGHT * (1 + rows);
 
@@ -69,14 +67,14 @@ export function trackHeights(tracks, height) {
   });
   // Where the room is short, the charts of areas shrink first, to the height of their legends.
   const spare = stacked.map((isStacked, i) => (isStacked ? STACKED_HEIGHT - legends[i] : 0));
-  const room = Math.max(height - total(legends), 0);
-  const part = total(spare) > room ? room / total(spare) : 1;
+  const room = Math.max(height - sum(legends), 0);
+  const part = sum(spare) > room ? room / sum(spare) : 1;
   const minimum = legends.map((value, i) => value + part * spare[i]);
-  const sum = total(minimum);
-  if (sum >= height) return minimum.map((value) => Math.floor((value / sum) * height));
+  const least = sum(minimum);
+  if (least >= height) return minimum.map((value) => Math.floor((value / least) * height));
   /** @type {number[]} */
   const weights = stacked.map((isStacked, i) => (noteOnly[i] ? 0 : isStacked ? STACKED_WEIGHT : 1));
-  const share = (height - sum) / total(weights);
+  const share = (height - least) / sum(weights);
   return minimum.map((value, i) => Math.floor(value + weights[i] * share));
 }
 

@@ -3,37 +3,30 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
-import { element } from '../core/dom.js';
+import { element, setOptions } from '../core/dom.js';
 import { displayName } from '../core/units.js';
 
 const PREFIX = 'only=';
 
-export class StandalonePicker {
-  #select = element('#standalone', HTMLSelectElement);
-  #store;
-
-  /** @param {Store} store */
-  constructor(store) {
-    this.#store = store;
-    this.#select.addEventListener('change', () => {
-      const { value } = this.#select;
-      store.set({ against: value && PREFIX + value });
-    });
-    store.when(['against'], () => this.#update());
-  }
-
-  /** @param {Trace} trace */
-  show({ inputs }) {
-    this.#select.hidden = !inputs.length;
-    this.#select.replaceChildren(
-      new Option('no standalone', ''),
-      ...inputs.map((name) => new Option(`${displayName(name)} standalone`, name)),
-    );
-    this.#update();
-  }
-
-  #update() {
-    const { against } = this.#store.state;
-    this.#select.value = against.startsWith(PREFIX) ? against.slice(PREFIX.length) : '';
-  }
+/**
+ * Connects the choice.
+ * @param {Store} store
+ * @returns {(trace: Trace) => void} offers the modalities of a trace
+ */
+export function standalonePicker(store) {
+  const select = element('#standalone', HTMLSelectElement);
+  const update = () => {
+    const { against } = store.state;
+    select.value = against.startsWith(PREFIX) ? against.slice(PREFIX.length) : '';
+  };
+  select.addEventListener('change', () =>
+    store.set({ against: select.value && PREFIX + select.value }),
+  );
+  store.when(['against'], update);
+  return ({ inputs }) => {
+    const options = inputs.map((name) => [name, `${displayName(name)} standalone`]);
+    setOptions(select, [['', 'no standalone'], ...options]);
+    select.hidden = !inputs.length;
+    update();
+  };
 }

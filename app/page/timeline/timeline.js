@@ -21,7 +21,7 @@ import { HoverValues } from './hover_values.js';
 import { isCompact, isDense, layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, legendWidth, updateLegend } from './legend.js';
 import { Overview } from './overview.js';
-import { StandalonePicker } from './standalone_picker.js';
+import { standalonePicker } from './standalone_picker.js';
 import { STEPS, secondsAxis } from './step_axis.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
 import { TrackSizes } from './track_sizes.js';
@@ -70,7 +70,7 @@ export class Timeline {
   #marks;
   #overview;
   #values;
-  #standalone;
+  #showStandalone;
   #group;
   #menu;
   #sizes = new TrackSizes(() => this.#build());
@@ -97,7 +97,7 @@ export class Timeline {
       setWindow: (window) => this.#setWindow(window),
       scrub: (step, inputTime) => store.set({ step: this.#nearest(step) }, { inputTime }),
     });
-    this.#standalone = new StandalonePicker(store);
+    this.#showStandalone = standalonePicker(store);
     this.#group = new GroupPicker(() => this.redraw());
     this.#menu = new ChartMenu(html('#chart-menu'), html('#charts'), store, () =>
       this.#sizes.reset(),
@@ -136,7 +136,7 @@ export class Timeline {
     this.#window = fitWindow(sameLength ? parseWindow(window, all) : all, all);
     this.mark([]);
     this.showRepair(null);
-    this.#standalone.show(trace);
+    this.#showStandalone(trace);
     this.#group.show(trace.groups);
     this.#menu.show(trace);
     this.redraw();

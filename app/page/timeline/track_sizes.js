@@ -1,6 +1,7 @@
 /** Heights of the charts that the user has chosen, as shares; separators between the charts change them. */
 
 import { create } from '../core/dom.js';
+import { sum } from '../data/arrays.js';
 
 const STORAGE_KEY = 'beliefscope.charts';
 const MIN_HEIGHT = 28; // px
@@ -45,8 +46,8 @@ export class TrackSizes {
   apply(keys, heights) {
     const chosen = this.#chosen[keys.join()];
     if (!Array.isArray(chosen) || chosen.length !== heights.length) return [...heights];
-    const [total, sum] = [heights, chosen].map((list) => list.reduce((a, b) => a + b, 0));
-    return sum > 0 ? chosen.map((height) => Math.floor((height / sum) * total)) : [...heights];
+    const [total, used] = [sum(heights), sum(chosen)];
+    return used > 0 ? chosen.map((height) => Math.floor((height / used) * total)) : [...heights];
   }
 
   reset() {

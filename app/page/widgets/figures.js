@@ -4,7 +4,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Curve, DiagnosticResult, Table } from '../types/server.js' */
 
-import { create } from '../core/dom.js';
+import { columnHeading, create, fillTable } from '../core/dom.js';
 import { csv } from '../core/download.js';
 import { scaled, swatch } from '../core/colours.js';
 import { sentence, significant, typeset } from '../core/units.js';
@@ -191,20 +191,16 @@ export class Figures {
     const head = heading(title);
     const copied = () => csv([columns, ...rows]);
     head.append(copyButton('Copy CSV', `Copy ${title} as CSV`, copied));
-    const table = document.createElement('table');
-    table.setAttribute('aria-label', title);
+    const body = create('tbody');
+    const table = create('table', { ariaLabel: title }, create('thead'), body);
     const classes = columns.map((_, i) =>
       rows.every((row) => typeof row[i] !== 'string') ? 'number' : '',
     );
-    const cells = columns.map((name, i) =>
-      create('th', { scope: 'col', textContent: label(name), className: classes[i] }),
+    const headings = columns.map((name, i) =>
+      columnHeading(label(name), { className: classes[i] }),
     );
-    table
-      .createTHead()
-      .insertRow()
-      .append(...cells);
+    fillTable(table, headings, []);
     const layers = new Set(['truth', 'fused', ...(this.#trace?.modalities ?? [])]);
-    const body = table.createTBody();
     rows.forEach((row, r) => {
       const line = body.insertRow();
       const repeated = r > 0 && rows[r - 1][0] === row[0]; // its first cell is hidden
