@@ -4,7 +4,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { MapPanel } from './map_panel.js' */
 
-import { create, element, html } from '../core/dom.js';
+import { create, element, html, setOptions } from '../core/dom.js';
 import { CHOICES } from '../core/state.js';
 import { displayName } from '../core/units.js';
 import { choice, choiceHost } from '../widgets/pickers.js';
@@ -74,9 +74,8 @@ export function mapMenu(menu, button, store, maps) {
     for (const key of ['tiles', 'range', 'colours', 'regions']) rows[key].hidden = isCurve;
     rows.cloud.hidden = !trace.has('effective_sample_size') || isCurve;
     rows.others.hidden = trace.components.length < 3;
-    plane.replaceChildren(...planeOptions(trace));
+    setOptions(plane, planeOptions(trace), mapPlane(store.state, trace).join());
     planeRow.hidden = plane.options.length < 2;
-    plane.value = mapPlane(store.state, trace).join();
   };
 }
 
@@ -92,7 +91,7 @@ function planeOptions({ components, task }) {
   const others = pairs.filter(
     (pair) => pair.join() !== map.join() && [...pair].reverse().join() !== map.join(),
   );
-  return [map, ...others].map((pair) => new Option(pair.map(displayName).join(', '), pair.join()));
+  return [map, ...others].map((pair) => [pair.join(), pair.map(displayName).join(', ')]);
 }
 
 /**

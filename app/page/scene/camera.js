@@ -6,7 +6,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
-import { context2d, create, element, html, paintPixels } from '../core/dom.js';
+import { context2d, create, element, html, paintPixels, setOptions } from '../core/dom.js';
 import { COLOUR_TABLES, colour } from '../core/colours.js';
 import { displayName, niceStep, significant } from '../core/units.js';
 import { sensorImages } from '../data/api.js';
@@ -86,9 +86,9 @@ export class Camera {
       return create('span', {
         textContent: name === 'image' ? 'camera, ' : `${displayName(name)}, `,
       });
-    const options = sensors.map((sensor) => new Option(displayName(sensor.name), sensor.name));
-    const select = create('select', { ariaLabel: 'Sensor' }, ...options);
-    select.value = name;
+    const select = create('select', { ariaLabel: 'Sensor' });
+    const options = sensors.map((sensor) => [sensor.name, displayName(sensor.name)]);
+    setOptions(select, options, name);
     select.addEventListener('change', () => this.#store.set({ sensor: select.value }));
     return select;
   }

@@ -120,14 +120,12 @@ export class Experiments {
     );
     this.#groupMenu = new GroupMenu(host, (groups) => store.set({ groups }));
     store.listen((_, changed) => {
+      /** @param {...string} keys */
+      const any = (...keys) => keys.some((key) => changed.has(key));
       if (!this.#open) return;
-      if (['sweep', 'steps'].some((key) => changed.has(key))) {
-        this.#load();
-        return;
-      }
-      if (['match', 'sort', 'x', 'y', 'rows', 'groups', 'pinned'].some((key) => changed.has(key)))
-        this.#draw();
-      if (['cell', 'rows', 'groups'].some((key) => changed.has(key))) this.#showSelected();
+      if (any('sweep', 'steps')) return this.#load();
+      if (any('match', 'sort', 'x', 'y', 'rows', 'groups', 'pinned')) this.#draw();
+      if (any('cell', 'rows', 'groups')) this.#showSelected();
     });
   }
 

@@ -11,6 +11,7 @@
 import { element, html, messageOf } from '../core/dom.js';
 import { formatBytes, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
+import { sum } from '../data/arrays.js';
 import { acceptDrops } from '../widgets/file_drop.js';
 import { FileTable } from '../widgets/file_table.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
@@ -21,7 +22,7 @@ import { fileActions } from './file_actions.js';
 import { differences, recordedRun, selectRun } from './recorded_run.js';
 import { RECORDING_COLUMNS, REPORT_COLUMNS } from './recording_columns.js';
 import { SelectionBar } from './selection_bar.js';
-import { Trash } from './trash.js';
+import { trash } from './trash.js';
 
 const POLL_INTERVAL = 4000; // ms; other clients may change the files
 const READING_INTERVAL = 700; // ms, while the server reads a new file
@@ -59,7 +60,7 @@ export class Recordings {
   #reports;
   #selection;
   #uploads;
-  #trash;
+  #showTrash;
   #status;
   /** @type {{recordings: RecordingList, reports: ReportList} | null} */
   #files = null;
@@ -112,7 +113,7 @@ export class Recordings {
     );
     this.#uploads = new Uploads(html('.uploads', host), (added) => this.#showAdded(added));
     this.#status = new StatusLine(html('.status', host));
-    this.#trash = new Trash(
+    this.#showTrash = trash(
       html('.trash', host),
       this.#readOnlyReason,
       (file) => this.#restore(file),
@@ -191,13 +192,13 @@ export class Recordings {
     html('section.reports', this.#host).hidden = !reports.reports.length;
     const total = plural(all.length, 'recording');
     const count = matches.length < all.length ? `${matches.length} of ${total}` : total;
-    const used = reports.reports.reduce((sum, { bytes }) => sum + bytes, recordings.bytes);
+    const used = recordings.bytes + sum(reports.reports.map(({ bytes }) => bytes));
     html('.summary', this.#host).textContent =
       `${count} · ${formatBytes(used)} used, ${formatBytes(recordings.free)} free`;
     const none = this.#catalog.read_only ? 'No recordings.' : NO_RECORDINGS;
     const hint = all.length ? 'No recording matches all words.' : none;
     html('.rest', this.#host).textContent = matches.length ? '' : hint;
-    this.#trash.show([
+    this.#showTrash([
       ...recordings.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('recordings') })),
       ...reports.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('reports') })),
     ]);

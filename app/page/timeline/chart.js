@@ -295,10 +295,8 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
   /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] @param {number} [top] */
   const shade = (intervals, fill, height = bbox.height, top = bbox.top) => {
     ctx.fillStyle = fill ?? 'transparent';
-    for (const [first, last] of intervals) {
-      const left = Math.max(bbox.left, plot.valToPos(axis.position(first - 0.5), 'x', true));
-      const end = plot.valToPos(axis.position(last + 0.5), 'x', true);
-      const right = Math.min(bbox.left + bbox.width, end);
+    for (const interval of intervals) {
+      const [left, right] = visiblePart(plot, axis, interval);
       if (right > left) ctx.fillRect(left, top, Math.max(right - left, 1), height);
     }
   };
@@ -328,6 +326,19 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
 }
 
 /**
+ * Returns the visible part of an interval in px.
+ * @param {uPlot} plot
+ * @param {StepAxis} axis
+ * @param {Interval} interval
+ */
+function visiblePart({ bbox, valToPos }, axis, [first, last]) {
+  const [start, end] = [first - 0.5, last + 0.5].map((step) =>
+    valToPos(axis.position(step), 'x', true),
+  );
+  return [Math.max(bbox.left, start), Math.min(bbox.left + bbox.width, end)];
+}
+
+/**
  * Writes a label into each interval that has room for it.
  * @param {uPlot} plot
  * @param {StepAxis} axis
@@ -337,15 +348,14 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
  * @param {string} ink
  * @param {string | null} background
  */
-function labelIntervals({ ctx, bbox, valToPos }, axis, intervals, text, top, ink, background) {
+function labelIntervals(plot, axis, intervals, text, top, ink, background) {
+  const { ctx } = plot;
   const height = STRIP_HEIGHT * devicePixelRatio;
   ctx.font = `${scaled(9.5) * devicePixelRatio}px system-ui, sans-serif`;
   [ctx.textAlign, ctx.textBaseline] = ['center', 'middle'];
   const width = ctx.measureText(text).width + 6 * devicePixelRatio;
-  for (const [first, last] of intervals) {
-    const left = Math.max(bbox.left, valToPos(axis.position(first - 0.5), 'x', true));
-    const end = valToPos(axis.position(last + 0.5), 'x', true);
-    const right = Math.min(bbox.left + bbox.width, end);
+  for (const interval of intervals) {
+    const [left, right] = visiblePart(plot, axis, interval);
     if (right - left < width) continue;
     const centre = (left + right) / 2;
     ctx.fillStyle = background ?? 'transparent';

@@ -3,7 +3,7 @@
 import { element, html } from '../core/dom.js';
 
 export class GroupPicker {
-  #key = element('#group-key', HTMLElement);
+  #key = html('#group-key');
   #name = html('span', this.#key);
   #select = element('#group', HTMLSelectElement);
 
