@@ -1,6 +1,5 @@
 /** All commands of the page: its tabs, buttons and choices, read from the page itself, and layouts and examples. */
 
-/** @import { Catalog } from '../types/server.js' */
 /** @import { Page } from './page.js' */
 /** @import { Store } from './state.js' */
 
@@ -74,16 +73,13 @@ export function stepCommand(page, query) {
 
 /**
  * Returns the episodes with all words of a query, for a data set that the catalog lists in part.
- * @param {Catalog} catalog
  * @param {Store} store
  * @param {string} query
  * @returns {Promise<Command[]>}
  */
-export async function episodeCommands(catalog, store, query) {
+export async function episodeCommands(store, query) {
   const { task, data } = store.state;
-  const set = catalog.tasks
-    .find(({ name }) => name === task)
-    ?.data.find(({ name }) => name === data);
+  const set = store.task(task)?.data.find(({ name }) => name === data);
   if (!set || isComplete(set) || !query.trim()) return [];
   const matches = await episodes(task, data, { query, limit: MAX_EPISODES });
   return matches.episodes.map((entry) => ({

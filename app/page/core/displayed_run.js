@@ -1,6 +1,5 @@
 /** The displayed run: its trace, which follows the selection in the state, and the panels, which follow both. */
 
-/** @import { Catalog } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Handlers } from '../data/view_socket.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */
@@ -32,7 +31,6 @@ export const delayed = pause(MAX_DELAY);
 
 export class DisplayedRun {
   #page;
-  #catalog;
   #store;
   #messages;
   #loading = new AbortController();
@@ -42,13 +40,11 @@ export class DisplayedRun {
 
   /**
    * @param {Page} page
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {Messages} messages
    */
-  constructor(page, catalog, store, messages) {
+  constructor(page, store, messages) {
     this.#page = page;
-    this.#catalog = catalog;
     this.#store = store;
     this.#messages = messages;
   }
@@ -76,7 +72,7 @@ export class DisplayedRun {
   async load() {
     const page = this.#page;
     const { task: name, filter, data, episode, faults } = this.#store.state;
-    const task = this.#catalog.tasks.find((item) => item.name === name);
+    const task = this.#store.task();
     if (!task) return;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());

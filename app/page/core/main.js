@@ -39,7 +39,7 @@ async function start() {
       state.faults = '';
     });
   messages.show('link', problems.join('\n'));
-  new Page(catalog, new Store(state), live, messages);
+  new Page(new Store(state, catalog), live, messages);
 }
 
 /** Loads the catalog, with the link's checkpoints of sweeps, which a new server does not list. */

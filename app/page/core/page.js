@@ -1,6 +1,6 @@
 /** The page: its panels, tabs and commands. */
 
-/** @import { Catalog, LiveList, Selection } from '../types/server.js' */
+/** @import { LiveList, Selection } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Tabs } from '../tabs/tabs.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */
@@ -43,7 +43,6 @@ import { Theme } from './theme.js';
 import { Undo } from './undo.js';
 
 export class Page {
-  #catalog;
   #store;
   #messages;
   #run;
@@ -54,25 +53,23 @@ export class Page {
   tabs = null;
 
   /**
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {LiveList} live
    * @param {Messages} messages
    */
-  constructor(catalog, store, live, messages) {
-    this.#catalog = catalog;
+  constructor(store, live, messages) {
     this.#store = store;
     this.#messages = messages;
-    this.#run = new DisplayedRun(this, catalog, store, messages);
+    this.#run = new DisplayedRun(this, store, messages);
     this.#faultDialog = new FaultDialog(
       element('#fault-dialog', HTMLDialogElement),
-      catalog.faults,
+      store.catalog.faults,
     );
-    const refreshPickers = connectPickers(catalog, store, this.#faultDialog, () =>
+    const refreshPickers = connectPickers(store, this.#faultDialog, () =>
       this.commands.toggle('episode '),
     );
     this.finding = new FindingBar(html('#finding'), store);
-    this.intro = new Intro(html('#intro'), catalog, store, () => this.tour.start());
+    this.intro = new Intro(html('#intro'), store, () => this.tour.start());
     this.tour = new Tour();
     this.splitters = new Splitters();
     layoutMenu(html('#layouts'), html('#layout'), (layout) => this.setLayout(layout));
@@ -99,7 +96,7 @@ export class Page {
       (at) => this.socket.setViewpoint(at),
     );
     this.jobs = new Jobs(html('#jobs'), element('#jobs-button', HTMLButtonElement));
-    this.live = new Live(catalog, store, this.#run.liveHandlers(refreshPickers), live);
+    this.live = new Live(store, this.#run.liveHandlers(refreshPickers), live);
     this.selectTab = tabBar(store);
     this.socket = new ViewSocket(
       this.#run.socketHandlers,
@@ -117,7 +114,7 @@ export class Page {
       element('#commands', HTMLDialogElement),
       () => commands(this),
       (/** @type {string} */ query) => stepCommand(this, query),
-      (/** @type {string} */ query) => episodeCommands(catalog, store, query),
+      (/** @type {string} */ query) => episodeCommands(store, query),
     );
     this.#start();
   }
@@ -126,7 +123,7 @@ export class Page {
     const store = this.#store;
     store.listen((state, changed) => this.#run.follow(state, changed));
     window.addEventListener('popstate', () => {
-      const { state, problems } = parsePermalink(location.search, this.#catalog);
+      const { state, problems } = parsePermalink(location.search, this.#store.catalog);
       this.#messages.show('link', problems.join('\n'));
       store.restore(state);
     });
@@ -161,7 +158,7 @@ export class Page {
   async #createTabs() {
     setPanelState(html('#tabs-state'), 'loading', 'Loading …');
     const { Tabs } = await import('../tabs/tabs.js');
-    const tabs = new Tabs(this.#catalog, this.#store, {
+    const tabs = new Tabs(this.#store, {
       jobs: this.jobs,
       timeline: this.timeline,
       finding: this.finding,

@@ -186,10 +186,19 @@ export class Store {
   /** @type {number | undefined} */
   #linkTimer;
 
-  /** @param {State} state */
-  constructor(state) {
+  /**
+   * @param {State} state
+   * @param {Catalog} catalog of the names in the state
+   */
+  constructor(state, catalog) {
     this.state = state;
+    this.catalog = catalog;
     this.#link = permalink(state);
+  }
+
+  /** Returns a task, by default the selected one. @param {string} [selected] */
+  task(selected = this.state.task) {
+    return this.catalog.tasks.find(({ name }) => name === selected);
   }
 
   /** @param {Listener} listener called in a frame after one or more changes */

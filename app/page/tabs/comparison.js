@@ -2,7 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
-/** @import { Catalog, Comparison } from '../types/server.js' */
+/** @import { Comparison } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { element, html, isAbort, messageOf } from '../core/dom.js';
@@ -16,7 +16,6 @@ const NO_COMPARISON =
   'No comparison yet. Choose another filter, other sensor faults, the standalone filter of a modality or an intervention over some steps, then compare.';
 
 export class ComparisonTab {
-  #catalog;
   #store;
   #result;
   #figures;
@@ -35,13 +34,11 @@ export class ComparisonTab {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {FaultDialog} dialog
    * @param {(other: Trace | null, label: string) => void} overlay called when the comparison run changes
    */
-  constructor(host, catalog, store, dialog, overlay) {
-    this.#catalog = catalog;
+  constructor(host, store, dialog, overlay) {
     this.#store = store;
     this.#overlay = overlay;
     this.#result = html('.result', host);
@@ -53,7 +50,7 @@ export class ComparisonTab {
     store.when(['beside'], () => this.#showGain());
     this.#figures = new Figures(html('.figures', host), store);
     const form = element('form', HTMLFormElement, host);
-    this.#form = new ComparisonForm(form, catalog, store, dialog, (against) =>
+    this.#form = new ComparisonForm(form, store, dialog, (against) =>
       api.checkSelection({ ...store.state, against }),
     );
     setPanelState(this.#result, 'loading', 'Loading …');
@@ -108,7 +105,7 @@ export class ComparisonTab {
 
   /** @param {Trace} trace */
   async #load(trace) {
-    const { against, task: name } = this.#store.state;
+    const { against } = this.#store.state;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     this.#setOther(null, '');
@@ -120,7 +117,7 @@ export class ComparisonTab {
     };
     progress(null);
     try {
-      const task = this.#catalog.tasks.find((t) => t.name === name) ?? this.#catalog.tasks[0];
+      const task = this.#store.task() ?? this.#store.catalog.tasks[0];
       const selection = { ...trace.selection, against };
       const other = await api.loadTrace(task, selection, progress, signal);
       const result = await api.comparison(selection, signal);

@@ -2,7 +2,6 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
-/** @import { Catalog } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { create, element, html } from '../core/dom.js';
@@ -45,7 +44,6 @@ function kindOf(against) {
 export class ComparisonForm {
   #form;
   #store;
-  #catalog;
   #filter;
   #only;
   #first;
@@ -64,14 +62,12 @@ export class ComparisonForm {
 
   /**
    * @param {HTMLFormElement} form
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {FaultDialog} dialog
    * @param {(against: string) => Promise<unknown>} check throws the reason if a comparison is invalid
    */
-  constructor(form, catalog, store, dialog, check) {
+  constructor(form, store, dialog, check) {
     this.#form = form;
-    this.#catalog = catalog;
     this.#store = store;
     this.#filter = element('[name=filter]', HTMLSelectElement, form);
     this.#only = element('[name=only]', HTMLSelectElement, form);
@@ -109,8 +105,8 @@ export class ComparisonForm {
   show(trace) {
     const isNew = this.#trace?.steps !== trace.steps;
     this.#trace = trace;
-    const { against, data, filter, task: name, step, faults } = this.#store.state;
-    const task = this.#catalog.tasks.find((t) => t.name === name);
+    const { against, data, filter, step, faults } = this.#store.state;
+    const task = this.#store.task();
     const filters = task ? filtersOf(task, data) : [];
     const others = filters.map((f) => f.name).filter((other) => other !== filter);
     this.#filter.replaceChildren(...others.map((other) => new Option(other, other)));
@@ -245,7 +241,7 @@ export class ComparisonForm {
     const parts = this.#form.querySelectorAll('[data-kind]');
     for (const part of parts) part.hidden = part.dataset.kind !== this.#kind;
     const isExternal = this.#trace?.header.kind === 'external';
-    const cannotRun = isRecordedOnly(this.#catalog, this.#store.state)
+    const cannotRun = isRecordedOnly(this.#store.catalog, this.#store.state)
       ? 'The filter of this run is known only from its recorded runs, so it cannot run again.'
       : '';
     html('[data-kind="intervention"] > .why-not', this.#form).textContent =

@@ -3,7 +3,7 @@
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
-/** @import { Catalog, Diagnosis as Result, DiagnosisCause, HealthyRecord } from '../types/server.js' */
+/** @import { Diagnosis as Result, DiagnosisCause, HealthyRecord } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
@@ -32,7 +32,6 @@ const SETTLING = { open: 500, closed: 2000 }; // ms until the job of a selection
 export class Diagnosis {
   #host;
   #store;
-  #catalog;
   #starts;
   #repair;
   /** @type {Trace | null} */
@@ -56,16 +55,14 @@ export class Diagnosis {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {Jobs} jobs
    * @param {Timeline} timeline displays the smallest repair
    */
-  constructor(host, catalog, store, jobs, timeline) {
+  constructor(host, store, jobs, timeline) {
     this.#host = host;
     this.#store = store;
-    this.#catalog = catalog;
-    this.#starts = !catalog.read_only;
+    this.#starts = !store.catalog.read_only;
     this.#repair = new Repair(html('.repair', host), jobs, timeline);
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
       finished.includes(this.#key) ? this.load() : this.#draw(),
@@ -289,7 +286,7 @@ export class Diagnosis {
     const isReady = entry.state === 'ready'; // the run is loading again
     this.#writeHeadline(isReady ? 'Loading …' : sentence(reason));
     const { task, data } = trace.selection;
-    const sets = this.#catalog.tasks.find(({ name }) => name === task)?.data ?? [];
+    const sets = this.#store.task(task)?.data ?? [];
     const other = sets.length > 1 ? ' If they are not, choose another data set above first.' : '';
     const about = `Runs the filter over the held-out episodes of ${data}, which must be healthy.${other} This and later episodes are then compared with them. More held-out episodes mean fewer false alarms for a single episode.`;
     const state = this.#starts
@@ -342,7 +339,7 @@ export class Diagnosis {
    */
   #drawHealthyFilter(host, trace, entry) {
     const { task, filter } = trace.selection;
-    const filters = this.#catalog.tasks.find(({ name }) => name === task)?.filters ?? [];
+    const filters = this.#store.task(task)?.filters ?? [];
     const others = filters.filter(({ name, live }) => name !== filter && !live);
     const label = html('.healthy-filter', host);
     label.hidden = !this.#starts || !others.length || entry.state === 'active';

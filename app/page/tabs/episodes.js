@@ -1,7 +1,7 @@
 /** Table of the episodes of a data set, with the errors of the filter once it has run over them. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, DataSet, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
+/** @import { DataSet, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
 import { create, createButton, element, focusedIn, html } from '../core/dom.js';
@@ -117,7 +117,6 @@ export class Episodes {
   #head;
   #body;
   #store;
-  #catalog;
   /** Selected order; null for the default one. @type {Sort | null} */
   #selectedSort = null;
   /** @type {Failures | null} */
@@ -134,12 +133,10 @@ export class Episodes {
   /**
    * @param {HTMLTableElement} table
    * @param {Store} store
-   * @param {Catalog} catalog
    */
-  constructor(table, store, catalog) {
+  constructor(table, store) {
     this.#table = table;
     this.#store = store;
-    this.#catalog = catalog;
     this.#head = element('thead', HTMLTableSectionElement, table);
     this.#body = element('tbody', HTMLTableSectionElement, table);
     navigateRows(this.#body);
@@ -162,14 +159,10 @@ export class Episodes {
     return this.#selectedSort ?? standard;
   }
 
-  get #task() {
-    return this.#catalog.tasks.find(({ name }) => name === this.#store.state.task);
-  }
-
   /** Sorted rows. */
   get #episodes() {
     const { data } = this.#store.state;
-    const selected = this.#task;
+    const selected = this.#store.task();
     const sets = selected?.data ?? [];
     const set = sets.find(({ name }) => name === data);
     const summaries = (set && this.#listed.get(set)) ?? set?.episodes ?? [];
@@ -187,7 +180,7 @@ export class Episodes {
 
   #draw() {
     const { task, data, filter, faults, among, episode } = this.#store.state;
-    const selected = this.#task;
+    const selected = this.#store.task();
     if (!selected) return;
     this.#list(selected.data.find(({ name }) => name === data));
     const run = [task, data, filter, faults, among, this.#score?.name, Boolean(this.#results)];

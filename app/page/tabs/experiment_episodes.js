@@ -1,7 +1,7 @@
 /** The episodes of a checkpoint selected in the Experiments tab, or the checkpoints of a group, and how they open. */
 
 /** @import { State, Store } from '../core/state.js' */
-/** @import { Catalog, EpisodeResult, ExperimentRow } from '../types/server.js' */
+/** @import { EpisodeResult, ExperimentRow } from '../types/server.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { HASH_DIGITS } from '../core/constants.js';
@@ -28,7 +28,6 @@ export function worstOfSeed(episodes, seed) {
 
 export class EpisodePanel {
   #section;
-  #catalog;
   #store;
   #report;
   #sweep = '';
@@ -41,13 +40,11 @@ export class EpisodePanel {
 
   /**
    * @param {HTMLElement} section
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {(problem: string) => void} report
    */
-  constructor(section, catalog, store, report) {
+  constructor(section, store, report) {
     this.#section = section;
-    this.#catalog = catalog;
     this.#store = store;
     this.#report = report;
     html('.compare', section).addEventListener('click', () =>
@@ -175,7 +172,7 @@ export class EpisodePanel {
     const { result } = worstOfSeed(this.#episodes, this.#openedSeed);
     const episode = result?.episode ?? worst_episode ?? 0;
     const step = result?.worst_step ?? worst_step ?? 0;
-    const sets = this.#catalog.tasks.find(({ name }) => name === task)?.data;
+    const sets = this.#store.task(task)?.data;
     const place = { episode, step, against: '', playing: false };
     return { task, filter, faults, data: data ?? sets?.[0]?.name ?? '', ...place };
   }
@@ -198,7 +195,7 @@ export class EpisodePanel {
       return;
     }
     try {
-      const filter = this.#catalog.read_only
+      const filter = this.#store.catalog.read_only
         ? filterName(row)
         : (await api.addSweepFilter(this.#sweep, row.checkpoint)).filter;
       // Loads the catalog again.

@@ -1,7 +1,7 @@
 /** The Experiments tab: its choices, and the loading of results for the table, the scatter plot and the list of episodes. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, ExperimentRow, SweepInfo } from '../types/server.js' */
+/** @import { ExperimentRow, SweepInfo } from '../types/server.js' */
 /** @import { Column } from './experiment_columns.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
 
@@ -101,10 +101,9 @@ export class Experiments {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    */
-  constructor(host, catalog, store) {
+  constructor(host, store) {
     this.#host = host;
     this.#store = store;
     host.innerHTML = BODY;
@@ -115,7 +114,7 @@ export class Experiments {
     });
     new ResizeObserver(() => this.#drawChart()).observe(html('.chart', host));
     this.#listenToPickers();
-    this.#episodes = new EpisodePanel(html('.episodes', host), catalog, store, (problem) =>
+    this.#episodes = new EpisodePanel(html('.episodes', host), store, (problem) =>
       this.#report(problem),
     );
     this.#groupMenu = new GroupMenu(host, (groups) => store.set({ groups }));

@@ -3,7 +3,7 @@
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
-/** @import { Catalog, FailureEvent, FailureScore, Failures as Search } from '../types/server.js' */
+/** @import { FailureEvent, FailureScore, Failures as Search } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
@@ -53,13 +53,12 @@ export class Failures {
    * @param {Store} store
    * @param {Jobs} jobs
    * @param {Timeline} timeline displays marks of the events
-   * @param {Catalog} catalog
    */
-  constructor(host, store, jobs, timeline, catalog) {
+  constructor(host, store, jobs, timeline) {
     this.#host = host;
     this.#store = store;
     this.#timeline = timeline;
-    this.#episodes = new Episodes(element('.episodes', HTMLTableElement, host), store, catalog);
+    this.#episodes = new Episodes(element('.episodes', HTMLTableElement, host), store);
     this.#table = new EventTable(element('.events', HTMLTableElement, host), (event, time) =>
       this.#open(event, time),
     );

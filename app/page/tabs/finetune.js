@@ -1,7 +1,7 @@
 /** The Fine-tune tab: a form for a new run, or a run with its progress and its results, and the lineage of the filters. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneOffer, Job, Selection } from '../types/server.js' */
+/** @import { FineTuneDetails, FineTuneOffer, Job, Selection } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 /** @import { Decision } from './finetune_run.js' */
@@ -33,7 +33,6 @@ export class Finetune {
   #runs;
   /** @type {FineTuneOffer | null} */
   #offer = null;
-  #catalog;
   #offerKey = ''; // selection of the offer and its weaknesses
   /** @type {FineTuneDetails | null} */
   #run = null;
@@ -46,24 +45,22 @@ export class Finetune {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {Jobs} jobs
    * @param {FaultDialog} faultDialog
    */
-  constructor(host, catalog, store, jobs, faultDialog) {
+  constructor(host, store, jobs, faultDialog) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#store = store;
     this.#jobs = jobs;
     host.innerHTML = BODY;
     const form = element('form', HTMLFormElement, host);
-    this.#form = new FinetuneForm(form, catalog, store, faultDialog, (settings) =>
+    this.#form = new FinetuneForm(form, store, faultDialog, (settings) =>
       this.#start(store.state, settings),
     );
     html('.lineage', host).hidden = true;
-    this.#runs = new FinetuneRuns(html('.runs', host), catalog, store);
-    this.#runView = new FinetuneRun(html('article', host), catalog, store, {
+    this.#runs = new FinetuneRuns(html('.runs', host), store);
+    this.#runView = new FinetuneRun(html('article', host), store, {
       back: () => this.#closeRun(),
       pauseOrResume: () => this.#pauseOrResume(),
       trainLonger: () => this.#trainLonger(),
@@ -91,7 +88,7 @@ export class Finetune {
   async #load() {
     if (!this.#open) return;
     const { task, filter, data, episode, faults, run } = this.#store.state;
-    if (!run && isRecordedOnly(this.#catalog, { task, filter, data })) {
+    if (!run && isRecordedOnly(this.#store.catalog, { task, filter, data })) {
       this.#loading.abort();
       const text = `The filter ${filter} is known only from its recorded runs: it has no modules to train.`;
       return setPanelState(this.#host, 'empty', text);
@@ -108,7 +105,7 @@ export class Finetune {
         [this.#offer, this.#offerKey] = [offer, key];
         this.#form.show(offer, weaknesses);
         const { members } = await api.lineage(state.task, signal);
-        const task = this.#catalog.tasks.find(({ name }) => name === state.task);
+        const task = this.#store.task();
         showLineage(html('.lineage', this.#host), task, state, members);
       }
       this.#run = run ? await api.finetuneRun(run, signal) : null;

@@ -1,7 +1,7 @@
 /** Form for a fine-tuning run: a weakness, the modules and data to train, and the criterion of success. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneOffer, FineTuneSettings, Weakness } from '../types/server.js' */
+/** @import { FineTuneOffer, FineTuneSettings, Weakness } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { CLEAN_WEIGHT } from '../core/constants.js';
@@ -86,12 +86,11 @@ export class FinetuneForm {
 
   /**
    * @param {HTMLFormElement} form
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {FaultDialog} faultDialog
    * @param {(settings: FineTuneRequest) => void} submit
    */
-  constructor(form, catalog, store, faultDialog, submit) {
+  constructor(form, store, faultDialog, submit) {
     this.#form = form;
     this.#store = store;
     const body = document.createElement('template');
@@ -102,7 +101,7 @@ export class FinetuneForm {
       this.#showCount();
     });
     html('.numbers', form).append(...NUMBERS.map(numberField));
-    this.#slice = new SliceFields(form, catalog, store, faultDialog, () => this.#weightClean());
+    this.#slice = new SliceFields(form, store, faultDialog, () => this.#weightClean());
     this.#select('preset').addEventListener('change', () => this.#applyPreset());
     this.#select('criterion').addEventListener('change', () => (this.#hasOwnCriterion = true));
     form.addEventListener('submit', (event) => {

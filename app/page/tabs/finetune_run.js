@@ -1,7 +1,7 @@
 /** A fine-tuning run: progress, verdict, decision about the checkpoint, and the changes in detail. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, Success, Task } from '../types/server.js' */
+/** @import { FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, Success, Task } from '../types/server.js' */
 
 import { columnHeading, create, createButton, element, fillTable, html } from '../core/dom.js';
 import {
@@ -48,22 +48,21 @@ const BODY = `
 
 export class FinetuneRun {
   #host;
-  #catalog;
   #handlers;
+  #store;
   #progress;
   #report;
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {{back: () => void, pauseOrResume: () => void, trainLonger: () => void, decide: (decision: Decision, link?: string) => void}} handlers
    *   link: to be opened afterwards
    */
-  constructor(host, catalog, store, handlers) {
+  constructor(host, store, handlers) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#handlers = handlers;
+    this.#store = store;
     host.innerHTML = BODY;
     this.#progress = new Figures(html('.live', host), store);
     this.#report = new Figures(html('.report', host), store);
@@ -103,7 +102,7 @@ export class FinetuneRun {
     button.textContent = active ? 'Pause' : 'Resume';
     button.title = active ? RESUMES : '';
     this.#drawDecision(run);
-    const task = this.#catalog.tasks.find(({ name }) => name === run.task);
+    const task = this.#store.task(run.task);
     this.#progress.show(progress && task ? progressFigures(progress, task, settings) : null, null);
     this.#report.show(result?.comparison ?? null, null);
     this.#drawEvents(run, result?.events ?? [], task);

@@ -1,7 +1,7 @@
 /** The fine-tuning runs of a task: their criterion and outcome in a table, their validations in one chart. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunInfo, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews } from '../types/server.js' */
+/** @import { FineTuneDetails, FineTuneProgress, FineTuneRunInfo, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews } from '../types/server.js' */
 
 import { columnHeading, create, createButton, fillTable } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
@@ -23,7 +23,6 @@ const COLUMNS = [
 
 export class FinetuneRuns {
   #host;
-  #catalog;
   #store;
   #figures;
   #table = create(
@@ -35,12 +34,10 @@ export class FinetuneRuns {
 
   /**
    * @param {HTMLElement} host hidden without runs
-   * @param {Catalog} catalog
    * @param {Store} store
    */
-  constructor(host, catalog, store) {
+  constructor(host, store) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#store = store;
     const figures = create('div', { className: 'figures' });
     const scroll = create('div', { className: 'scroll' }, this.#table);
@@ -64,7 +61,7 @@ export class FinetuneRuns {
     fillTable(this.#table, headings, rows);
     const base = current?.filter ?? this.#store.state.filter;
     const same = runs.filter(({ filter }) => filter === base);
-    const task = this.#catalog.tasks.find(({ name }) => name === this.#store.state.task);
+    const task = this.#store.task();
     const plot = task && overlay(same, names, base, task.main.key, task.main.name);
     this.#figures.show(plot ? plotViews([plot]) : null, null);
   }

@@ -94,7 +94,6 @@ export class Live {
   #button = element('#live', HTMLButtonElement);
   #list = html('#live-runs');
   #follow = html('#follow');
-  #catalog;
   #store;
   #handlers;
   /** @type {ListedRun[]} */
@@ -107,13 +106,11 @@ export class Live {
   #latencies = [];
 
   /**
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {LiveHandlers} handlers
    * @param {LiveList} list
    */
-  constructor(catalog, store, handlers, list) {
-    this.#catalog = catalog;
+  constructor(store, handlers, list) {
     this.#store = store;
     this.#handlers = handlers;
     this.#awaited = awaitedRun(location.search, list);
@@ -250,7 +247,7 @@ export class Live {
     const isNew = fingerprint(list.runs) !== fingerprint(this.#runs);
     this.#runs = list.runs;
     if (isNew) {
-      addLiveRuns(this.#catalog, list);
+      addLiveRuns(this.#store.catalog, list);
       this.#handlers.listed();
     }
     const running = this.#runs.filter(({ state }) => state === 'running').length;
@@ -292,7 +289,7 @@ export class Live {
     this.#list.hidePopover();
     const { state } = this.#store;
     if (run.data === state.data && this.#isRunning) this.#store.set({ follow: true });
-    else this.#store.set(liveRunState(this.#catalog, run, state));
+    else this.#store.set(liveRunState(this.#store.catalog, run, state));
   }
 
   #place() {

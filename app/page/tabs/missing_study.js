@@ -1,7 +1,7 @@
 /** What the Study tab shows for a task that no study contains: where there are results, and how to make some. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, StudyInfo } from '../types/server.js' */
+/** @import { StudyInfo } from '../types/server.js' */
 
 import { createButton } from '../core/dom.js';
 import { emptyNote } from '../widgets/empty_note.js';
@@ -14,13 +14,12 @@ const ABOUT =
 /**
  * Returns the elements of the note.
  * @param {StudyInfo} study the selected one
- * @param {Catalog} catalog
  * @param {Store} store
  */
-export function missingStudy(study, catalog, store) {
+export function missingStudy(study, store) {
   const { task: name } = store.state;
-  const selected = catalog.tasks.find((task) => task.name === name);
-  const buttons = catalog.tasks
+  const selected = store.task(name);
+  const buttons = store.catalog.tasks
     .filter((task) => study.tasks.some((other) => other.name === task.name))
     .map((task) =>
       createButton('text', `Show ${task.name}`, () => store.set(firstRun(task, store.state))),

@@ -1,7 +1,7 @@
 /** The Recordings tab: search, import, rename, compare, delete and restore recordings and reports. */
 
 /** @import { State, Store } from '../core/state.js' */
-/** @import { Catalog, Job, RecordingEntry, RecordingList, ReportEntry, ReportList } from '../types/server.js' */
+/** @import { Job, RecordingEntry, RecordingList, ReportEntry, ReportList } from '../types/server.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 /** @import { Status } from '../widgets/status_line.js' */
 /** @import { Run } from './recorded_run.js' */
@@ -52,7 +52,6 @@ const BODY = `
 export class Recordings {
   #host;
   #store;
-  #catalog;
   #jobs;
   #rerun;
   #search;
@@ -72,14 +71,12 @@ export class Recordings {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {Jobs} jobs
    * @param {Rerun} rerun displays recordings
    */
-  constructor(host, catalog, store, jobs, rerun) {
+  constructor(host, store, jobs, rerun) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#store = store;
     this.#jobs = jobs;
     this.#rerun = rerun;
@@ -90,7 +87,7 @@ export class Recordings {
       compare: (files) => this.#compare(files),
       clear: () => this.#draw(),
     });
-    const actions = fileActions(catalog, this.#readOnlyReason, {
+    const actions = fileActions(store.catalog, this.#readOnlyReason, {
       openInRerun: (file) => this.#openInRerun([file]),
       openRun: (run) => this.#openRun(run),
       importRun: (file) => this.#importRun(file),
@@ -178,7 +175,7 @@ export class Recordings {
   }
 
   get #readOnlyReason() {
-    return this.#catalog.read_only ? READ_ONLY : undefined;
+    return this.#store.catalog.read_only ? READ_ONLY : undefined;
   }
 
   #draw() {
@@ -195,7 +192,7 @@ export class Recordings {
     const used = recordings.bytes + sum(reports.reports.map(({ bytes }) => bytes));
     html('.summary', this.#host).textContent =
       `${count} · ${formatBytes(used)} used, ${formatBytes(recordings.free)} free`;
-    const none = this.#catalog.read_only ? 'No recordings.' : NO_RECORDINGS;
+    const none = this.#store.catalog.read_only ? 'No recordings.' : NO_RECORDINGS;
     const hint = all.length ? 'No recording matches all words.' : none;
     html('.rest', this.#host).textContent = matches.length ? '' : hint;
     this.#showTrash([
@@ -247,7 +244,7 @@ export class Recordings {
    * @param {Partial<State>} [patch]
    */
   #openRun(run, patch = { tab: 'scene' }) {
-    this.#store.set({ ...selectRun(this.#catalog, this.#store.state, run), ...patch });
+    this.#store.set({ ...selectRun(this.#store.catalog, this.#store.state, run), ...patch });
   }
 
   /** @param {RecordingEntry[]} files */

@@ -1,7 +1,7 @@
 /** Fields of the data slice to train on: a named one, or its faults, phase and modalities. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneOffer, SliceInfo } from '../types/server.js' */
+/** @import { FineTuneOffer, SliceInfo } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { element, html, setOptions } from '../core/dom.js';
@@ -16,7 +16,6 @@ const PHASES = { '': 'all steps', yes: 'contact', no: 'free motion' };
 
 export class SliceFields {
   #form;
-  #catalog;
   #store;
   #showFaults;
   /** @type {SliceInfo[]} */
@@ -25,14 +24,12 @@ export class SliceFields {
 
   /**
    * @param {HTMLFormElement} form
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {FaultDialog} faultDialog
    * @param {() => void} changed called after a change by the user
    */
-  constructor(form, catalog, store, faultDialog, changed) {
+  constructor(form, store, faultDialog, changed) {
     this.#form = form;
-    this.#catalog = catalog;
     this.#store = store;
     setOptions(this.#select('contact'), PHASES);
     const useCustomSlice = () => {
@@ -95,9 +92,8 @@ export class SliceFields {
   #showDefinition() {
     if (this.#select('slice').value === CUSTOM) return;
     const slice = this.#named;
-    const { task } = this.#store.state;
     this.#faults = slice?.text.match(/faults=(.*?)(?=$|:contact=|:only=)/)?.[1] ?? '';
-    this.#showFaults(this.#catalog.tasks.find(({ name }) => name === task)?.fault_presets ?? []);
+    this.#showFaults(this.#store.task()?.fault_presets ?? []);
     const contact = slice?.contact ?? null;
     this.#select('contact').value = contact === null ? '' : contact ? 'yes' : 'no';
     this.#select('only').value = slice?.only.join('+') ?? '';

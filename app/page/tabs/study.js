@@ -1,7 +1,7 @@
 /** The Study tab: errors of all filters by share of image blackout, as bars and as a table with links to the failures. */
 
 /** @import { State, Store } from '../core/state.js' */
-/** @import { Catalog, Job, StudyInfo, StudyTask, Task } from '../types/server.js' */
+/** @import { Job, StudyInfo, StudyTask, Task } from '../types/server.js' */
 /** @import { Bar } from '../widgets/bar_chart.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 /** @import { Failures } from './failures.js' */
@@ -44,7 +44,6 @@ const BODY = `
 export class Study {
   #host;
   #store;
-  #catalog;
   #failures;
   #jobs;
   #chart;
@@ -60,14 +59,12 @@ export class Study {
 
   /**
    * @param {HTMLElement} host
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {Failures} failures
    * @param {Jobs} jobs
    */
-  constructor(host, catalog, store, failures, jobs) {
+  constructor(host, store, failures, jobs) {
     this.#host = host;
-    this.#catalog = catalog;
     this.#store = store;
     this.#failures = failures;
     this.#jobs = jobs;
@@ -136,11 +133,11 @@ export class Study {
     html('.problems', this.#host).textContent = this.#problems.map(sentence).join(' ');
     this.#drawCells(study);
     const results = study.tasks.find(({ name }) => name === state.task);
-    const task = this.#catalog.tasks.find(({ name }) => name === state.task);
+    const task = this.#store.task();
     if (!results || !task) {
       setPanelState(this.#host, 'empty');
       const note = html('.note', this.#host);
-      note.replaceChildren(...missingStudy(study, this.#catalog, this.#store));
+      note.replaceChildren(...missingStudy(study, this.#store));
       return;
     }
     const quantities = studyQuantities(results.rows, task);

@@ -1,7 +1,6 @@
 /** All tabs except the 3D scene. The page imports this module when the run is displayed. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog } from '../types/server.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
@@ -34,24 +33,23 @@ import { Study } from './study.js';
 
 export class Tabs {
   /**
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {PageParts} parts
    */
-  constructor(catalog, store, { jobs, timeline, finding, faultDialog, reload, setComparison }) {
+  constructor(store, { jobs, timeline, finding, faultDialog, reload, setComparison }) {
     this.rerun = new Rerun(html('#rerun'), jobs, (/** @type {number} */ step) =>
       store.set({ step, playing: false }, { origin: 'rerun' }),
     );
-    this.diagnosis = new Diagnosis(html('#diagnosis'), catalog, store, jobs, timeline);
+    this.diagnosis = new Diagnosis(html('#diagnosis'), store, jobs, timeline);
     this.diagnosis.confirmed = (trace, result) => finding.confirm(trace, result);
     this.diagnosis.recorded = reload;
     this.diagnostics = new Diagnostics(html('#diagnostics'), store, jobs);
-    this.failures = new Failures(html('#failures'), store, jobs, timeline, catalog);
-    this.compare = new ComparisonTab(html('#compare'), catalog, store, faultDialog, setComparison);
-    this.finetune = new Finetune(html('#finetune'), catalog, store, jobs, faultDialog);
-    this.study = new Study(html('#study'), catalog, store, this.failures, jobs);
-    this.experiments = new Experiments(html('#experiments'), catalog, store);
-    this.recordings = new Recordings(html('#recordings'), catalog, store, jobs, this.rerun);
+    this.failures = new Failures(html('#failures'), store, jobs, timeline);
+    this.compare = new ComparisonTab(html('#compare'), store, faultDialog, setComparison);
+    this.finetune = new Finetune(html('#finetune'), store, jobs, faultDialog);
+    this.study = new Study(html('#study'), store, this.failures, jobs);
+    this.experiments = new Experiments(html('#experiments'), store);
+    this.recordings = new Recordings(html('#recordings'), store, jobs, this.rerun);
   }
 
   /** @param {Trace} trace */

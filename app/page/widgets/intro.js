@@ -14,14 +14,14 @@ export class Intro {
 
   /**
    * @param {HTMLElement} host is shown if the address selects nothing, it was not closed before and there are examples
-   * @param {Catalog} catalog
    * @param {Store} store
    * @param {() => void} startTour
    */
-  constructor(host, catalog, store, startTour) {
+  constructor(host, store, startTour) {
     this.#host = host;
-    const chips = catalog.examples.map((example) => {
-      const open = () => example.setup || store.set(parsePermalink(example.link, catalog).state);
+    const chips = store.catalog.examples.map((example) => {
+      const open = () =>
+        example.setup || store.set(parsePermalink(example.link, store.catalog).state);
       const chip = createButton('chip', example.title, open, { title: example.help });
       if (example.setup) openSetup(chip, example);
       return chip;

@@ -1,7 +1,7 @@
 /** Pickers in the header: task, filter, data set, episode, faults and speed; and the radio groups of all panels. */
 
 /** @import { State, Store } from '../core/state.js' */
-/** @import { Catalog, DataSet, EpisodeSummary, Task } from '../types/server.js' */
+/** @import { DataSet, EpisodeSummary, Task } from '../types/server.js' */
 /** @import { FaultDialog } from './fault_dialog.js' */
 
 import { create, element, setOptions } from '../core/dom.js';
@@ -18,18 +18,18 @@ export const FIND = 'find';
 
 /**
  * Connects the pickers of the header.
- * @param {Catalog} catalog
  * @param {Store} store
  * @param {FaultDialog} dialog
  * @param {() => void} findEpisode opens the search for an episode
  * @returns {() => void} to be called when the catalog has changed
  */
-export function connectPickers(catalog, store, dialog, findEpisode) {
+export function connectPickers(store, dialog, findEpisode) {
   const ids = ['task', 'filter', 'data', 'episode', 'speed', 'faults'];
   const [task, filter, data, episode, speed, faultSelect] = ids.map((id) =>
     element(`#${id}`, HTMLSelectElement),
   );
-  const currentTask = () => byName(catalog.tasks, store.state.task) ?? catalog.tasks[0];
+  const { catalog } = store;
+  const currentTask = () => store.task() ?? catalog.tasks[0];
   const showFaults = faultPicker(faultSelect, dialog, {
     none: 'as recorded',
     selected: () => store.state.faults,
@@ -48,7 +48,7 @@ export function connectPickers(catalog, store, dialog, findEpisode) {
       if (select.parentElement) select.parentElement.hidden = select.length < 2;
   };
   task.addEventListener('change', () => {
-    const selected = byName(catalog.tasks, task.value);
+    const selected = store.task(task.value);
     if (selected) store.set(firstRun(selected, store.state));
   });
   data.addEventListener('change', () => {
