@@ -1,10 +1,11 @@
 /** A chart of the timeline: a uPlot chart without its own cursor and legend, with shaded intervals. */
 
+/** @import { AxisStyle } from './plot_style.js' */
 /** @import { StepAxis } from './step_axis.js' */
 
 import { context2d } from '../core/dom.js';
 import { colour, lineStyle, scaled, translucent } from '../core/colours.js';
-import { typeset } from '../core/units.js';
+import { PLAIN, WHOLE_STEPS, clipToPlot, plainAxis, tickLabels } from './plot_style.js';
 import { drawStack } from './stacked_weights.js';
 import { STEPS } from './step_axis.js';
 
@@ -40,21 +41,10 @@ import { STEPS } from './step_axis.js';
  * @property {number} steps
  * @property {StepAxis} axis
  * @property {boolean} withAxis whether the step axis has numbers
- *
- * @typedef {{stroke: string, grid: uPlot.Axis.Grid, ticks: uPlot.Axis.Ticks, font: string}} AxisStyle
  */
 
 /** px beside and below the plot; a label of the step axis needs more. */
 export const GUTTER = { left: scaled(46), right: scaled(12), axis: scaled(19) };
-const FONT = `${scaled(10)}px system-ui, sans-serif`;
-/** Options of all charts, which have neither a cursor nor a legend nor a selection of their own. */
-export const PLAIN = {
-  cursor: { show: false },
-  legend: { show: false },
-  select: { show: false, left: 0, top: 0, width: 0, height: 0 },
-};
-/** Style of axis labels. */
-export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
 const BLACKOUT_HEIGHT = scaled(8); // px
 const STRIP_HEIGHT = scaled(12); // px, of the labelled strips for contact and blackout over areas
 const AREA_GRID_OPACITY = 0.3; // of the grid over areas
@@ -62,10 +52,6 @@ const COMPARISON_OPACITY = 0.65;
 const COMPARISON_WIDTH = 1.25; // px
 const LINE_HEIGHT = 4; // px, of a failure and its repair
 const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
-/** Distances of the ticks of whole numbers, such as steps. */
-export const WHOLE_STEPS = Array.from({ length: 8 }, (_, power) =>
-  [1, 2, 5].map((n) => n * 10 ** power),
-).flat();
 const INTEGER_TOLERANCE = 1e-9;
 
 /**
@@ -78,17 +64,6 @@ export function seriesStyle({ name, comparison = false }) {
   const stroke = translucent(style.stroke, COMPARISON_OPACITY);
   return { ...style, stroke, width: COMPARISON_WIDTH };
 }
-
-/** @returns {AxisStyle} */
-const plainAxis = () => ({
-  stroke: colour('muted'),
-  grid: { stroke: colour('grid'), width: 1 },
-  ticks: { stroke: colour('grid'), size: 4, width: 1 },
-  font: FONT,
-});
-
-/** Style of an axis of numbers. */
-export const axisStyle = () => ({ ...plainAxis(), values: tickLabels });
 
 /**
  * @param {HTMLElement} parent
@@ -203,14 +178,6 @@ function valueAxis({ log, note }, { grid, ticks }) {
     values: (_, splits) => splits.map((v) => (v ? String(Number(v.toPrecision(1))) : '')),
   };
 }
-
-/**
- * Labels of ticks, with true minus signs.
- * @param {uPlot} _
- * @param {number[]} splits
- */
-export const tickLabels = (_, splits) =>
-  splits.map((value) => (value === null ? '' : typeset(String(Number(value.toPrecision(6))))));
 
 /**
  * Returns the step axis. Only the lowest chart has its numbers; the others have the same grid. (uPlot draws no axis after a hidden one.)
@@ -363,17 +330,6 @@ function labelIntervals(plot, axis, intervals, text, top, ink, background) {
     ctx.fillStyle = ink;
     ctx.fillText(text, centre, top + height / 2);
   }
-}
-
-/**
- * Saves the drawing state, and restricts drawing to the plot until it is restored.
- * @param {uPlot} plot
- */
-export function clipToPlot({ ctx, bbox }) {
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
 }
 
 /**

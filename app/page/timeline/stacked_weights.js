@@ -4,6 +4,7 @@
 /** @import { StepAxis } from './step_axis.js' */
 
 import { colour, cssVariable, lineStyle, translucent } from '../core/colours.js';
+import { clipToPlot } from './plot_style.js';
 
 const SUM_TOLERANCE = 1e-3; // of weights in single precision, and of the normalisation of networks
 /** Opacity of the areas, from below: neighbours differ without colour too. */
@@ -49,13 +50,10 @@ export const opacity = (index) => OPACITIES[index % OPACITIES.length];
  * @param {StepAxis} axis
  */
 export function drawStack(plot, track, axis) {
-  const { ctx, bbox } = plot;
+  const { ctx } = plot;
   const stacked = track.series.filter((item) => item.stacked);
   if (!stacked.length) return;
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
+  clipToPlot(plot);
   const run = stacked.filter(({ comparison }) => !comparison);
   const edges = upperEdges(run);
   run.forEach(({ name }, i) => {

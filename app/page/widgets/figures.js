@@ -9,7 +9,8 @@ import { csv } from '../core/download.js';
 import { scaled, swatch } from '../core/colours.js';
 import { sentence, significant, typeset } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
-import { GUTTER, LABEL, PLAIN, axisStyle, shadeBounds, shadeIntervals } from '../timeline/chart.js';
+import { GUTTER, shadeBounds, shadeIntervals } from '../timeline/chart.js';
+import { LABEL, PLAIN, axisStyle } from '../timeline/plot_style.js';
 import { copyButton } from './copy_button.js';
 import {
   drawPixelMap,

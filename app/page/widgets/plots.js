@@ -12,7 +12,7 @@ import {
   scaled,
 } from '../core/colours.js';
 import { displayName, significant, typeset } from '../core/units.js';
-import { LABEL, PLAIN, WHOLE_STEPS, axisStyle, clipToPlot } from '../timeline/chart.js';
+import { LABEL, PLAIN, WHOLE_STEPS, axisStyle, clipToPlot } from '../timeline/plot_style.js';
 
 /** @typedef {[low: number, high: number]} Range */
 /** @typedef {{property: string, stroke: string, dash: number[], width: number}} LineStyle */
