@@ -108,6 +108,10 @@ class Evidence:
             present=None if self.present is None else function(self.present),
         )
 
+    def repeated(self, count: int) -> Evidence:
+        """``count`` copies of the evidence of one trajectory."""
+        return self._map(lambda tensor: tensor.expand(-1, count, *tensor.shape[2:]))
+
     def trajectory(self, i: int) -> Evidence:
         """The evidence of trajectory i, N = 1."""
         return self._map(lambda tensor: tensor[:, i : i + 1])
@@ -140,7 +144,7 @@ class Evidence:
         """
         n = present.shape[1]
         present = present if self.present is None else present & self.present
-        subset = replace(self._map(lambda tensor: tensor.expand(-1, n, *tensor.shape[2:])), present=present)
+        subset = replace(self.repeated(n), present=present)
         if subset.log_weights is None:
             return subset
         used = present & (subset.log_weights > -torch.inf).any(-1)

@@ -23,6 +23,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.text import plural
 from beliefscope.inspect.diagnosis.cause import Candidate, Diagnosis as DiagnosisResult, Recovery
 from beliefscope.inspect.diagnosis.diagnose import preliminary
+from beliefscope.inspect.diagnosis.largest_error import LargestError
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import MAX_EPISODES as MAX_RECORDED
@@ -58,6 +59,7 @@ class Diagnosis(Reply):
     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
     outdated: whether an earlier version measured the healthy record, which lacks statistics.
     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
+    largest_error: of runs without a fault; None if the true state is unknown.
     """
 
     causes: list[DiagnosisCause]
@@ -73,6 +75,7 @@ class Diagnosis(Reply):
     outdated: bool = False
     alarm_rate: float
     restarts: dict[int, list[int]] | None = None
+    largest_error: Encoded[LargestError] | None = None
 
 
 class DiagnosisJob(JobReply):

@@ -248,7 +248,11 @@ class Diagnosis:
         missing = [Table("Not measured in these episodes", ("sensor or statistic",), unmeasured)] if unmeasured else []
         if not causes:
             largest = [((), deviation) for deviation in self.deviations]
-            return [*([_evidence_table("Largest deviations", (), largest)] if largest else []), *missing]
+            deviations = [_evidence_table("Largest deviations", (), largest)] if largest else []
+            error = self.provenance.get("largest_error")
+            heads = ("episode", "step", "size", "sources")
+            worst = [Table("Largest error", heads, (tuple(error[name] for name in heads),))] if error else []
+            return [*worst, *deviations, *missing]
         ranked = tuple(
             (c.cause.name, probability_text(c.probability), _share(c.recovered), index_ranges(c.episodes))
             for c in causes

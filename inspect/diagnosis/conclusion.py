@@ -32,6 +32,7 @@ from beliefscope.inspect.diagnosis.cause import (
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
 from beliefscope.inspect.diagnosis.checks.sensors import covers_episode
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
+from beliefscope.inspect.diagnosis.largest_error import largest_error
 from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
 from beliefscope.inspect.diagnosis.next_action import CONVENTIONS, is_unused, next_action, search_action
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
@@ -82,9 +83,13 @@ def healthy(case: Case) -> Diagnosis:
             noise = too_small(case.profile, case.inputs.checkpoint) if nees > 1 else None
             reason, action = (f": {noise.finding}", noise.action) if noise else ("", CONVENTIONS)
             headline = f"Always {overconfident}, even in its healthy record{reason}; {text[:-1]}; try: {action}."
+    error = largest_error(case.inputs.checkpoint, case.traces)
+    if error is not None and error.overconfident and len(case.traces) == 1 and headline.startswith("Healthy: "):
+        headline = f"No fault, but the filter is overconfident at step {error.step}: {error.text}; otherwise {text}"
     if defect := defect_of(case):
         headline = f"{defect}; otherwise {text}"
-    return Diagnosis("healthy", False, headline, (), largest, _provenance(case, defect))
+    provenance = _provenance(case, defect) | ({} if error is None else {"largest_error": error.to_json()})
+    return Diagnosis("healthy", False, headline, (), largest, provenance)
 
 
 def _nees(profile: HealthyProfile) -> float:

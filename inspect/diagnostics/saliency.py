@@ -21,7 +21,7 @@ from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, oc
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.external_step import ExternalStep
 from beliefscope.inspect.diagnostics.single_step import SingleStep, Target, channels_of
-from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table
+from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.data import check_step
@@ -161,7 +161,7 @@ class Saliency(Diagnostic):
     def tables(self) -> list[Table]:
         target, tables = with_unit(self.target, self.unit), []
         if self.attributions:
-            sums = []
+            sums: list[tuple[Value, ...]] = []
             for attribution in self.attributions:
                 totals = [self.factor * values.sum() for values in attribution.integrated.values()]
                 change = self.factor * (self.value - attribution.value)
@@ -169,7 +169,7 @@ class Saliency(Diagnostic):
                 sums.append((self._baseline(attribution), *map(_rounded, numbers), attribution.points))
             heads = ("baseline", *self.inputs, "sum", "change", "error (%)", "points")
             tables.append(Table(f"Integrated gradients of {target}, by modality", heads, sums))
-        rows = []
+        rows: list[tuple[Value, ...]] = []
         for modality, channels in channels_of(self.task, self.inputs).items():
             for i, channel in enumerate(channels):
                 display_unit, factor = channel.conversion

@@ -37,7 +37,7 @@ class Table:
 
     title: str
     columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    rows: Sequence[Sequence[Value]]
     note: str = ""
 
     def __post_init__(self) -> None:

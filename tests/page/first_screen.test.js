@@ -157,7 +157,7 @@ test('a fault comes first, then the outage, then the largest error', () => {
   const elsewhere = { ...run(14), error: () => series((t) => (t === 16 ? 2 : 0.5)) };
   assert.match(
     finding(elsewhere, 0, HEALTHY).headline,
-    /^No fault found: mean position error 0\.57 cm/,
+    /^No fault found, but the filter is overconfident at step 16\.$/,
   );
   assert.equal(finding(elsewhere, 0, HEALTHY).step, 16, 'a failure after the outage');
   const before = { ...run(14), largestDeviation: () => ({ sigmas: 5, component: 'x' }) };
@@ -169,18 +169,21 @@ test('a fault comes first, then the outage, then the largest error', () => {
   const header = { no_diagnosis: 'this filter has no healthy record' };
   const { evidence } = finding({ ...run(11), header }, 0, null);
   assert.match(evidence, /\. This filter has no healthy record\.$/);
-  const healthy = finding(run(11), 0, HEALTHY);
+  const consistent = { ...run(11), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
   assert.match(
-    healthy.headline,
+    finding(consistent, 0, HEALTHY).headline,
     /^No fault found: mean position error 0\.54 cm; image has 38 % of/,
   );
+  const largest_error = { episode: 0, step: 10, size: '', sources: 'image 1.20 cm' };
+  const healthy = finding(run(11), 0, { ...HEALTHY, largest_error });
+  assert.equal(healthy.headline, 'No fault found, but the filter is overconfident at step 10.');
+  assert.match(healthy.evidence, /^Largest error at step 10\. By source: image 1\.20 cm\. Fused/);
   const poor = finding(run(11), 0, { ...HEALTHY, miscalibrated: true });
   assert.equal(
     poor.headline,
     'Healthy: all is normal.',
     'the record, which the diagnosis describes',
   );
-  assert.match(healthy.evidence, /^Largest error at step 10\. /);
 });
 
 test('an error that grows to the end is a divergence, shown where it begins', () => {

@@ -43,7 +43,10 @@ export function finding(trace, component, diagnosis) {
     return { ...injected, evidence: `${diagnosed} ${injected.evidence}`.trim() };
   }
   const worst = worstFinding(trace, component);
-  const summary = `${worst.headline} ${worst.evidence}`.trim();
+  const sources = diagnosis?.largest_error?.sources;
+  const cause =
+    sources && diagnosis.largest_error?.step === worst.step ? `By source: ${sources}.` : '';
+  const summary = [worst.headline, cause, worst.evidence].filter(Boolean).join(' ');
   // As its record, which may be poor.
   const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
   const failed = worst.tone === 'bad' ? worst.step : null;
@@ -56,7 +59,8 @@ export function finding(trace, component, diagnosis) {
     const reason = sentence(trace.header.no_diagnosis ?? '');
     return { ...worst, evidence: `${worst.evidence} ${reason}`.trim() };
   }
-  const { tone = healthy, headline = healthyHeadline(trace, component, diagnosis) } = fault ?? {};
+  const { tone = healthy, headline = healthyHeadline(trace, component, diagnosis, worst) } =
+    fault ?? {};
   return { tone, headline, evidence: summary, step: worst.step };
 }
 
@@ -71,14 +75,18 @@ function failureFinding({ failure, restarts }) {
 }
 
 /**
- * Says how accurate a run without a fault is and which modality it relies on; that a filter is miscalibrated comes first.
+ * Says how accurate a run without a fault is and which modality it relies on; that a filter is miscalibrated, or
+ * overconfident at a step, comes first.
  * @param {Trace} trace
  * @param {number} component whose effective weights are described
  * @param {Diagnosis} diagnosis
+ * @param {Finding} worst of the largest error
  */
-function healthyHeadline(trace, component, { headline, miscalibrated }) {
+function healthyHeadline(trace, component, { headline, miscalibrated }, worst) {
   const errors = trace.error('fused', 'main')?.filter(Number.isFinite) ?? [];
   if (miscalibrated || !errors.length) return sentence(headline);
+  if (worst.tone === 'bad' && worst.step !== null)
+    return `No fault found, but the filter is overconfident at ${trace.stepLabel(worst.step)}.`;
   const error = withUnit(fixed(mean(errors), 2), trace.mainUnit);
   const [most] = trace.modalities
     .flatMap((name) => {

@@ -179,6 +179,7 @@ export interface components {
          *     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
          *     outdated: whether an earlier version measured the healthy record, which lacks statistics.
          *     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
+         *     largest_error: of runs without a fault; None if the true state is unknown.
          */
         Diagnosis: {
             /** Causes */
@@ -217,6 +218,7 @@ export interface components {
             restarts?: {
                 [key: string]: number[];
             } | null;
+            largest_error?: components["schemas"]["LargestError"] | null;
             /**
              * State
              * @enum {string}
@@ -1091,6 +1093,28 @@ export interface components {
             log: string;
         };
         /**
+         * LargestError
+         * @description The largest main error of several runs.
+         *
+         *     Attributes:
+         *         episode, step: where it is.
+         *         size: the error, and its largest deviation in standard deviations.
+         *         sources: the parts of the error by source; empty where they cannot be computed.
+         *         overconfident: whether the deviation is more than twice as large as a consistent one.
+         */
+        LargestError: {
+            /** Episode */
+            episode: number;
+            /** Step */
+            step: number;
+            /** Size */
+            size: string;
+            /** Sources */
+            sources: string;
+            /** Overconfident */
+            overconfident: boolean;
+        };
+        /**
          * Line
          * @description One series of a plot: x and y (S,), and the layer that determines its colour.
          */
@@ -1963,7 +1987,7 @@ export interface components {
         };
         /**
          * Table
-         * @description Rows of values, None where a value is not available. Column names include the unit.
+         * @description Rows of values, None where a value is not available, such as NaN. Column names include the unit.
          *
          *     note: explains columns, below the table.
          */
@@ -2253,6 +2277,7 @@ export type HealthyRecord = components['schemas']['HealthyRecord'];
 export type Job = components['schemas']['Job'];
 export type JobReply = components['schemas']['JobReply'];
 export type JobWithLog = components['schemas']['JobWithLog'];
+export type LargestError = components['schemas']['LargestError'];
 export type Line = components['schemas']['Line'];
 export type Lineage = components['schemas']['Lineage'];
 export type LineageMember = components['schemas']['LineageMember'];
