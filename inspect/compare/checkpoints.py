@@ -282,7 +282,7 @@ def _standard(pair: Sequence[Checkpoint], without: set[str]) -> tuple[list[Slice
     return selected, tuple(left_out)
 
 
-MEASURES = {"nll": "NLL", "nees": "NEES", "coverage95": "95 % coverage"}
+MEASURES = {"nll": "NLL", "nees": "NEES/n", "coverage95": "95 % coverage"}
 """Display names of measures."""
 
 

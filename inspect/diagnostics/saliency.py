@@ -130,7 +130,7 @@ class Saliency(Diagnostic):
     @property
     def _title(self) -> str:
         kind, _, name = self.target.partition(":")
-        titles = {"log-likelihood": f"the log-likelihood of {name}", "beta": f"beta of {name}"}
+        titles = {"log-likelihood": f"the log-likelihood of {name} relative to its evidence", "beta": f"beta of {name}"}
         return titles.get(kind, display_name(kind))
 
     def _format(self, value: float, sign: str = "") -> str:

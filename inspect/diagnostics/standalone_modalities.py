@@ -86,7 +86,7 @@ class StandaloneModalities(RunDiagnostic):
             return " ".join(sentences)
         low, high = total.low[k], total.high[k]
         result = (
-            "Fusion is more accurate than every standalone modality"
+            f"Fusion is more accurate than {display_name(self.modalities[k])}, the best standalone modality"
             if high < 1.0
             else f"Standalone {display_name(self.modalities[k])} is more accurate than fusion"
             if low > 1.0

@@ -144,7 +144,7 @@ class WeightAudit(RunDiagnostic):
         strongest = int(unimodal.argmin())
         parts = [NO_RECORD if self.healthy is None else self.healthy.sentence]
         parts += [
-            f"The posterior is dominated by {display_name(name)}: effective weight {mean_weights('effective_weights')}"
+            f"Mean effective weight of {display_name(name)}: {mean_weights('effective_weights')}"
             f"{' (mean over components)' if len(self._columns) > 1 else ''}; oracle: {mean_weights('oracle')}.",
             f"{main.title} RMSE {main.text(total.fused[0], 3)}, {main.text(unimodal[strongest], 3)} for the "
             f"{measures.layer_label(self.modalities[strongest])}, {main.text(total.hindsight[0], 3)} with the oracle's "

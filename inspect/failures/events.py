@@ -197,7 +197,7 @@ class Failures(ScoredRuns):
         columns += (self._label, "phase")
         columns += tuple(with_unit(layer_label(self.layers[i]), self.error_conversion[0]) for i in known)
         columns += tuple(f"{display_name(name)} (deg)" for name in self.angles)
-        columns += ("NEES", *(("ESS",) if self.particles else ()))
+        columns += ("NEES/n", *(("ESS",) if self.particles else ()))
         if any(event.effective_weights is not None for event in events):
             columns += tuple(f"effective weight of {display_name(layer)} (%)" for layer in self.layers[:-1])
         return Table("Worst events", columns, [self._row(event, known) for event in events])

@@ -72,7 +72,7 @@ def result(update: float, alone: float, low: float, high: float) -> StandaloneMo
 @pytest.mark.parametrize(
     ("alone", "low", "high", "expected"),
     [
-        (2.0, 0.4, 0.6, "Fusion is more accurate than every standalone modality"),
+        (2.0, 0.4, 0.6, "Fusion is more accurate than image, the best standalone modality"),
         (0.5, 1.8, 2.2, "Standalone image is more accurate than fusion"),
         (1.0, 0.9, 1.1, "Fusion and image standalone do not differ significantly"),
     ],
