@@ -78,11 +78,12 @@ class ErrorSources(RunDiagnostic):
             f"Largest {main.name} error at step {self.worst_step}{episode}: {main.text(self.worst.sum())}, of which "
             f"{parts_text(self.task, self.sources, self.worst)}."
         ]
-        for phase in self.phases:
-            where = "all steps" if phase.phase == "all" else phase.phase
-            shares = [f"{title} {percent(share)}" for title, share in named_parts(self.sources, phase.shares)]
-            sentences.append(f"Mean squared error, {where}: {', '.join(shares)}.")
-        return " ".join(sentences)
+        shares = [
+            ("" if phase.phase == "all" else f"in {phase.phase} ")
+            + ", ".join(f"{title} {percent(share)}" for title, share in named_parts(self.sources, phase.shares))
+            for phase in self.phases
+        ]
+        return " ".join([*sentences, f"Shares of the mean squared error: {'; '.join(shares)}."])
 
     def tables(self) -> list[Table]:
         main = self.task.main_error
