@@ -56,11 +56,12 @@ class Catalog(Reply):
 
 
 class Column(Reply):
-    """A float32 array in the columns buffer; offset in bytes."""
+    """A float32 array in the columns buffer; offset in bytes. channels: of readings and reported innovations (T, d)."""
 
     name: str
     shape: list[int]
     offset: int
+    channels: list[Component] | None = None
 
 
 class Failure(Reply):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import correlation_interval
 from beliefscope.inspect.statistics.measures import Array, counted, without_reading
@@ -60,9 +60,14 @@ def innovations(trace: Trace) -> tuple[Array, Array] | None:
     (T, K, m) and (T, K, m, m) in the spaces of the measurements if the filter reports them, NaN where there is none;
     else (T, K, n) and (T, K, n, n) of the virtual observations.
     """
-    if trace.innovation is not None and trace.innovation_covariance is not None:
-        return trace.innovation.astype(np.float64), trace.innovation_covariance.astype(np.float64)
-    return virtual_innovations(trace)
+    return reported_innovations(trace) or virtual_innovations(trace)
+
+
+def reported_innovations(trace: Trace) -> tuple[Array, Array] | None:
+    """Innovations (T, K, m) and S (T, K, m, m) in the spaces of the measurements; None if they are not reported."""
+    if trace.innovation is None or trace.innovation_covariance is None:
+        return None
+    return trace.innovation.astype(np.float64), trace.innovation_covariance.astype(np.float64)
 
 
 def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
@@ -205,19 +210,26 @@ def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
     ]
 
 
-def channel_names(trace: Trace, innovation: NDArray[Any]) -> list[list[str]]:
-    """(K, m) names of the channels of reported innovations (T, K, m).
+def channels_of(trace: Trace, innovation: NDArray[Any]) -> list[list[Component]]:
+    """(K, m) channels of reported innovations (T, K, m), with their units.
 
-    They are those of the modality's sensors, such as ``gps x``, if these have as many, else numbers from 0.
+    They are those of the modality's sensors, such as ``gps x``, if these have as many, else numbers from 0 without a
+    unit.
     """
     result = []
     for k, modality in enumerate(trace.modalities):
         used = np.flatnonzero(np.isfinite(innovation[:, k]).any(0)).max(initial=-1) + 1
         shapes = [(key, trace.task.observations[key]) for key in trace.task.modalities.get(modality, ())]
-        names = [trace.task.channel(key, i).name for key, shape in shapes if len(shape) == 1 for i in range(shape[0])]
-        names = names if len(names) == used else []
-        result.append([*names, *(f"channel {i}" for i in range(len(names), innovation.shape[-1]))])
+        channels = [trace.task.channel(key, i) for key, shape in shapes if len(shape) == 1 for i in range(shape[0])]
+        channels = channels if len(channels) == used else []
+        numbers = range(len(channels), innovation.shape[-1])
+        result.append([*channels, *(Component(f"channel {i}", "") for i in numbers)])
     return result
+
+
+def channel_names(trace: Trace, innovation: NDArray[Any]) -> list[list[str]]:
+    """(K, m) names of the channels of reported innovations (T, K, m), as in ``channels_of``."""
+    return [[channel.name for channel in channels] for channels in channels_of(trace, innovation)]
 
 
 def _names(trace: Trace, innovation: Array) -> list[tuple[str, str]]:

@@ -85,7 +85,7 @@ export function showProperties(trace) {
   for (const body of bodies.slice(1)) setPanelState(body, 'ready');
   const { no_maps: noMaps, data_warning: warning } = trace.header;
   showDataWarning(warning);
-  html('#maps').classList.toggle('no-effector', !trace.has('effector_position'));
+  html('#maps').classList.toggle('no-effector', !trace.has('readings/effector_position'));
   if (noMaps) setPanelState(html('#heatmaps'), 'empty', noMaps);
   showBlackouts(trace);
   html('#sigma-key').hidden = !trace.has('estimate_sigma');

@@ -29,7 +29,7 @@ export interface components {
         };
         /**
          * Column
-         * @description A float32 array in the columns buffer; offset in bytes.
+         * @description A float32 array in the columns buffer; offset in bytes. channels: of readings and reported innovations (T, d).
          */
         Column: {
             /** Name */
@@ -38,6 +38,8 @@ export interface components {
             shape: number[];
             /** Offset */
             offset: number;
+            /** Channels */
+            channels?: components["schemas"]["Component"][] | null;
         };
         /**
          * Comparison

@@ -66,7 +66,7 @@ def test_columns_equal_the_trace(client: TestClient, trace_url: str, settings: S
     np.testing.assert_array_equal(values["estimate_mean"], trace.estimate_mean)
     np.testing.assert_array_equal(values["effective_weights"], trace.effective_weights)
     np.testing.assert_array_equal(values["contact"], trace.episode.contact)
-    np.testing.assert_array_equal(values["force"], trace.episode.observations["force"])
+    np.testing.assert_array_equal(values["readings/force"], trace.episode.observations["force"])
     np.testing.assert_allclose(values["estimate_sigma"][:, 0] ** 2, trace.estimate_covariance[:, 0, 0], rtol=1e-5)
     assert trace.log_weights is not None
     np.testing.assert_allclose(

@@ -7,12 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.inspect.diagnosis.checks.test_innovations import BIAS, STD, Boat, sail
 
-from beliefscope.app.protocol.trace_format import columns, header
+from beliefscope.app.protocol.trace_format import MAX_CHANNELS, columns, header
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.task import Component
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
+from beliefscope.filters.external.adapter import Adapter
+from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.trace import Trace, trace
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -97,3 +102,80 @@ def test_steps_with_injected_faults(faults: str, steps: tuple[int, int] | None) 
     else:
         at = np.arange(len(run))
         np.testing.assert_array_equal(values["faulty"], (at >= steps[0]) & (at < steps[1]))
+
+
+def boat_run(episode: Episode) -> Trace:
+    """A run of a Kalman filter that reports its innovations; the radar has a reading at every fourth step."""
+    adapter = Adapter(Boat(), batched=False, modalities=tuple(STD), initial_std=(0.5, 0.5, 0.1, BIAS))
+    return trace(as_external(adapter, "boat", episode.task), episode)
+
+
+def channels_of(run: Trace, column: str) -> list[tuple[str, str, float]]:
+    """Names, units for display and scales of the channels of a column."""
+    channels = next(c["channels"] for c in columns(run)[0] if c["name"] == column)
+    return [(c["name"], c["display_unit"], c["scale"]) for c in channels]
+
+
+def test_readings_are_those_that_the_filter_received_with_names_and_units() -> None:
+    with open_dataset(sample_path("door")) as episodes:
+        checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-ekf"))
+        run = trace(checkpoint, episodes[9], faults=Faults.parse("force_bias:x=5"))
+        _, values, _ = read(run)
+        np.testing.assert_allclose(values["readings/force"][:, 0] - episodes[9].observations["force"][:, 0], 5.0)
+    np.testing.assert_array_equal(values["readings/torque"], run.episode.observations["torque"])
+    np.testing.assert_array_equal(values["readings/control"], run.episode.controls)
+    assert "readings/image" not in values
+    assert channels_of(run, "readings/force") == [(f"force {axis}", "N", 1.0) for axis in "xyz"]
+    assert channels_of(run, "readings/effector_position")[2] == ("effector_position z", "cm", 100.0)
+
+
+def test_steps_without_a_reading_are_nan() -> None:
+    episode = sail(0)
+    _, values, _ = read(boat_run(episode))
+    present = np.isfinite(values["readings/radar"])
+    np.testing.assert_array_equal(present, np.repeat(episode.present("radar")[:, None], 2, axis=1))
+    assert np.isfinite(values["readings/compass"]).all()
+
+
+def test_long_vectors_and_scans_have_no_column() -> None:
+    episode = sail(0)
+    many = np.zeros((len(episode), MAX_CHANNELS + 1), np.float32)
+    sizes = {"ranges": MAX_CHANNELS, "tactile": MAX_CHANNELS + 1, "scan": 4}
+    task = replace(
+        episode.task,
+        observations={**episode.task.observations, **{key: (size,) for key, size in sizes.items()}},
+        scans={"scan": (-1.0, 1.0)},
+    )
+    readings = {**episode.observations, **{key: many[:, :size] for key, size in sizes.items()}}
+    run = replace(boat_run(episode), episode=replace(episode, task=task, observations=readings))
+    names = {c["name"] for c in columns(run)[0] if c["name"].startswith("readings/")}
+    assert names == {"readings/radar", "readings/compass", "readings/ranges", "readings/control"}
+
+
+def test_reported_innovations_have_the_channels_of_their_sensors() -> None:
+    episode = sail(0)
+    units = {"radar": (Component("range", "m"), Component("bearing", "rad"))}
+    episode = replace(episode, task=replace(episode.task, channels=units))
+    run, values, _ = read(boat_run(episode))
+    assert run.innovation is not None
+    assert run.innovation_covariance is not None
+    assert "innovation" not in values
+    for k, name in enumerate(run.modalities):
+        np.testing.assert_array_equal(values[f"innovation/{name}"], run.innovation[:, k])
+        variance = np.diagonal(run.innovation_covariance[:, k], axis1=1, axis2=2)
+        np.testing.assert_allclose(values[f"innovation_sigma/{name}"] ** 2, variance, rtol=1e-5)
+    names = [name for name, *_ in channels_of(run, "innovation/radar")]
+    assert names == ["radar range", "radar bearing"]
+    assert [unit for _, unit, _ in channels_of(run, "innovation_sigma/radar")] == ["cm", "deg"]
+    assert channels_of(run, "innovation/compass")[0][:2] == ("compass", "")
+    assert values["innovation/compass"].shape[1] == 2, "as wide in each block of a live run"
+
+
+def test_innovations_of_many_channels_have_no_column() -> None:
+    run = boat_run(sail(0))
+    wide = np.zeros((len(run), 2, MAX_CHANNELS + 1))
+    wide[:, 1, 1:] = np.nan
+    covariance = np.broadcast_to(np.eye(MAX_CHANNELS + 1), (*wide.shape, MAX_CHANNELS + 1))
+    _, values, _ = read(replace(run, innovation=wide, innovation_covariance=covariance))
+    assert "innovation/radar" not in values
+    assert values["innovation/compass"].shape == (len(run), MAX_CHANNELS)
