@@ -130,6 +130,7 @@ class Evidence:
         value, low, high: value of the statistic and its 95 % healthy range.
         episode, step: where it shows best; None if it concerns whole episodes.
         time: s from the first step to ``step``; None without timestamps.
+        sensor: observation key of the sensor that it is about, or ``control``; empty if it is about something else.
     """
 
     text: str
@@ -139,6 +140,7 @@ class Evidence:
     episode: int | None = None
     step: int | None = None
     time: float | None = None
+    sensor: str = ""
 
 
 @dataclass(frozen=True)

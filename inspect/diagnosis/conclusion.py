@@ -228,7 +228,21 @@ def _evidence(case: Case, deviation: Deviation) -> Evidence:
     steps = located(case, deviation, trace.episode)
     step = None if steps is None else steps[0]
     time = None if step is None else trace.episode.time_of(step)
-    return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step, time)
+    sensor = sensor_about(case, deviation.statistic)
+    values = (deviation.value, deviation.low, deviation.high)
+    return Evidence(deviation.text, *values, trace.episode_index, step, time, sensor)
+
+
+def sensor_about(case: Case, statistic: str) -> str:
+    """Observation key of the sensor that a statistic is about, or ``control``; empty if it is about something else.
+
+    The subject of a statistic may start with the modality: ``haptics force x``.
+    """
+    if statistic not in _of_sensors(case):
+        return ""
+    subject = f" {statistic.split('/')[1]} "
+    keys = [key for key in (*case.inputs.checkpoint.task.observations, "control") if f" {key} " in subject]
+    return max(keys, key=len, default="")
 
 
 def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int, is_known: bool) -> str:

@@ -139,6 +139,7 @@ def test_a_planted_sensor_fault_is_named_with_its_steps(faults: str, cause: str,
     first = result.causes[0]
     assert (result.state, first.cause.name) == ("fault", cause)
     assert first.evidence[0].value > first.evidence[0].high
+    assert first.evidence[0].sensor == first.cause.component
     assert result.headline.startswith(f"{first.cause.title}{steps}, probability ")
     assert progress == sorted(progress)
     assert progress[-1] == pytest.approx(1.0)
