@@ -50,14 +50,17 @@ export const CATALOG = {
   problems: [],
 };
 
+/** @typedef {import('../../app/page/types/server.js').TraceHeader['columns'][number]['channels']} Channels */
+/** @typedef {Record<string, {shape: number[], values: number[], channels?: Channels}>} Arrays */
+
 /**
  * Encodes columns end to end, as the server does.
- * @param {Record<string, {shape: number[], values: number[]}>} arrays
+ * @param {Arrays} arrays
  */
 export function encodeColumns(arrays) {
   let offset = 0;
-  const columns = Object.entries(arrays).map(([name, { shape, values }]) => {
-    const column = { name, shape, offset };
+  const columns = Object.entries(arrays).map(([name, { shape, values, channels }]) => {
+    const column = { name, shape, offset, ...(channels && { channels }) };
     offset += 4 * values.length;
     return column;
   });
@@ -67,7 +70,7 @@ export function encodeColumns(arrays) {
 
 /**
  * Creates a trace.
- * @param {Record<string, {shape: number[], values: number[]}>} arrays
+ * @param {Arrays} arrays
  * @param {object} [header]
  * @param {ArrayBuffer | null} [images]
  */

@@ -3,7 +3,8 @@ import test from 'node:test';
 
 import { cssVariable } from '../../app/page/core/colours.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
-import { chartData, shadeIntervals, valueRange } from '../../app/page/timeline/chart.js';
+import { shadeIntervals } from '../../app/page/timeline/chart.js';
+import { chartData, valueRange } from '../../app/page/timeline/chart_data.js';
 import { secondsAxis } from '../../app/page/timeline/step_axis.js';
 import { trackHeights } from '../../app/page/timeline/layout.js';
 import { formatValue, legendWidth } from '../../app/page/timeline/legend.js';
@@ -13,13 +14,8 @@ import {
   parseWindow,
   zoomWindow,
 } from '../../app/page/timeline/step_window.js';
-import {
-  TRACKS,
-  digitsOf,
-  selectedError,
-  trackOptions,
-  tracks,
-} from '../../app/page/timeline/tracks.js';
+import { digitsOf } from '../../app/page/timeline/digits.js';
+import { TRACKS, selectedError, trackOptions, tracks } from '../../app/page/timeline/tracks.js';
 import { FUSION, TASK, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
@@ -200,9 +196,9 @@ test('values of a small range have more digits', () => {
 
 test('legends have room for the longest name, in two columns if it is short', () => {
   const { haptics, full } = { haptics: 'haptics'.length, full: 'haptics-only update'.length };
-  assert.ok(legendWidth(trace, 'full') > 0.58 * full);
-  assert.ok(legendWidth(trace, 'compact') > 2 * 0.58 * haptics);
-  assert.ok(legendWidth(trace, 'dense') > legendWidth(trace, 'compact'));
+  assert.ok(legendWidth(trace, [], 'full') > 0.58 * full);
+  assert.ok(legendWidth(trace, [], 'compact') > 2 * 0.58 * haptics);
+  assert.ok(legendWidth(trace, [], 'dense') > legendWidth(trace, [], 'compact'));
 });
 
 test('in a low timeline the chart of areas shrinks first', () => {

@@ -41,6 +41,9 @@ const SPARE_DASHES = [
 ];
 const SPARE_VARIABLES = SPARE_DASHES.map((_, i) => `--spare-${i}`);
 
+/** Colours of the channels of sensors, which are no modalities. */
+const CHANNEL_VARIABLES = [7, 2, 3, 5, 4, 6, 0, 1].map((i) => SPARE_VARIABLES[i]);
+
 const UNIT =
   typeof document === 'undefined'
     ? 1
@@ -138,6 +141,23 @@ export function lineStyle(name) {
   const source = name.replace(STANDALONE, '');
   const dash = DASHES[source] ?? spareOf(SPARE_DASHES, source);
   return { stroke: colour(cssVariable(name).slice(2)), dash, width: WIDTHS[name] ?? 1.5 };
+}
+
+/**
+ * Returns the CSS variable with the colour of a channel of a sensor.
+ * @param {number} line number of the channel
+ */
+export const channelVariable = (line) => CHANNEL_VARIABLES[line % CHANNEL_VARIABLES.length];
+
+/**
+ * Returns the style of the line of a channel of a sensor. Channels with the same colour differ in their dashes.
+ * @param {number} line number of the channel
+ * @returns {LineStyle}
+ */
+export function channelStyle(line) {
+  const round = Math.floor(line / CHANNEL_VARIABLES.length);
+  const dash = round ? SPARE_DASHES[(round - 1) % SPARE_DASHES.length] : [];
+  return { stroke: colour(channelVariable(line).slice(2)), dash, width: 1.5 };
 }
 
 /**

@@ -1,6 +1,8 @@
 /** Arrays over time: slices, growth and intervals. */
 
-/** @typedef {{data: Float32Array, shape: number[]}} Column steps first; `data` may have unused space at the end */
+/** @import { Component } from '../types/api.js' */
+
+/** @typedef {{data: Float32Array, shape: number[], channels?: Component[] | null}} Column steps first; `data` may have unused space at the end */
 /** @typedef {Float32Array} Series one value per step */
 
 /**

@@ -13,6 +13,7 @@ import {
   wrapDegrees,
 } from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
+import { Channels } from './channels.js';
 
 const FUSED = 'fused';
 const MAX_TIME_DIGITS = 4;
@@ -32,6 +33,8 @@ export class Trace {
   #columns = new Map();
   /** @type {Map<string, Series | undefined>} */
   #cache = new Map();
+  /** Readings of sensors, and innovations in the space of the measurements. */
+  channels = new Channels(this.#columns);
 
   /**
    * @param {Task} task
@@ -49,9 +52,9 @@ export class Trace {
     this.components = header.components;
     this.modalities = header.modalities;
     this.images = images && new Uint8Array(images);
-    for (const { name, shape, offset } of header.columns) {
+    for (const { name, shape, offset, channels } of header.columns) {
       const size = shape.reduce((a, b) => a * b, 1);
-      this.#columns.set(name, { data: new Float32Array(buffer, offset, size), shape });
+      this.#columns.set(name, { data: new Float32Array(buffer, offset, size), shape, channels });
     }
     /** Indices of the state components of the main error. */
     this.main = task.main.indices;
@@ -75,8 +78,9 @@ export class Trace {
     const before = this.steps;
     const headers = new Map(columns.map((column) => [column.name, column]));
     const added = columns.filter(({ name }) => !this.has(name));
-    for (const { name, shape } of added)
+    for (const { name, shape, channels } of added)
       this.#columns.set(name, {
+        channels,
         shape: [before, ...shape.slice(1)],
         data: new Float32Array(before * stride(shape)).fill(NaN),
       });
@@ -88,6 +92,8 @@ export class Trace {
         : new Float32Array(size).fill(NaN);
       column.data = append(column.data, used, values);
       column.shape = [before + steps, ...column.shape.slice(1)];
+      // Innovations have the names of the sensor's channels once there is a measurement.
+      if (header?.channels && values.some(Number.isFinite)) column.channels = header.channels;
     }
     if (images && this.images) {
       const used = (before * images.byteLength) / steps;
@@ -95,6 +101,7 @@ export class Trace {
     }
     this.steps += steps;
     this.#cache.clear();
+    this.channels.clear();
     this.#update();
     return added.length > 0;
   }
@@ -152,7 +159,7 @@ export class Trace {
 
   /** Columns of the filter's own scalars. */
   get scalars() {
-    return [...this.#columns.keys()].filter((name) => name.startsWith('extra/'));
+    return this.channels.columns('extra/');
   }
 
   /**

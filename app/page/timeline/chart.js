@@ -4,7 +4,8 @@
 /** @import { StepAxis } from './step_axis.js' */
 
 import { context2d } from '../core/dom.js';
-import { colour, lineStyle, scaled, translucent } from '../core/colours.js';
+import { channelStyle, colour, lineStyle, scaled, translucent } from '../core/colours.js';
+import { chartData, isolatedSteps, valueRange } from './chart_data.js';
 import { PLAIN, WHOLE_STEPS, clipToPlot, plainAxis, tickLabels } from './plot_style.js';
 import { drawStack } from './stacked_weights.js';
 import { STEPS } from './step_axis.js';
@@ -14,6 +15,8 @@ import { STEPS } from './step_axis.js';
  * @property {string} name truth, fused or a modality
  * @property {Float32Array} values
  * @property {Float32Array} [sigma] draws a band of ±2 sigma
+ * @property {boolean} [aroundZero] whether the band is around zero instead of the values
+ * @property {number} [line] number of a channel, for its colour; its missing values are gaps
  * @property {boolean} [comparison] whether it belongs to the comparison run
  * @property {boolean} [stacked] whether it is an area on those before it
  *
@@ -50,16 +53,16 @@ const STRIP_HEIGHT = scaled(12); // px, of the labelled strips for contact and b
 const AREA_GRID_OPACITY = 0.3; // of the grid over areas
 const COMPARISON_OPACITY = 0.65;
 const COMPARISON_WIDTH = 1.25; // px
+const POINT = scaled(4); // px, of a single value between gaps
 const LINE_HEIGHT = 4; // px, of a failure and its repair
-const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
 const INTEGER_TOLERANCE = 1e-9;
 
 /**
  * Returns the style of a line. A line of the comparison run has the colour and dashes of its quantity, thinner and lighter.
- * @param {Pick<Series, 'name' | 'comparison'>} series
+ * @param {Pick<Series, 'name' | 'comparison' | 'line'>} series
  */
-export function seriesStyle({ name, comparison = false }) {
-  const style = lineStyle(name);
+export function seriesStyle({ name, comparison = false, line }) {
+  const style = line === undefined ? lineStyle(name) : channelStyle(line);
   if (!comparison) return style;
   const stroke = translucent(style.stroke, COMPARISON_OPACITY);
   return { ...style, stroke, width: COMPARISON_WIDTH };
@@ -122,38 +125,31 @@ function lines(track) {
   const series = [{}];
   /** @type {uPlot.Band[]} */
   const bands = [];
-  for (const { name, sigma } of track.series) {
+  for (const { name, sigma, line } of track.series) {
     if (!sigma) continue;
     const edge = { points: { show: false }, width: 0, stroke: 'transparent' };
     series.push({ ...edge }, { ...edge });
-    const fill = translucent(lineStyle(name).stroke, name === 'fused' ? 0.2 : 0.08);
+    const fill = translucent(seriesStyle({ name, line }).stroke, name === 'fused' ? 0.2 : 0.08);
     bands.push({ series: [series.length - 2, series.length - 1], fill });
   }
   for (const item of track.series) {
     const paths = item.stacked ? { paths: () => null } : {}; // drawStack draws it
-    series.push({ ...seriesStyle(item), ...paths, points: { show: false } });
+    const style = seriesStyle(item);
+    /** @type {uPlot.Series.Points} */
+    const points =
+      item.line === undefined
+        ? { show: false }
+        : {
+            show: false,
+            filter: isolatedSteps,
+            size: POINT,
+            stroke: style.stroke,
+            fill: style.stroke,
+          };
+    series.push({ ...style, ...paths, points });
   }
   if (!track.series.length) series.push({}); // uPlot draws an axis only for a line
   return { series, bands };
-}
-
-/**
- * Returns uPlot's data for a track: the positions of the steps, the edges of the bands and the lines.
- * @param {Track} track
- * @param {number} steps
- * @param {StepAxis} [axis]
- * @returns {uPlot.AlignedData}
- */
-export function chartData({ series }, steps, axis = STEPS) {
-  const edges = series.flatMap(({ values, sigma }) =>
-    sigma ? [2, -2].map((factor) => values.map((v, t) => v + factor * sigma[t])) : [],
-  );
-  const values = series.map((item) => item.values);
-  return [
-    Float64Array.from({ length: steps }, (_, t) => axis.position(t)),
-    ...edges,
-    ...(values.length ? values : [new Array(steps).fill(null)]),
-  ];
 }
 
 /**
@@ -196,56 +192,6 @@ function stepAxis(style, { withAxis, axis: { inSeconds } }) {
       values: (_, splits) => splits.map(() => ''),
     };
   return { ...axis, size: GUTTER.axis };
-}
-
-/**
- * Returns the range of the y axis. It fits the visible truth and fused estimate, and most values of the modalities.
- * @param {Track} track
- * @param {Interval} window
- * @returns {Interval}
- */
-export function valueRange(track, [from, to]) {
-  if (track.limits) return track.limits;
-  if (track.note) return [0, 1];
-  const [first, last] = [Math.max(0, Math.floor(from)), Math.ceil(to)];
-  const extremes = track.series
-    .flatMap((series) => extremesOf(series, first, last))
-    .filter(Number.isFinite);
-  let [low, high] = [Math.min(...extremes), Math.max(...extremes)];
-  if (track.log && track.bounds) {
-    const [least, most] = track.bounds;
-    return [
-      Math.min(Math.max(low, LOG_MARGIN * least), 0.5 * least),
-      Math.max(1.3 * high, 2 * most),
-    ];
-  }
-  if (track.fromZero) low = 0;
-  if (!(high > low)) [low, high] = Number.isFinite(low) ? [low - 1, low + 1] : [0, 1];
-  const margin = 0.06 * (high - low);
-  return [track.fromZero ? 0 : low - margin, high + margin];
-}
-
-/**
- * Returns values that the y axis must include.
- * @param {Series} series
- * @param {number} first
- * @param {number} last
- */
-function extremesOf({ name, values, sigma }, first, last) {
-  const visible = Array.from(values.subarray(first, last + 1));
-  if (name === 'truth' || name === 'fused') {
-    const bands = visible.flatMap((v, t) =>
-      sigma ? [v - 2 * sigma[first + t], v + 2 * sigma[first + t]] : [v],
-    );
-    const finite = bands.filter(Number.isFinite);
-    return [
-      finite.reduce((a, b) => Math.min(a, b), Infinity),
-      finite.reduce((a, b) => Math.max(a, b), -Infinity),
-    ];
-  }
-  visible.sort((a, b) => a - b);
-  const end = visible.length - 1;
-  return [visible[Math.floor(0.02 * end)], visible[Math.ceil(0.98 * end)]];
 }
 
 /**

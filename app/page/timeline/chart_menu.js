@@ -5,8 +5,8 @@
 
 import { create, createButton, html } from '../core/dom.js';
 import { choice } from '../widgets/pickers.js';
-import { FIXED_CHARTS, chartKeys, formatCharts, moved, toggled } from './chart_list.js';
-import { trackOptions } from './tracks.js';
+import { chartKeys, formatCharts, moved, toggled } from './chart_list.js';
+import { chartOptions } from './tracks.js';
 
 const MARGIN = 8; // px to the edge of the window
 
@@ -54,10 +54,7 @@ export class ChartMenu {
     if (!trace) return;
     const axes = { steps: 'steps', seconds: 'seconds' };
     choice(html('#time-axis'), axes, this.#store.state.time, (time) => this.#store.set({ time }));
-    const { track } = this.#store.state;
-    const options = trackOptions(trace, track).filter(([key]) => key !== track);
-    /** @type {Map<string, string>} */
-    const labels = new Map([...Object.entries(FIXED_CHARTS), ...options]);
+    const labels = new Map(chartOptions(trace, this.#store.state.track));
     const keys = chartKeys(this.#store.state, [...labels.keys()]);
     const hidden = [...labels.keys()].filter((key) => !keys.includes(key));
     this.#rows.replaceChildren(

@@ -4,8 +4,7 @@
 /** @import { Track } from './chart.js' */
 
 import { create } from '../core/dom.js';
-import { cssVariable } from '../core/colours.js';
-import { formatValue } from './legend.js';
+import { colourOf, formatValue } from './legend.js';
 
 const DISTANCE = 14; // px from the pointer
 
@@ -32,13 +31,15 @@ export class HoverValues {
     /** @param {string} name */
     const rank = (name) => [...all].indexOf(name.replace(COMPARED, ''));
     const charts = tracks.filter(({ series }) => series.length);
-    const all = new Set(charts.flatMap(({ series }) => series.map(rowName)));
+    const everySeries = charts.flatMap(({ series }) => series);
+    const all = new Set(everySeries.map(rowName));
     const names = [...all].sort((a, b) => rank(a) - rank(b)); // the comparison run follows each source
     const titles = charts.map(({ title, unit }) => (unit ? `${title} (${unit})` : title));
     const head = create('tr', {}, ...['', ...titles].map((text) => create('th', {}, text)));
     const rows = names.map((name) => {
       const swatch = create('i');
-      swatch.style.background = `var(${cssVariable(name.replace(COMPARED, ''))})`;
+      const first = everySeries.find((series) => rowName(series) === name);
+      if (first) swatch.style.background = `var(${colourOf(first)})`;
       const cells = charts.map((track) => {
         const index = track.series.findIndex((series) => rowName(series) === name);
         const text = new Text();

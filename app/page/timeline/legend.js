@@ -4,7 +4,7 @@
 /** @import { Track } from './chart.js' */
 
 import { create } from '../core/dom.js';
-import { cssVariable, lineSample } from '../core/colours.js';
+import { channelVariable, cssVariable, lineSample } from '../core/colours.js';
 import { displayName, fixed, significant } from '../core/units.js';
 import { seriesStyle } from './chart.js';
 import { areaSample } from './stacked_weights.js';
@@ -38,7 +38,7 @@ export function legend(track, trace, compared, compact) {
     const { dash, width } = seriesStyle(first);
     const sample = first.stacked
       ? areaSample(name, index)
-      : lineSample(cssVariable(name), dash, width);
+      : lineSample(colourOf(first), dash, width);
     const short = displayName(name);
     const label = track.ofModalities ? short : trace.label(name);
     const text = create('span', { textContent: compact && trace.fuses ? short : label });
@@ -56,15 +56,25 @@ export function legend(track, trace, compared, compact) {
 }
 
 /**
+ * Returns the CSS variable with the colour of a series.
+ * @param {import('./chart.js').Series} series
+ */
+export const colourOf = ({ name, line }) =>
+  line === undefined ? cssVariable(name) : channelVariable(line);
+
+/**
  * Returns the width of a legend that shows its names in full, in rem.
  * @param {Trace} trace
+ * @param {Track[]} tracks
  * @param {keyof typeof SAMPLE_AND_VALUE} kind full: one column of labels; else two columns of short names
  */
-export function legendWidth(trace, kind) {
+export function legendWidth(trace, tracks, kind) {
   const isFull = kind === 'full';
-  const names = trace.sources.map((name) =>
+  const sources = trace.sources.map((name) =>
     isFull || !trace.fuses ? trace.label(name) : displayName(name),
   );
+  const channels = tracks.flatMap(({ series }) => series.filter(({ line }) => line !== undefined));
+  const names = [...sources, ...channels.map(({ name }) => name)];
   const width = CHARACTER * Math.max(...names.map(({ length }) => length));
   return (isFull ? 1 : 2) * (width + SAMPLE_AND_VALUE[kind]);
 }

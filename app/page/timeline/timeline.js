@@ -12,7 +12,8 @@
 import { create, element, html, setOptions } from '../core/dom.js';
 import { fixed, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
-import { GUTTER, chart, chartData } from './chart.js';
+import { GUTTER, chart } from './chart.js';
+import { chartData } from './chart_data.js';
 import { ChartMenu } from './chart_menu.js';
 import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
@@ -341,7 +342,11 @@ export class Timeline {
     const keys = this.#tracks.map(({ key = '' }) => key);
     const heights = this.#sizes.apply(keys, trackHeights(this.#tracks, clientHeight - GUTTER.axis));
     const dense = this.#tracks.some((track, i) => isDense(track, heights[i]));
-    const names = legendWidth(this.#trace, compact ? 'compact' : dense ? 'dense' : 'full');
+    const names = legendWidth(
+      this.#trace,
+      this.#tracks,
+      compact ? 'compact' : dense ? 'dense' : 'full',
+    );
     html('#timeline').style.setProperty('--legend-names', `${names}rem`);
     const style = getComputedStyle(this.#host);
     this.#legendWidth = parseFloat(style.getPropertyValue('--legend-width'));

@@ -6,7 +6,9 @@
 /** @import { Series, Track } from './chart.js' */
 
 import { displayName, fixed } from '../core/units.js';
-import { chartKeys } from './chart_list.js';
+import { channelOptions, channelTrack, innovationsTrack, isOfChannels } from './channel_tracks.js';
+import { FIXED_CHARTS, chartKeys } from './chart_list.js';
+import { digitsOf } from './digits.js';
 import { areShares } from './stacked_weights.js';
 
 /** Options for the lowest chart: labels and charts. @type {Record<string, [label: string, (trace: Trace, component: number) => Track]>} */
@@ -20,6 +22,7 @@ export const TRACKS = {
 
 /** Start of the keys of an external filter's own scalars. */
 export const SCALAR = 'extra/';
+const ABSENT = 'None: this run does not have it.';
 const NO_TRUTH = 'None: the true state of this run is unknown.';
 
 /**
@@ -50,6 +53,7 @@ function chartOf(key, run, { weights, track }, component) {
   if (key === 'weights') return weightTrack(run, weights, component);
   if (key === 'estimate') return estimateTrack(run, component);
   const quantity = key === 'track' ? track : key;
+  if (isOfChannels(quantity)) return channelTrack(run, quantity) ?? emptyTrack(quantity, ABSENT);
   const build = TRACKS[quantity]?.[1] ?? scalarTrack(quantity);
   return build(run, component);
 }
@@ -62,8 +66,21 @@ function chartOf(key, run, { weights, track }, component) {
 const shownCharts = (trace, state) =>
   chartKeys(
     state,
-    trackOptions(trace, state.track).map(([key]) => key),
+    chartOptions(trace, state.track).map(([key]) => key),
   );
+
+/**
+ * Returns the charts that the timeline can show: the fixed ones, those of each quantity that is not selected, and those
+ * of the channels of sensors.
+ * @param {Trace} trace
+ * @param {string} selected quantity of the lowest chart
+ * @returns {[key: string, label: string][]}
+ */
+export const chartOptions = (trace, selected) => [
+  ...Object.entries(FIXED_CHARTS),
+  ...trackOptions(trace, selected).filter(([key]) => key !== selected),
+  ...channelOptions(trace),
+];
 
 /**
  * Returns the options for the lowest chart: those of every trace, and the filter's own scalars.
@@ -103,10 +120,11 @@ function overlay(track, other, standalone) {
   if (other.note) return track;
   const lines = other.series
     .filter(({ name }) => name !== 'truth')
-    .map(({ name, values, stacked }) => ({
+    .map(({ name, values, stacked, line }) => ({
       name: name === 'fused' && standalone ? `${displayName(standalone)} standalone` : name,
       values,
       stacked,
+      line,
       comparison: true,
     }));
   if (track.note) {
@@ -192,19 +210,6 @@ function estimateTrack(trace, component) {
 }
 
 /**
- * Number of decimals of the values, from 1 to 3, that fits their range: 1 from 5 on, 2 from 0.5 on.
- * @param {Pick<Series, 'values'>[]} series
- */
-export function digitsOf(series) {
-  let [low, high] = [Infinity, -Infinity];
-  for (const { values } of series)
-    for (const value of values)
-      if (Number.isFinite(value)) [low, high] = [Math.min(low, value), Math.max(high, value)];
-  const range = high - low;
-  return range > 0 ? Math.min(3, Math.max(1, 1 - Math.floor(Math.log10(range / 5)))) : 1;
-}
-
-/**
  * @param {Trace} trace
  * @param {number} component
  * @returns {Track}
@@ -275,6 +280,8 @@ function neesTrack(trace) {
  * @returns {Track}
  */
 function innovationTrack(trace, component) {
+  const reported = innovationsTrack(trace);
+  if (reported) return reported;
   const series = availableSeries(
     trace.modalities,
     (name) => trace.innovation(name, component),
@@ -284,8 +291,8 @@ function innovationTrack(trace, component) {
   return {
     title: 'Innovation',
     unit: trace.unitOf(component).unit,
-    help: 'Measurement minus prediction of each modality. For a consistent filter 95 % are within the band.',
-    series,
+    help: 'Measurement minus prediction of each modality. For a consistent filter 95 % are within the ±2σ band.',
+    series: series.map((item) => ({ ...item, aroundZero: Boolean(item.sigma) })),
     ofModalities: true,
     digits: digitsOf(series),
   };
