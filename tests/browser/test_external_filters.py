@@ -64,6 +64,34 @@ def test_missing_outputs_are_explained(open_page: Any, start_server: Any, tmp_pa
     page.screenshot("external-filter-weights")
 
 
+def test_reported_innovations_are_charts_and_rows_of_the_step(
+    open_page: Any, start_server: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "boats.py").write_text(BOATS)
+    write_dataset(tmp_path / "boats.h5", task(4), [sail(seed) for seed in range(3)])
+    options = ["--task", f"{tmp_path}/boats.py:TASK", "--data", str(tmp_path / "boats.h5")]
+    url = start_server(*options, "--filter", f"{tmp_path}/boats.py:right").url
+    page = open_page("?episode=0&step=40&track=innovation&charts=track,readings/radar", url=url)
+    names = ["radar x", "radar y", "compass"]
+    legends = "() => [...document.querySelectorAll('#tracks .track')].map((t) => [...t.querySelectorAll('dt')]"
+    legends += ".map((name) => name.textContent))"
+    assert page.page.evaluate(legends) == [names, ["x", "y"]]
+    rows = page.page.locator("#step-table tr.measured")
+    assert rows.locator("th:first-child").all_text_contents() == ["measurement", *names]
+    values = rows.nth(1).locator("td").all_text_contents()
+    innovation, sigma, ratio = (float(value.replace("\N{MINUS SIGN}", "-")) for value in values)
+    assert ratio == pytest.approx(innovation / sigma, abs=0.1)
+    page.page.keyboard.press("ArrowRight")  # the radar has no reading
+    page.until("() => document.querySelector('#step-table tr.measured td').textContent === '\N{EN DASH}'")
+    assert "\N{EN DASH}" not in rows.nth(3).text_content()
+    page.page.locator("#charts").click()
+    page.page.get_by_label("innovation of compass", exact=True).check()
+    page.until(f"() => ({legends})().at(-1).join() === 'compass'")
+    page.page.keyboard.press("Escape")
+    assert not page.violations()
+    page.screenshot("reported-innovations")
+
+
 @pytest.mark.long
 def test_wrong_equations_are_the_finding_of_a_filter_without_a_record(
     open_page: Any, start_server: Any, tmp_path: Path

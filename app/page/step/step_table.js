@@ -1,10 +1,13 @@
-/** The table of the current step: a row for each modality's update and for the fused estimate. */
+/** The table of the current step: a row for each modality's update, the fused estimate and each measured channel. */
 
+/** @import { Channel } from '../data/channels.js' */
 /** @import { Trace } from '../data/trace.js' */
 
 import { create } from '../core/dom.js';
 import { cssVariable, swatch } from '../core/colours.js';
-import { displayName, fixed, percent } from '../core/units.js';
+import { displayName, fixed, percent, significant } from '../core/units.js';
+import { INNOVATION } from '../data/channels.js';
+import { measuredChannels } from '../timeline/channel_tracks.js';
 
 const ROWS = 5; // for which there is room; more are scrolled
 
@@ -25,6 +28,8 @@ export class StepTable {
   #columns = [];
   /** @type {HTMLElement[][]} */
   #cells = [];
+  /** @type {{channel: Channel, cells: HTMLElement[]}[]} */
+  #measured = [];
 
   /** @param {HTMLElement} table */
   constructor(table) {
@@ -57,7 +62,14 @@ export class StepTable {
       row.style.setProperty('--line', `var(${cssVariable(source)})`);
       return row;
     });
-    if (trace.sources.length > ROWS)
+    const columns = trace.channels.columns(INNOVATION);
+    const channels = columns.flatMap((column) => measuredChannels(trace, column));
+    this.#measured = channels.map((channel) => ({
+      channel,
+      cells: MEASURED.map(() => create('td')),
+    }));
+    if (channels.length) rows.push(measuredHeads(), ...this.#measured.map(measuredRow));
+    if (rows.length > ROWS)
       this.#table.tabIndex = 0; // so that the keyboard scrolls it
     else this.#table.removeAttribute('tabindex');
     this.#table.replaceChildren(
@@ -75,7 +87,47 @@ export class StepTable {
         if (share) cell.style.setProperty('--share', String(share(source, step)));
       }),
     );
+    for (const { channel, cells } of this.#measured)
+      MEASURED.forEach(({ text }, i) => (cells[i].textContent = text(channel, step)));
   }
+}
+
+/**
+ * Columns of the rows of measured channels, empty at a step without a measurement.
+ * @type {{title: string, help: string, text: (channel: Channel, step: number) => string}[]}
+ */
+const MEASURED = [
+  {
+    title: 'innov.',
+    help: 'Innovation: measurement minus predicted measurement',
+    text: ({ values }, t) => significant(values[t]),
+  },
+  {
+    title: 'σ',
+    help: 'Predicted standard deviation of the innovation',
+    text: ({ values, sigma }, t) => significant(Number.isFinite(values[t]) ? sigma?.[t] : NaN),
+  },
+  {
+    title: 'ratio',
+    help: 'Innovation in predicted standard deviations: for a consistent filter within ±2 at 95 % of the steps',
+    text: ({ values, sigma }, t) => fixed(values[t] / (sigma?.[t] ?? NaN), 1),
+  },
+];
+
+/** Returns the row with the titles of the columns of measured channels. */
+const measuredHeads = () =>
+  create(
+    'tr',
+    { className: 'measured heads' },
+    create('th', { scope: 'row' }, 'measurement'),
+    ...MEASURED.map(({ title, help }) => create('th', { scope: 'col', title: help }, title)),
+  );
+
+/** @param {{channel: Channel, cells: HTMLElement[]}} row */
+function measuredRow({ channel: { name, unit }, cells }) {
+  const label = displayName(unit ? `${name} (${unit})` : name);
+  const title = create('th', { scope: 'row', title: label }, label);
+  return create('tr', { className: 'measured' }, title, ...cells);
 }
 
 /**
