@@ -151,6 +151,26 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     third.until(f"() => ({titles})().join() === 'Effective,Hinge,Particles'")
 
 
+def test_readings_are_charts_that_a_diagnosis_offers(open_page: Any) -> None:
+    page = open_page(LINK + "&faults=force_bias%3D5&tab=diagnosis", size=(1280, 720))
+    titles = "() => [...document.querySelectorAll('#tracks h3')].map((title) => title.textContent)"
+    page.page.locator("#diagnosis").get_by_role("button", name="Show the readings of force").first.click()
+    page.until(f"() => ({titles})().at(-1) === 'Force readings (N)'")
+    clean = column(page, "readings/force")[40]  # of the run without faults
+    assert legend(page, 3) == {"x": [near(clean[0] + 5)], "y": [near(clean[1])], "z": [near(clean[2])]}
+    page.page.locator("#charts").click()
+    page.page.get_by_label("readings of effector position", exact=True).check()
+    page.page.get_by_label("readings of force", exact=True).uncheck()
+    page.until(f"() => ({titles})().at(-1) === 'Effector position readings (cm)'")
+    assert legend(page, 3)["z"] == [near(100 * column(page, "readings/effector_position")[40, 2])]
+    page.until("() => location.search.includes('effector_position')")
+    page.page.keyboard.press("Escape")
+    assert not page.violations()
+    page.screenshot("readings")
+    again = open_page("?" + page.page.url.partition("?")[2])
+    assert again.page.evaluate(titles)[-1] == "Effector position readings (cm)"
+
+
 @pytest.mark.long
 def test_event_marks_and_comparison_run(open_page: Any) -> None:
     page = open_page(LINK + "&track=signed", theme="dark")

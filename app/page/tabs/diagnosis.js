@@ -12,6 +12,7 @@ import { create, createButton, html, pause, setOptions } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { affectedComponent, largest } from '../step/finding.js';
+import { readingCharts } from '../timeline/reading_charts.js';
 import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { choice } from '../widgets/pickers.js';
 import { causeItem, evidenceItem, isTrainable, withCode } from './diagnosis_cause.js';
@@ -238,17 +239,18 @@ export class Diagnosis {
       ({ probability, evidence }) => probability >= SHOWN && evidence.length > 0,
     );
     const alone = over === 'episode';
+    const charts = readingCharts(this.#store, this.#trace);
     const rows = causes.map((cause, i) => {
       const canTrain = this.#canStart && !i && isTrainable(cause);
       const open = (/** @type {number} */ e, /** @type {number | null} */ s) =>
         this.#openStep(e, s, cause);
-      return causeItem(cause, alone, open, canTrain ? [this.#finetuneButton()] : []);
+      return causeItem(cause, alone, open, charts, canTrain ? [this.#finetuneButton()] : []);
     });
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
     const items = deviations.map((deviation) =>
-      evidenceItem(deviation, alone, (e, s) => this.#openStep(e, s)),
+      evidenceItem(deviation, alone, (e, s) => this.#openStep(e, s), charts),
     );
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';

@@ -1,9 +1,18 @@
 /** A cause in the Diagnosis tab: its probability, evidence, the effect of undoing it and the next action. */
 
+/** @import { ReadingCharts } from '../timeline/reading_charts.js' */
 /** @import { DiagnosisCause, Evidence } from '../types/server.js' */
 
 import { create, createButton } from '../core/dom.js';
-import { fixed, percent, probabilityText, sentence, stepLabel, typeset } from '../core/units.js';
+import {
+  displayName,
+  fixed,
+  percent,
+  probabilityText,
+  sentence,
+  stepLabel,
+  typeset,
+} from '../core/units.js';
 import { copyButton } from '../widgets/copy_button.js';
 
 /** @typedef {(episode: number, step: number | null) => void} OpenStep step: null if the evidence has none */
@@ -14,9 +23,10 @@ const PRESENT = 'Probability that this cause is present, alone or together with 
  * @param {DiagnosisCause} cause
  * @param {boolean} alone whether the displayed episode is the only one
  * @param {OpenStep} open
+ * @param {ReadingCharts} charts
  * @param {HTMLElement[]} actions after the next action
  */
-export function causeItem(cause, alone, open, actions) {
+export function causeItem(cause, alone, open, charts, actions) {
   const { probability, recovered, evidence, steps } = cause;
   const bar = create('meter', { min: 0, max: 1, value: probability });
   bar.setAttribute('aria-label', `Probability of ${cause.title}`);
@@ -26,7 +36,7 @@ export function causeItem(cause, alone, open, actions) {
   /** @type {HTMLElement[]} */
   const lines = [
     create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
-    create('ul', {}, ...evidence.map((item) => evidenceItem(item, alone, open))),
+    create('ul', {}, ...evidence.map((item) => evidenceItem(item, alone, open, charts))),
   ];
   if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
   lines.push(nextAction(cause.next), ...actions);
@@ -47,15 +57,23 @@ export function causeItem(cause, alone, open, actions) {
  * @param {Evidence} evidence
  * @param {boolean} alone whether the displayed episode is the only one
  * @param {OpenStep} open
+ * @param {ReadingCharts} charts
  */
-export function evidenceItem({ text, episode, step, time }, alone, open) {
+export function evidenceItem({ text, episode, step, time, sensor }, alone, open, charts) {
   const item = create('li', { textContent: typeset(sentence(text)) });
   const label = placeLabel({ episode, step, time }, alone);
-  if (episode === null || !label) return item;
-  item.append(
-    ' ',
-    createButton('text quiet', label, () => open(episode, step)),
-  );
+  if (episode !== null && label)
+    item.append(
+      ' ',
+      createButton('text quiet', label, () => open(episode, step)),
+    );
+  if (charts.has(sensor)) {
+    const title = `Show the readings of ${displayName(sensor)} in the timeline`;
+    item.append(
+      ' ',
+      createButton('text quiet', 'chart', () => charts.show(sensor), { title, ariaLabel: title }),
+    );
+  }
   return item;
 }
 
