@@ -25,7 +25,7 @@ export class Channels {
   /** @type {Map<string, Channel[]>} */
   #cache = new Map();
 
-  /** @param {Map<string, Column>} columns of a trace; those that it adds later too */
+  /** @param {Map<string, Column>} columns of a trace, which may get more */
   constructor(columns) {
     this.#columns = columns;
   }
