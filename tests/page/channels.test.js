@@ -4,6 +4,7 @@ import { test } from 'node:test';
 import { chartKeys } from '../../app/page/timeline/chart_list.js';
 import { chartData, isolatedSteps, valueRange } from '../../app/page/timeline/chart_data.js';
 import { channelOptions, measuredChannels } from '../../app/page/timeline/channel_tracks.js';
+import { trackHeights } from '../../app/page/timeline/layout.js';
 import { readingCharts } from '../../app/page/timeline/reading_charts.js';
 import { chartOptions, tracks } from '../../app/page/timeline/tracks.js';
 import { FUSION, encodeColumns, makeTrace } from './fixtures.js';
@@ -88,6 +89,15 @@ test('missing readings are gaps, and single ones between gaps are points', () =>
   const plot = /** @type {uPlot} */ ({ data: [[], [1, null, 2, 3, null, 4, null, null]] });
   assert.deepEqual(isolatedSteps(plot, 1), [0, 5]);
   assert.equal(isolatedSteps(/** @type {uPlot} */ ({ data: [[], [1, 2, null]] }), 1), null);
+});
+
+test('a legend of many channels leaves room for the other charts', () => {
+  const channels = Array.from({ length: 16 }, (_, i) => channel(`joints ${i}`));
+  const many = { shape: [2, 16], values: new Array(32).fill(0), channels };
+  const arm = makeTrace({ ...FUSION, 'readings/joints': many });
+  const list = tracks(arm, { ...state, charts: 'estimate,readings/joints' });
+  const [estimate, joints] = trackHeights(list, 300);
+  assert.ok(estimate > 100 && joints > 100);
 });
 
 test('a comparison run adds its readings', () => {

@@ -11,6 +11,7 @@ const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart
 const LINE_HEIGHT = scaled(12); // px of a line of a legend
 const STACKED_HEIGHT = scaled(84); // px of a chart of areas where the room is short, its axis included
 const COMPACT_HEIGHT = scaled(215); // px of a timeline below which legends have two columns and short names
+const CHANNEL_ROWS = 8; // of a legend of many channels, which has two columns then
 const STACKED_WEIGHT = 2; // share of the remaining height, relative to a chart of lines
 
 /**
@@ -61,7 +62,8 @@ export function trackHeights(tracks, height) {
   const stacked = tracks.map(({ series }) => series.some((item) => item.stacked));
   const legends = tracks.map(({ series }, i) => {
     if (noteOnly[i]) return NOTE_HEIGHT;
-    const { size } = new Set(series.map(({ name }) => name));
+    const names = new Set(series.map(({ name }) => name));
+    const size = series[0]?.line === undefined ? names.size : Math.min(names.size, CHANNEL_ROWS);
     const rows = legendHeight(compact ? Math.ceil(size / 2) : Math.max(size, 2));
     return stacked[i] ? Math.min(rows, STACKED_HEIGHT) : rows;
   });
