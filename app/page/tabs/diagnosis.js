@@ -239,19 +239,17 @@ export class Diagnosis {
       ({ probability, evidence }) => probability >= SHOWN && evidence.length > 0,
     );
     const alone = over === 'episode';
-    const charts = readingCharts(this.#store, this.#trace);
+    const charts = readingCharts(this.#store, () => this.#trace);
+    /** @type {(cause?: DiagnosisCause) => import('./diagnosis_cause.js').OpenStep} */
+    const open = (cause) => (e, s) => this.#openStep(e, s, cause);
     const rows = causes.map((cause, i) => {
       const canTrain = this.#canStart && !i && isTrainable(cause);
-      const open = (/** @type {number} */ e, /** @type {number | null} */ s) =>
-        this.#openStep(e, s, cause);
-      return causeItem(cause, alone, open, charts, canTrain ? [this.#finetuneButton()] : []);
+      return causeItem(cause, alone, open(cause), charts, canTrain ? [this.#finetuneButton()] : []);
     });
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
-    const items = deviations.map((deviation) =>
-      evidenceItem(deviation, alone, (e, s) => this.#openStep(e, s), charts),
-    );
+    const items = deviations.map((item) => evidenceItem(item, alone, open(), charts));
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';
     html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;

@@ -15,14 +15,15 @@ import { chartOptions } from './tracks.js';
 
 /**
  * @param {Store} store
- * @param {Trace | null} trace
+ * @param {() => Trace | null} trace the displayed one
  * @returns {ReadingCharts}
  */
 export const readingCharts = (store, trace) => ({
-  has: (sensor) => Boolean(trace?.channels.of(READINGS + sensor).length),
+  has: (sensor) => Boolean(trace()?.channels.of(READINGS + sensor).length),
   show: (sensor) => {
     const { state } = store;
-    const available = trace ? chartOptions(trace, state.track).map(([key]) => key) : [];
+    const run = trace();
+    const available = run ? chartOptions(run, state.track).map(([key]) => key) : [];
     const keys = chartKeys(state, available);
     const key = READINGS + sensor;
     if (!keys.includes(key)) store.set({ charts: formatCharts([...keys, key]) });
