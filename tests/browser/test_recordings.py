@@ -117,6 +117,50 @@ def test_recordings_are_renamed_searched_restored_and_compared(open_page: Callab
 
 
 @pytest.mark.long
+def test_recording_opens_with_its_run(open_page: Callable[..., Any], tmp_path: Path) -> None:
+    """A run that the server does not have keeps its own time."""
+    checkpoint = load_checkpoint(pretrained_path("push", "image-ekf"))
+    with open_dataset(sample_path("push")) as data:
+        index = data.held_out()[1]
+        runs = [trace(checkpoint, data[index], episode_index=index, seed=seed) for seed in (0, 1)]
+        last = len(data[index].states) - 1
+    paths = [write_recording(run, tmp_path / f"seed {run.seed}.rrd") for run in runs]
+    tab = RecordingsTab(open_page("?tab=recordings&step=20", size=(600, 450)))
+    page = tab.page.page
+    tab.add(paths)
+    viewer_time = (
+        "(async () => { const state = await beliefscope.rerun.getState(), id = state?.active_store_id;"
+        " return Number(state?.recordings.find((r) => r.store_id === id)?.current_time?.time); })"
+    )
+    ready = "() => document.querySelector('#rerun').dataset.state === 'ready'"
+
+    tab.row("seed 1.rrd").get_by_role("button", name="seed 1.rrd", exact=True).click()
+    tab.page.until(ready, RECORDING_TIMEOUT)
+    assert tab.page.state["task"] == "door"
+    assert "another run (push" in page.locator("#rerun .files").inner_text()
+    page.locator("#tab-rerun").focus()
+    page.keyboard.press("Home")
+    page.keyboard.press("End")
+    tab.page.until("() => beliefscope.state().step === 99")
+    assert page.evaluate(f"{viewer_time}()") == 0
+
+    page.keyboard.press("r")
+    tab.row("seed 0.rrd").get_by_role("button", name="seed 0.rrd", exact=True).click()
+    tab.page.until("() => document.querySelector('#rerun .files').textContent.includes('the run of this page')")
+    tab.page.until(f"() => document.querySelector('#readout b').textContent === '0 / {last}'")
+    state = tab.page.state
+    assert (state["task"], state["filter"], state["episode"]) == ("push", "image-ekf", index)
+    tab.page.until(ready, RECORDING_TIMEOUT)
+    page.locator("#tab-rerun").focus()
+    page.keyboard.press("End")
+    tab.page.until(f"async () => await {viewer_time}() === {last}")
+    page.reload()
+    tab.page.until(f"async () => await {viewer_time}() === {last}", RECORDING_TIMEOUT)
+    page.select_option("#episode", index=0)
+    tab.page.until("() => document.querySelector('#rerun .files').hidden && !beliefscope.state().recording")
+
+
+@pytest.mark.long
 def test_changes_appear_in_other_browsers(open_page: Callable[..., Any], runs: list[Path]) -> None:
     first, second = (RecordingsTab(open_page("?tab=recordings")) for _ in range(2))
     first.add([runs[0]])

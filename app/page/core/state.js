@@ -61,6 +61,7 @@ import { displayName } from './units.js';
  * @property {string} pinned columns kept at the left of the results, comma-separated
  * @property {string} x quantity of the x axis of the results. @property {string} y of the y axis
  * @property {string} cell selected result
+ * @property {string} recording names of the files in the Rerun tab, separated by slashes; empty for the current run
  * @property {string} rows of the results: each of the `checkpoints`, or their mean over `seeds`
  * @property {string} groups entries of the provenance that distinguish the groups, comma-separated; empty for the default
  * @property {string} pin step whose maps are the reference of the displayed ones, URL-encoded; empty for none
@@ -125,6 +126,7 @@ const TEXTS = {
   x: 'error',
   y: 'nees',
   cell: '',
+  recording: '',
   pin: '',
   plane: '',
   sensor: '',
@@ -163,6 +165,7 @@ const HISTORY_KEYS = [
   'run',
   'study',
   'sweep',
+  'recording',
 ];
 const LINK_DELAY = 250; // ms; browsers limit how often a page may change its address
 

@@ -16,6 +16,55 @@ export function recordedRun({ task, episode, faults, run }) {
   return run && task !== null && episode !== null ? { task, episode, faults, ...run } : null;
 }
 
+/** @type {(keyof Run)[]} */
+const RUN_KEYS = ['task', 'filter', 'data', 'episode', 'faults'];
+
+/**
+ * Returns whether two selections are of the same run.
+ * @param {Run} run
+ * @param {Run} other
+ */
+export const isSameRun = (run, other) => RUN_KEYS.every((key) => run[key] === other[key]);
+
+/**
+ * Returns the changes of the state that open recordings in the Rerun tab. The page shows the run of a single recording
+ * with it, if this server has that run.
+ * @param {Catalog} catalog
+ * @param {State} state
+ * @param {RecordingEntry[]} files
+ * @returns {Partial<State>}
+ */
+export function openRecordings(catalog, state, files) {
+  const run = files.length === 1 ? recordedRun(files[0]) : null;
+  const isNew = run && !isSameRun(run, state);
+  return {
+    ...(isNew ? selectRun(catalog, state, run) : {}),
+    recording: files.map(({ name }) => name).join('/'),
+    tab: 'rerun',
+    playing: false,
+  };
+}
+
+/**
+ * Describes opened files, and how they relate to the rest of the page.
+ * @param {Pick<RecordingEntry, 'name' | 'task' | 'filter' | 'episode' | 'application'>[]} files
+ * @param {boolean} isCurrentRun whether the page shows the run of the only file
+ * @param {Run} current run of the page
+ */
+export function describeOpened(files, isCurrentRun, current) {
+  const names = files.map(({ name }) => name).join(' and ');
+  if (isCurrentRun) return `${names}: the run of this page`;
+  const rest = `The rest of the page shows ${describeRun(current)}; its time is separate.`;
+  if (files.length > 1) return `${names}. ${rest}`;
+  const [{ task, filter, episode, application }] = files;
+  const owner = task && filter ? describeRun({ task, filter, episode }) : application;
+  return `${names} is another run${owner ? ` (${owner})` : ''}. ${rest}`;
+}
+
+/** @param {{task: string, filter: string, episode: number | null}} run */
+const describeRun = ({ task, filter, episode }) =>
+  [task, filter, episode === null ? '' : `episode ${episode}`].filter(Boolean).join(' · ');
+
 /**
  * Returns the run of a report, or why the catalog does not contain it.
  * @param {Catalog} catalog

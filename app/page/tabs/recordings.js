@@ -19,7 +19,7 @@ import { setPanelState } from '../widgets/panel_state.js';
 import { StatusLine } from '../widgets/status_line.js';
 import { Uploads } from '../widgets/upload.js';
 import { fileActions } from './file_actions.js';
-import { differences, recordedRun, selectRun } from './recorded_run.js';
+import { differences, openRecordings, recordedRun, selectRun } from './recorded_run.js';
 import { RECORDING_COLUMNS, REPORT_COLUMNS } from './recording_columns.js';
 import { SelectionBar } from './selection_bar.js';
 import { trash } from './trash.js';
@@ -249,8 +249,25 @@ export class Recordings {
 
   /** @param {RecordingEntry[]} files */
   #openInRerun(files) {
-    this.#rerun.files(files.map(({ name, url }) => ({ name, url })));
-    this.#store.set({ tab: 'rerun', playing: false });
+    this.#store.set(openRecordings(this.#store.catalog, this.#store.state, files));
+  }
+
+  /** Displays the recordings that the state names in Rerun's viewer, or the current run. */
+  async showOpened() {
+    const { recording } = this.#store.state;
+    if (!recording) return this.#rerun.files(null);
+    try {
+      const { recordings } = await api.recordings();
+      if (recording !== this.#store.state.recording) return;
+      const files = recording.split('/').map((name) => {
+        const file = recordings.find((entry) => entry.name === name);
+        if (!file) throw new Error(`The recording ${name} does not exist any more.`);
+        return { ...file, isOf: recordedRun(file) };
+      });
+      this.#rerun.files(files);
+    } catch (error) {
+      this.#rerun.files(null, messageOf(error));
+    }
   }
 
   /** @param {RecordingEntry[]} files two of them */

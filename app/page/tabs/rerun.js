@@ -1,18 +1,26 @@
 /**
  * Rerun's viewer, loaded when its tab is first opened. It shows the recording of the current run, whose time follows the
- * page's step and the reverse; or files instead, with their own time.
+ * page's step and the reverse; or files instead, with their own time unless the only file is of the current run.
  */
 
 /** @import { WebViewer } from '/vendor/rerun/viewer.js' */
 /** @import { Trace } from '../data/trace.js' */
+/** @import { RecordingEntry } from '../types/server.js' */
+/** @import { Store } from '../core/state.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
+/** @import { Run } from './recorded_run.js' */
 
 import { create, createButton, html, messageOf, pause } from '../core/dom.js';
 import { recordingRequest } from '../data/api.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { writeRecording } from '../widgets/save_button.js';
+import { describeOpened, isSameRun } from './recorded_run.js';
 
-/** @typedef {{name?: string, url: string}} RecordingFile */
+/** @typedef {{url: string}} RecordingUrl */
+/**
+ * A file of the workspace, and its run if this server has it.
+ * @typedef {RecordingEntry & {isOf: Run | null}} RecordingFile
+ */
 
 const SETTLE_FRAMES = 30; // at most, until a recording that is being opened keeps our time
 const STABLE_FRAMES = 3; // with our time, after which it is kept
@@ -20,8 +28,8 @@ const ECHO_FRAMES = 4; // until the viewer reports a time that we have set
 
 export class Rerun {
   #host;
+  #store;
   #jobs;
-  #onMove;
   /** @type {WebViewer | null} */
   #viewer = null;
   /** @type {Promise<WebViewer> | null} */
@@ -32,12 +40,14 @@ export class Rerun {
   #trace = null;
   /** Files to display in place of the trace. @type {RecordingFile[] | null} */
   #files = null;
+  #problem = '';
   /** The source, once it keeps our time. @type {Trace | RecordingFile[] | null} */
   #settled = null;
   /** IDs of the stores that we have opened. @type {string[]} */
   #stores = [];
   #fileName = document.createElement('span');
   #bar = create('p', { className: 'files', hidden: true }, this.#fileName);
+  #close = createButton('text', 'Close the recording', () => this.#store.set({ recording: '' }));
   #step = 0;
   /** Step to be set next. @type {number | null} */
   #pending = null;
@@ -48,32 +58,50 @@ export class Rerun {
 
   /**
    * @param {HTMLElement} host
+   * @param {Store} store
    * @param {Jobs} jobs
-   * @param {(step: number) => void} onMove called when the time was changed in the viewer
    */
-  constructor(host, jobs, onMove) {
+  constructor(host, store, jobs) {
     this.#host = host;
+    this.#store = store;
     this.#jobs = jobs;
-    this.#onMove = onMove;
-    this.#bar.append(createButton('text', 'Back to the current run', () => this.files(null)));
+    this.#bar.append(this.#close);
     host.append(this.#bar);
+    store.when(['task', 'filter', 'data', 'episode', 'faults'], () => this.#showBar());
   }
 
   /** @param {Trace} trace */
   show(trace) {
     this.#trace = trace;
-    this.files(null);
+    this.#load();
   }
 
   /**
-   * Displays files until the next run is selected; null for the current run.
+   * Displays files; null for the current run.
    * @param {RecordingFile[] | null} files
+   * @param {string} [problem] why files cannot be displayed
    */
-  files(files) {
+  files(files, problem = '') {
     this.#files = files;
-    this.#bar.hidden = !files;
-    this.#fileName.textContent = files?.map(({ name }) => name).join(' and ') ?? '';
+    this.#problem = problem;
+    this.#showBar();
     this.#load();
+  }
+
+  /** Whether the page shows the run of the only file. */
+  get #isFileOfRun() {
+    const run = this.#files?.length === 1 ? this.#files[0].isOf : null;
+    return Boolean(run && isSameRun(run, this.#store.state));
+  }
+
+  #showBar() {
+    const files = this.#files;
+    const isOfRun = this.#isFileOfRun;
+    this.#bar.hidden = !files && !this.#problem;
+    this.#bar.classList.toggle('other-run', !isOfRun);
+    this.#close.textContent = isOfRun ? 'Close the recording' : 'Back to the current run';
+    const text = files ? describeOpened(files, isOfRun, this.#store.state) : this.#problem;
+    this.#fileName.textContent = this.#fileName.title = text;
   }
 
   /** Whether the tab is selected. */
@@ -124,6 +152,7 @@ export class Rerun {
   /** @param {Trace | RecordingFile[]} source */
   async #display(source) {
     const isTrace = !Array.isArray(source);
+    const sharesTime = isTrace || this.#isFileOfRun;
     setPanelState(this.#host, 'loading', isTrace ? 'Writing the recording …' : 'Starting Rerun …');
     const [recordings, viewer] = await Promise.all([
       isTrace ? Promise.all([this.#recordingOf(source)]) : source,
@@ -139,7 +168,7 @@ export class Rerun {
     viewer.override_panel_state('blueprint', recordings.length > 1 ? 'expanded' : undefined);
     setPanelState(this.#host, 'ready');
     // Each of the following requests takes one drawing or more; the recording is already visible.
-    if (isTrace) await this.#settle(viewer, source);
+    if (sharesTime) await this.#settle(viewer, source);
     if (this.#source !== source) return;
     this.#stores = stores;
     await Promise.allSettled(others.map((id) => viewer.close({ store_ids: [id] })));
@@ -149,7 +178,7 @@ export class Rerun {
   /**
    * Returns the recording of a trace. A live run writes it as it grows; that of any other run is written now.
    * @param {Trace} trace
-   * @returns {Promise<RecordingFile>}
+   * @returns {Promise<RecordingUrl>}
    */
   async #recordingOf(trace) {
     if (trace.stream && trace.live) {
@@ -168,7 +197,7 @@ export class Rerun {
   /**
    * Sets our time until the recording keeps it: its blueprint, which arrives later, sets another one.
    * @param {WebViewer} viewer
-   * @param {Trace} source
+   * @param {Trace | RecordingFile[]} source
    */
   async #settle(viewer, source) {
     let stable = 0;
@@ -216,10 +245,13 @@ export class Rerun {
 
   /** Whether the viewer's time and the page's step are coupled. */
   get #isCoupled() {
+    const { state } = this.#store;
     return (
-      !this.#files &&
       this.#open &&
-      this.#settled === this.#trace &&
+      (!this.#files || this.#isFileOfRun) &&
+      this.#settled === (this.#files ?? this.#trace) &&
+      this.#trace !== null &&
+      isSameRun(this.#trace.selection, state) && // no longer while the next run is loading
       this.#host.dataset.state === 'ready'
     );
   }
@@ -256,7 +288,8 @@ export class Rerun {
     const isOlder = this.#echo !== null || this.#pending !== null; // than the step that we are setting
     if (step === this.#echo) this.#echo = null;
     if (isOlder || !this.#isCoupled || step === this.#step) return;
-    if (this.#trace && step >= 0 && step < this.#trace.steps) this.#onMove(step);
+    if (this.#trace && step >= 0 && step < this.#trace.steps)
+      this.#store.set({ step, playing: false }, { origin: 'rerun' });
   }
 }
 

@@ -32,14 +32,15 @@ import { Study } from './study.js';
  */
 
 export class Tabs {
+  #store;
+
   /**
    * @param {Store} store
    * @param {PageParts} parts
    */
   constructor(store, { jobs, timeline, finding, faultDialog, reload, setComparison }) {
-    this.rerun = new Rerun(html('#rerun'), jobs, (/** @type {number} */ step) =>
-      store.set({ step, playing: false }, { origin: 'rerun' }),
-    );
+    this.#store = store;
+    this.rerun = new Rerun(html('#rerun'), store, jobs);
     this.diagnosis = new Diagnosis(html('#diagnosis'), store, jobs, timeline);
     this.diagnosis.confirmed = (trace, result) => finding.confirm(trace, result);
     this.diagnosis.recorded = reload;
@@ -50,6 +51,7 @@ export class Tabs {
     this.study = new Study(html('#study'), store, this.failures, jobs);
     this.experiments = new Experiments(html('#experiments'), store);
     this.recordings = new Recordings(html('#recordings'), store, jobs, this.rerun);
+    if (store.state.recording) this.recordings.showOpened();
   }
 
   /** @param {Trace} trace */
@@ -88,6 +90,8 @@ export class Tabs {
   follow(changed, hasTrace) {
     /** @param {...string} keys */
     const any = (...keys) => keys.some((key) => changed.has(key));
+    if (any('recording')) this.recordings.showOpened();
+    else if (any('task', 'filter', 'data', 'episode', 'faults')) this.#store.set({ recording: '' });
     if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
     if (any('over')) this.diagnosis.load();
     if (any('against') && hasTrace) this.compare.choose();
