@@ -26,7 +26,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     keyboard.press("Shift+ArrowRight")
     keyboard.press("]")
     page.until("() => !document.querySelector('#compare').hidden")
-    assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
+    assert [form.locator(f"[name={name}]").input_value() for name in ("from", "to")] == ["45", "56"]
     form.get_by_role("button", name="Compare").click()
     assert "The intervention is empty" in form.locator(".error").text_content()
     form.locator("[name=intervention_faults]").select_option("blackout=0.8")

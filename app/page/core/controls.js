@@ -29,7 +29,7 @@ export function bindControls(page) {
     '<': () => clock.changeSpeed(-1),
     '>': () => clock.changeSpeed(1),
     '[': () => page.markIntervention('from'),
-    ']': () => page.markIntervention('last'),
+    ']': () => page.markIntervention('to'),
     'ctrl+k': () => page.commands.toggle(),
     'ctrl+z': () => undo.undo(),
     'ctrl+shift+z': () => undo.redo(),

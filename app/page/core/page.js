@@ -64,6 +64,7 @@ export class Page {
     this.#faultDialog = new FaultDialog(
       element('#fault-dialog', HTMLDialogElement),
       store.catalog.faults,
+      () => this.#run.trace?.steps ?? null,
     );
     const refreshPickers = connectPickers(store, this.#faultDialog, () =>
       this.commands.toggle('episode '),
@@ -255,8 +256,8 @@ export class Page {
   }
 
   /**
-   * Sets the first or the last step of the intervention to the cursor.
-   * @param {'from' | 'last'} end
+   * Lets the intervention begin at the cursor, or end after it.
+   * @param {'from' | 'to'} end
    */
   markIntervention(end) {
     this.openTab('compare');

@@ -95,8 +95,8 @@ export class ComparisonTab {
   }
 
   /**
-   * Sets the first or the last step of an intervention.
-   * @param {'from' | 'last'} end
+   * Lets an intervention begin at a step, or end after it.
+   * @param {'from' | 'to'} end
    * @param {number} step
    */
   mark(end, step) {

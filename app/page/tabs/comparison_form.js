@@ -41,13 +41,26 @@ function kindOf(against) {
   return against.has('faults') && !against.has('filter') ? 'faults' : 'filter';
 }
 
+/**
+ * Returns why an intervention cannot have these steps; empty if it can.
+ * @param {number} first its first step
+ * @param {number} to first step after it
+ * @param {number} steps of the episode
+ */
+export function spanProblem(first, to, steps) {
+  if (!(first < to))
+    return 'The intervention has no steps: the step after it must be later than its first step.';
+  if (to <= steps) return '';
+  return `This episode has steps 0 to ${steps - 1}, so the first step after the intervention is at most ${steps}.`;
+}
+
 export class ComparisonForm {
   #form;
   #store;
   #filter;
   #only;
   #first;
-  #last;
+  #to;
   #clearButton;
   /** @type {Trace | null} */
   #trace = null;
@@ -72,7 +85,7 @@ export class ComparisonForm {
     this.#filter = element('[name=filter]', HTMLSelectElement, form);
     this.#only = element('[name=only]', HTMLSelectElement, form);
     this.#first = element('[name=from]', HTMLInputElement, form);
-    this.#last = element('[name=last]', HTMLInputElement, form);
+    this.#to = element('[name=to]', HTMLInputElement, form);
     this.#clearButton = element('.clear', HTMLButtonElement, form);
     this.#showFaults = faultPicker(element('[name=faults]', HTMLSelectElement, form), dialog, {
       none: 'as recorded',
@@ -94,7 +107,7 @@ export class ComparisonForm {
       this.#manual.clear();
       this.#showBetas();
     });
-    for (const input of [this.#first, this.#last])
+    for (const input of [this.#first, this.#to])
       input.addEventListener('change', () => this.#showBetas());
   }
 
@@ -113,8 +126,8 @@ export class ComparisonForm {
     this.#only.replaceChildren(
       ...trace.inputs.map((name) => new Option(`${displayName(name)} standalone`, name)),
     );
-    for (const input of [this.#first, this.#last]) input.max = String(trace.steps - 1);
-    if (isNew) this.#setSpan(step, step + DEFAULT_SPAN - 1);
+    [this.#first.max, this.#to.max] = [String(trace.steps - 1), String(trace.steps)];
+    if (isNew) this.#setSpan(step, step + DEFAULT_SPAN);
     for (const modality of this.#manual.keys())
       if (!trace.modalities.includes(modality)) this.#manual.delete(modality);
     if (against) this.#read(new URLSearchParams(against));
@@ -130,16 +143,16 @@ export class ComparisonForm {
   }
 
   /**
-   * Sets the first or the last step of an intervention.
-   * @param {'from' | 'last'} end
+   * Lets an intervention begin at a step, or end after it.
+   * @param {'from' | 'to'} end
    * @param {number} step
    */
   mark(end, step) {
     if (!this.#trace) return;
-    let [first, last] = [this.#first.valueAsNumber, this.#last.valueAsNumber];
-    if (end === 'from') [first, last] = [step, last < step ? step + DEFAULT_SPAN - 1 : last];
-    else [first, last] = [first > step ? Math.max(0, step - DEFAULT_SPAN + 1) : first, step];
-    this.#setSpan(first, last);
+    let [first, to] = [this.#first.valueAsNumber, this.#to.valueAsNumber];
+    if (end === 'from') [first, to] = [step, to <= step ? step + DEFAULT_SPAN : to];
+    else [first, to] = [first > step ? Math.max(0, step - DEFAULT_SPAN + 1) : first, step + 1];
+    this.#setSpan(first, to);
     this.#kind = 'intervention';
     this.#showKind();
     this.#showBetas();
@@ -157,7 +170,7 @@ export class ComparisonForm {
     if (this.#kind === 'only') this.#only.value = against.get('only') ?? '';
     if (this.#kind === 'faults') this.#faults = against.get('faults') ?? '';
     if (this.#kind !== 'intervention') return;
-    this.#setSpan(Number(against.get('from')), Number(against.get('to')) - 1);
+    this.#setSpan(Number(against.get('from')), Number(against.get('to')));
     this.#editFaults = against.get('faults') ?? '';
     const weights = (against.get('weights') ?? '').split(',').filter(Boolean);
     this.#manual = new Map(
@@ -172,18 +185,23 @@ export class ComparisonForm {
   get #span() {
     return [
       ['from', this.#first.valueAsNumber],
-      ['to', this.#last.valueAsNumber + 1],
+      ['to', this.#to.valueAsNumber],
     ];
   }
 
   /**
    * @param {number} first
-   * @param {number} last
+   * @param {number} to first step after the intervention
    */
-  #setSpan(first, last) {
-    const maximum = (this.#trace?.steps ?? 1) - 1;
-    this.#first.value = String(Math.min(first, maximum));
-    this.#last.value = String(Math.min(last, maximum));
+  #setSpan(first, to) {
+    const steps = this.#trace?.steps ?? 1;
+    this.#first.value = String(Math.min(first, steps - 1));
+    this.#to.value = String(Math.min(to, steps));
+  }
+
+  /** First step of the intervention and first step after it. @returns {[number, number]} */
+  get #steps() {
+    return [this.#first.valueAsNumber, this.#to.valueAsNumber];
   }
 
   #submit() {
@@ -203,8 +221,8 @@ export class ComparisonForm {
         ? this.#setError('This run has these sensor faults already. Choose others.')
         : joined([['faults', this.#faults]]);
     }
-    if (!(this.#first.valueAsNumber <= this.#last.valueAsNumber))
-      return this.#setError('The last step of the intervention is before its first step.');
+    const problem = spanProblem(...this.#steps, this.#trace?.steps ?? 1);
+    if (problem) return this.#setError(problem);
     const weights = [...this.#manual].map(([name, beta]) => `${name}=${beta}`).join(',');
     const pairs = this.#span.map(
       ([key, value]) => /** @type {[string, string]} */ ([key, `${value}`]),
@@ -332,8 +350,8 @@ export class ComparisonForm {
    * @returns {[string, number]}
    */
   #meanBeta(modality) {
-    const [first, last] = [this.#first.valueAsNumber || 0, this.#last.valueAsNumber || 0];
-    const beta = this.#trace?.weight('raw', modality, 0)?.slice(first, last + 1) ?? [];
+    const [first, to] = this.#steps.map((step) => step || 0);
+    const beta = this.#trace?.weight('raw', modality, 0)?.slice(first, to) ?? [];
     return [modality, beta.length ? sum(beta) / beta.length : 0];
   }
 }

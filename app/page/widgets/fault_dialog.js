@@ -18,14 +18,17 @@ export class FaultDialog {
   #dialog;
   #input;
   #error;
+  #steps;
   /** @type {FaultTarget | null} */
   #target = null;
 
   /**
    * @param {HTMLDialogElement} dialog
    * @param {FaultInfo[]} faults
+   * @param {() => number | null} steps of the displayed episode; null without one
    */
-  constructor(dialog, faults) {
+  constructor(dialog, faults, steps) {
+    this.#steps = steps;
     this.#dialog = dialog;
     this.#input = element('input', HTMLInputElement, dialog);
     this.#error = html('.error', dialog);
@@ -61,10 +64,25 @@ export class FaultDialog {
     this.#dialog.close();
   }
 
-  /** @param {string} line */
+  /** Shows an error, and whether faults exceed the episode. @param {string} line */
   #setError(line) {
     this.#error.textContent = line;
+    const note = spanNote(this.#input.value, this.#steps());
+    html('.span-note', this.#dialog).textContent = note;
   }
+}
+
+/**
+ * Returns a note on faults that end after the displayed episode; other episodes may be longer, so they are valid.
+ * @param {string} faults
+ * @param {number | null} steps of the episode
+ */
+export function spanNote(faults, steps) {
+  const ends = [...faults.matchAll(/:to=(\d+)/g)].map(([, to]) => Number(to));
+  const beyond = ends.filter((to) => steps !== null && to > steps);
+  if (steps === null || !beyond.length) return '';
+  const texts = [...new Set(beyond)].map((to) => `:to=${to}`).join(', ');
+  return `Note: the last step of this episode is ${steps - 1}, so ${texts} has no effect here: the fault lasts to the end.`;
 }
 
 /**
