@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.text import percent
+from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.finetuning.success import ERROR, Criterion
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison
 from beliefscope.inspect.compare.effects import Difference
@@ -84,21 +84,29 @@ def _change(difference: Difference, limit: float, is_target: bool = False) -> Sl
 
 
 def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference | None) -> str:
-    """The outcome, the change in the criterion's slice, and the largest one elsewhere."""
+    """The outcome, the change in the criterion's slice, and those elsewhere."""
     head = {"met": "Met", "not met": "Not met", "inconclusive": "Inconclusive"}[outcome]
     if target is None:
         return f"{head}: the slice of the criterion has no step in the held-out episodes."
     first, *others = rows
     text = f"{head}: {_description(first)}"
-    beyond = [row for row in others if row.outcome != "met"]
-    worst = max(beyond or others, key=lambda row: row.change, default=None)
     advice = _advice(rows) if outcome == "inconclusive" else ""
+    return f"{text}{_elsewhere(others)}.{advice}"
+
+
+def _elsewhere(others: Sequence[SliceChange]) -> str:
+    """The slices beyond their limit and the inconclusive ones; the largest change if there are none."""
+    failed, undecided = ([row for row in others if row.outcome == outcome] for outcome in ("not met", "inconclusive"))
+    worst = max(failed or undecided or others, key=lambda row: row.change, default=None)
     if worst is None:
-        return f"{text}.{advice}"
-    label = "beyond the limit:" if beyond else "largest change elsewhere:"
-    if len(beyond) > 1:
-        label = f"beyond the limit in {len(beyond)} slices, most in"
-    return f"{text}; {label} {_description(worst)}.{advice}"
+        return ""
+    label = "largest change elsewhere:"
+    if failed or undecided:
+        slices = failed or undecided
+        label = "beyond the limit" if failed else "inconclusive"
+        label += f" in {len(slices)} slices, most in" if len(slices) > 1 else ":"
+    more = f"; inconclusive in {plural(len(undecided), 'more slice')}" if failed and undecided else ""
+    return f"; {label} {_description(worst)}{more}"
 
 
 def _advice(rows: Sequence[SliceChange]) -> str:

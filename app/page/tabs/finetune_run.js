@@ -32,6 +32,8 @@ const SAVED_AS = {
   saved: 'The fine-tuned checkpoint is in the catalog, next to its base checkpoint.',
   default: 'The fine-tuned checkpoint is in the catalog, as the default filter of this server.',
 };
+const NOT_SAVED =
+  'The base checkpoint is unchanged. The fine-tuned one is not in the catalog yet: there is nothing to discard.';
 const RESUMES = 'The run resumes from its last validation.';
 
 const BODY = `
@@ -140,13 +142,12 @@ export class FinetuneRun {
     host.hidden = !result;
     if (!result) return;
     const { best_step: best, steps, seconds, no_change: noChange } = result.finetuned;
-    const text = place
-      ? SAVED_AS[place]
-      : `${name}: step ${best} of ${steps}, trained in ${fixed(seconds, 0)} s. The base checkpoint is unchanged.`;
+    const training = `${name}: step ${best} of ${steps}, trained in ${fixed(seconds, 0)} s.`;
+    const text = place ? SAVED_AS[place] : `${training} ${NOT_SAVED}`;
     host.replaceChildren(
       this.#decisionButton(
         'promote',
-        'Promote to default',
+        promoteText(success?.outcome),
         'Use it as the default filter of this server',
         place === 'default' || Boolean(noChange),
         primary,
@@ -210,6 +211,16 @@ export class FinetuneRun {
       }),
     );
   }
+}
+
+/**
+ * Returns the text of the button that promotes a checkpoint, with the outcome of a criterion that is not met.
+ * @param {SuccessInfo['outcome'] | undefined} outcome
+ */
+export function promoteText(outcome) {
+  const reasons = { 'not met': 'criterion not met', inconclusive: 'criterion inconclusive' };
+  const reason = outcome && outcome !== 'met' ? ` (${reasons[outcome]})` : '';
+  return `Promote to default${reason}`;
 }
 
 /** @param {Job | null} job */

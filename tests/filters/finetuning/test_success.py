@@ -71,6 +71,13 @@ def test_outcome_follows_from_the_intervals() -> None:
     outcome, text = verdict(good, ("free motion", 0.0, 0.0, 0.0), ("clean", 0.1, 0.06, 0.15))
     assert outcome == "not met"
     assert "beyond the limit: clean +10.5 %" in text
+    noise, blackout = ("image_noise", 0.2, -0.1, 0.5), ("image_blackout", 0.3, 0.02, 0.6)
+    text = verdict(good, noise, ("clean", 0.1, 0.06, 0.15), blackout)[1]
+    assert "beyond the limit: clean +10.5 %" in text
+    assert text.endswith("; inconclusive in 2 more slices.")
+    text = verdict(good, noise, blackout)[1]
+    assert "; inconclusive in 2 slices, most in image blackout +35.0 %" in text
+    assert "beyond" not in text
     assert verdict(("contact", -0.3, nan, nan))[0] == "inconclusive"
     text = verdict(good, ("image_noise", 0.08, 0.01, 0.15))[1]
     assert "image noise +8.3 %" in text
