@@ -48,7 +48,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "groups": np.stack(list(groups.values()), axis=1) if groups else None,
         "effective_sample_size": trace.effective_sample_size,
         "blackout": measures.blackout(trace) if camera_images(trace) is not None else None,
-        "faulty": faulty if faulty.any() and not faulty.all() else None,
+        "faulty": faulty if faulty.any() else None,
     }
     arrays |= {f"extra/{name}": values for name, values in trace.extra.items()}
     of_channels = _readings(trace) | reported

@@ -111,7 +111,7 @@ test('an injected fault that the diagnosis does not name comes before an outage'
   const part = { ...frozen, faulty: series((t) => Number(t >= 10 && t < 15)) };
   assert.match(finding(part, 0, HEALTHY).headline, /from step 10 to step 14\.$/);
   assert.match(finding(part, 0, HEALTHY).evidence, /2\.00 cm in these steps\./);
-  const always = finding({ ...frozen, faulty: series(() => 0) }, 0, HEALTHY);
+  const always = finding({ ...frozen, faulty: series(() => 1) }, 0, HEALTHY);
   assert.equal(always.headline, 'Injected: image frozen, in all steps.');
   assert.match(always.evidence, /^The diagnosis does not name it\. Largest error at step 10\./);
 });

@@ -325,6 +325,8 @@ test('injected faults are labelled, below the labels of outages', () => {
     ['no image', 'injected: image frozen, force bias'],
   );
   assert.ok(both[1][2] > both[0][2], 'in a row of its own');
+  const short = shaded({ ...fault, faulty: [[30, 35]] }).texts;
+  assert.equal(short[0][0], 'injected', 'where the names have no room');
 });
 
 test('estimates of an angle do not differ from the truth by whole turns', () => {

@@ -64,7 +64,7 @@ export class Trace {
     this.contact = new Float32Array();
     /** Whether an image of each step is blacked out. @type {Series} */
     this.blackout = new Float32Array();
-    /** Whether a fault was injected at each step; zero if at all steps. @type {Series} */
+    /** Whether a fault was injected at each step. @type {Series} */
     this.faulty = new Float32Array();
     this.#update();
   }

@@ -143,7 +143,7 @@ export const affectedComponent = (components, cause) =>
 function injectedFinding(trace, component) {
   const label = sentence(trace.faultLabel).slice(0, -1);
   const [first, last] = [trace.faulty.indexOf(1), trace.faulty.lastIndexOf(1)];
-  if (first < 0) {
+  if (first < 0 || last - first === trace.steps - 1) {
     const { headline, evidence, step } = worstFinding(trace, component);
     const text = `${headline} ${evidence}`.trim();
     return { tone: 'warn', headline: `${label}, in all steps.`, evidence: text, step };

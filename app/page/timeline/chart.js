@@ -220,14 +220,22 @@ export function shadeIntervals(plot, shading, hasAreas = false, axis = STEPS) {
     const strip = STRIP_HEIGHT * devicePixelRatio;
     const bottom = bbox.top + bbox.height - strip;
     shade(contact, colour('contact'), strip, bottom);
-    labelIntervals(plot, axis, contact, shading.label ?? '', bottom, colour('surface'), null);
+    labelIntervals(plot, axis, contact, [shading.label ?? ''], bottom, colour('surface'), null);
     const below = bbox.top + (faulty.length ? line : 0);
     shade(blackout, hatching(ctx), strip, below);
-    labelIntervals(plot, axis, blackout, 'no image', below, colour('ink'), colour('surface'));
+    labelIntervals(plot, axis, blackout, ['no image'], below, colour('ink'), colour('surface'));
     shade(faulty, colour('bad'), line);
     const top = below + (blackout.length ? strip : 0);
     const { faultLabel = '' } = shading;
-    labelIntervals(plot, axis, faulty, faultLabel, top, colour('bad'), colour('surface'));
+    labelIntervals(
+      plot,
+      axis,
+      faulty,
+      [faultLabel, 'injected'],
+      top,
+      colour('bad'),
+      colour('surface'),
+    );
   } else {
     shade(contact, colour('contact-band'));
     shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
@@ -252,24 +260,29 @@ function visiblePart({ bbox, valToPos }, axis, [first, last]) {
 }
 
 /**
- * Writes a label into each interval that has room for it.
+ * Writes the first text that has room into each interval.
  * @param {uPlot} plot
  * @param {StepAxis} axis
  * @param {Interval[]} intervals
- * @param {string} text
+ * @param {string[]} texts the longest one first
  * @param {number} top of the strip
  * @param {string} ink
  * @param {string | null} background
  */
-function labelIntervals(plot, axis, intervals, text, top, ink, background) {
+function labelIntervals(plot, axis, intervals, texts, top, ink, background) {
   const { ctx } = plot;
   const height = STRIP_HEIGHT * devicePixelRatio;
   ctx.font = `${scaled(9.5) * devicePixelRatio}px system-ui, sans-serif`;
   [ctx.textAlign, ctx.textBaseline] = ['center', 'middle'];
-  const width = ctx.measureText(text).width + 6 * devicePixelRatio;
+  const labels = texts.map((text) => ({
+    text,
+    width: ctx.measureText(text).width + 6 * devicePixelRatio,
+  }));
   for (const interval of intervals) {
     const [left, right] = visiblePart(plot, axis, interval);
-    if (right - left < width) continue;
+    const label = labels.find(({ width }) => width <= right - left);
+    if (!label) continue;
+    const { text, width } = label;
     const centre = (left + right) / 2;
     ctx.fillStyle = background ?? 'transparent';
     ctx.fillRect(centre - width / 2, top, width, height);

@@ -105,7 +105,7 @@ export function faultPicker(select, dialog, { none, selected, choose, check }) {
       [OTHER, 'other …'],
     ];
     setOptions(select, options, faults);
-    select.title = `Sensor faults${faults && `: ${faults}`}`;
+    select.title = faults ? `Sensor faults:\n${faults.replaceAll(',', ',\n')}` : 'Sensor faults';
   };
   /** @param {string} faults */
   const apply = (faults) => (choose(faults), show());

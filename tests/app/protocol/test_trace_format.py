@@ -88,7 +88,7 @@ def test_nees_bounds_contain_95_percent_for_a_consistent_filter() -> None:
     ("faults", "steps"),
     [
         ("", None),
-        ("blackout=0.4", None),  # at every step
+        ("blackout=0.4", (0, 100)),
         ("image_frozen:from=30:to=40", (30, 40)),
         ("force_bias=5:from=90,image_noise=40:from=95", (90, 100)),
         ("image_noise=40:from=500", None),  # after the end
