@@ -3,7 +3,10 @@ import test from 'node:test';
 
 import { spanProblem } from '../../app/page/tabs/comparison_form.js';
 import { promoteText } from '../../app/page/tabs/finetune_run.js';
+import { inOrder, verdictStatus } from '../../app/page/tabs/diagnostics.js';
+import { episodeNote } from '../../app/page/tabs/failures.js';
 import { spanNote } from '../../app/page/widgets/fault_dialog.js';
+import { episodeLabel } from '../../app/page/widgets/pickers.js';
 
 test('the steps of an intervention end before the first step after it', () => {
   assert.equal(spanProblem(30, 76, 100), '');
@@ -27,4 +30,43 @@ test('the button that promotes a checkpoint names a criterion that is not met', 
   assert.equal(promoteText('met'), 'Promote to default');
   assert.equal(promoteText('not met'), 'Promote to default (criterion not met)');
   assert.equal(promoteText('inconclusive'), 'Promote to default (criterion inconclusive)');
+});
+
+test('slow diagnostics follow the others, before those that do not apply', () => {
+  const entry = (/** @type {string} */ name, slow = false, why_not = null) => ({
+    name,
+    slow,
+    why_not,
+  });
+  const entries = [entry('maps', true), entry('pf', false, 'no particles'), entry('weights')];
+  assert.deepEqual(
+    inOrder(entries).map(({ name }) => name),
+    ['weights', 'maps', 'pf'],
+  );
+});
+
+test('the status at the start of a verdict has a tone', () => {
+  assert.deepEqual(verdictStatus('No alarm: within the healthy record.'), {
+    status: 'No alarm',
+    tone: 'good',
+  });
+  assert.deepEqual(verdictStatus('Alarm, NEES/n 3.'), { status: 'Alarm', tone: 'bad' });
+  const unusual = verdictStatus('Unusual episode (2 % of the healthy ones), NEES/n 3.');
+  assert.deepEqual(unusual, { status: 'Unusual episode', tone: 'warn' });
+  assert.deepEqual(verdictStatus('NEES/n is 3.'), { status: '', tone: '' });
+});
+
+test('a failure in another episode is announced', () => {
+  assert.equal(episodeNote({ episode: 9, step: 3 }, 9, '1 of 4'), '');
+  assert.equal(
+    episodeNote({ episode: 12, step: 3 }, 9, '2 of 4'),
+    'Failure 2 of 4 is in another episode: now episode 12, step 3, before episode 9. ctrl z returns.',
+  );
+});
+
+test('the label of an episode does not repeat the name of a task', () => {
+  const episode = { index: 9, split: 'test', steps: 100, contact_fraction: 0.21, label: '' };
+  const text = 'pushed · test · 100 steps · contact 21 %';
+  assert.equal(episodeLabel({ ...episode, policy: 'push' }), `9 · ${text}`);
+  assert.match(episodeLabel({ ...episode, policy: 'expert' }), /^9 · expert · test/);
 });

@@ -251,6 +251,15 @@ export class Page {
     this.openTab(tab);
   }
 
+  /**
+   * Goes to the next or the previous failure, and announces a change of the episode.
+   * @param {1 | -1} by
+   * @param {number} inputTime
+   */
+  goToFailure(by, inputTime) {
+    this.#messages.show('failure', this.tabs?.failures.go(by, inputTime));
+  }
+
   goToLargestError() {
     if (this.#run.trace) this.goTo(this.timeline.largestError);
   }

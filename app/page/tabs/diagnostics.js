@@ -120,8 +120,7 @@ export class Diagnostics {
     }
     try {
       const entries = await api.diagnostics(trace.selection, this.#loading.signal);
-      // Diagnostics that do not apply come last.
-      this.#entries = [...entries].sort((a, b) => Number(!!a.why_not) - Number(!!b.why_not));
+      this.#entries = inOrder(entries);
     } catch (error) {
       if (!isAbort(error)) setPanelState(this.#host, 'error', messageOf(error));
       return;
@@ -195,8 +194,8 @@ export class Diagnostics {
 
   /** Creates a row for each diagnostic; later only their contents change. */
   #buildRows() {
-    if (this.#rows.size) return;
     for (const { name, title, question } of this.#entries) {
+      if (this.#rows.has(name)) continue;
       const button = createButton('title', title, () => {
         this.#store.set({ diagnostic: name, options: '' });
         this.#store.flush();
@@ -212,7 +211,8 @@ export class Diagnostics {
       );
       this.#rows.set(name, row);
     }
-    this.#list.replaceChildren(...this.#rows.values());
+    const rows = this.#entries.flatMap(({ name }) => this.#rows.get(name) ?? []);
+    if (rows.some((row, i) => row !== this.#list.children[i])) this.#list.replaceChildren(...rows);
   }
 
   /** Shows the selected diagnostic, or the list of all. */
@@ -309,8 +309,14 @@ export class Diagnostics {
     const text = typeset(
       result.state === 'ready' ? result.result.verdict : resultText(result, STATES),
     );
-    if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
+    const { tone, status } = verdictStatus(state === 'ready' ? text : '');
+    if (verdict.textContent !== text) {
+      verdict.replaceChildren(create('b', { textContent: status }), text.slice(status.length));
+      verdict.title = text;
+    }
     host.dataset.state = state;
+    if (tone) host.dataset.tone = tone;
+    else delete host.dataset.tone;
     host.setAttribute('aria-busy', String(state === 'loading' || state === 'active'));
     const action = state === 'error' ? '' : jobAction(state, 'Compute');
     showJobButton(html('.doing', host), result, {
@@ -321,4 +327,24 @@ export class Diagnostics {
       next: this.#backButton,
     });
   }
+}
+
+/**
+ * Sorts diagnostics: those that are computed at once, slow ones, and those that do not apply.
+ * @template {{slow: boolean, why_not: string | null}} T
+ * @param {T[]} entries
+ */
+export function inOrder(entries) {
+  const rank = (/** @type {T} */ entry) => (entry.why_not ? 2 : Number(entry.slow));
+  return [...entries].sort((a, b) => rank(a) - rank(b));
+}
+
+/**
+ * Returns the comparison with the healthy record at the start of a verdict, and its tone; both empty without one.
+ * @param {string} verdict
+ */
+export function verdictStatus(verdict) {
+  const [status = ''] = /^(No alarm|Alarm|Unusual episode)/.exec(verdict) ?? [];
+  const tones = { 'No alarm': 'good', Alarm: 'bad', 'Unusual episode': 'warn' };
+  return { status, tone: tones[/** @type {keyof typeof tones} */ (status)] ?? '' };
 }

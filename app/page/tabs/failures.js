@@ -111,13 +111,20 @@ export class Failures {
    * Opens the next or the previous event.
    * @param {1 | -1} by
    * @param {number | null} [inputTime]
+   * @returns {string} announcement of another episode; empty if the event is in the same one
    */
   go(by, inputTime = null) {
     const events = this.#events;
-    if (!events.length) return this.#store.set({ tab: 'failures' });
+    if (!events.length) {
+      this.#store.set({ tab: 'failures' });
+      return '';
+    }
     this.#last = Math.min(Math.max(this.#last + by, 0), events.length - 1);
-    this.#open(events[this.#last], inputTime);
+    const event = events[this.#last];
+    const { episode } = this.#store.state;
+    this.#open(event, inputTime);
     this.#table.point(this.#last);
+    return episodeNote(event, episode, `${this.#last + 1} of ${events.length}`);
   }
 
   /** Opens the worst event once it is known; starts the search if necessary. */
@@ -299,6 +306,17 @@ export class Failures {
     );
   }
 }
+
+/**
+ * Announces that a failure is in another episode; empty if it is not.
+ * @param {Pick<FailureEvent, 'episode' | 'step'>} event
+ * @param {number} previous displayed episode
+ * @param {string} rank
+ */
+export const episodeNote = ({ episode, step }, previous, rank) =>
+  episode === previous
+    ? ''
+    : `Failure ${rank} is in another episode: now episode ${episode}, step ${step}, before episode ${previous}. ctrl z returns.`;
 
 /**
  * @param {FailureScore} score

@@ -34,7 +34,7 @@ export class Jobs {
     this.#button = button;
     button.addEventListener('click', () => this.toggle());
     this.#closeButton.addEventListener('click', () => this.toggle());
-    drawer.addEventListener('keydown', (event) => event.key === 'Escape' && this.toggle());
+    drawer.addEventListener('keydown', (event) => event.key === 'Escape' && this.toggleByKey());
     this.refresh();
   }
 
@@ -86,6 +86,12 @@ export class Jobs {
     else if (this.#drawer.contains(activeElement) || activeElement === document.body)
       this.#button.focus();
     this.refresh();
+  }
+
+  /** Opens or closes the drawer by a shortcut; afterwards the page has its keys again, such as Space to play. */
+  toggleByKey() {
+    this.toggle();
+    if (this.#drawer.hidden) this.#button.blur();
   }
 
   /** Gets the jobs from the server, and again at intervals while one is active. */

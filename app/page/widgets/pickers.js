@@ -156,10 +156,13 @@ export function firstRun(task, state) {
   };
 }
 
+/** Participles of the policies whose names are also those of tasks. @type {Record<string, string>} */
+const POLICY_LABELS = { push: 'pushed', pull: 'pulled' };
+
 /** @param {EpisodeSummary} episode */
 export function episodeLabel({ index, policy, split, steps, contact_fraction, label }) {
   if (label) return label;
-  const parts = [index, policy, split, plural(steps, 'step')];
+  const parts = [index, POLICY_LABELS[policy ?? ''] ?? policy, split, plural(steps, 'step')];
   if (contact_fraction !== null) parts.push(`contact ${percent(contact_fraction)}`);
   return parts.filter((part) => part !== '').join(' · ');
 }
