@@ -46,6 +46,9 @@ ENTRIES: tuple[Entry, ...] = (
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}
 """Entries by name, in display order."""
 
+SLOW = "slow diagnostic; include it with --all"
+"""Reason for the absence of a diagnostic that applies, but takes more than two seconds."""
+
 
 def run_diagnostics(
     traces: Sequence[Trace],
@@ -71,7 +74,7 @@ def run_diagnostics(
         entry = DIAGNOSTICS[name]
         reason = next(filter(None, (entry.refusal(trace, checkpoint) for trace in traces)), None)
         if reason is None and entry.slow and not slow:
-            reason = "slow diagnostic; include it with --all"
+            reason = SLOW
         if reason is not None:
             reasons[name] = reason
         else:
@@ -84,6 +87,11 @@ def run_diagnostics(
                 reasons[name] = str(error)
         progress((index + 1) / len(options))
     return results, reasons
+
+
+def reason_text(reason: str) -> str:
+    """Why a diagnostic has no result, in a report of all of them: it is slow, or not available."""
+    return reason if reason == SLOW else f"not available: {reason}"
 
 
 def quick(trace: Trace, checkpoint: Checkpoint | None = None) -> dict[str, Diagnostic]:

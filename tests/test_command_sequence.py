@@ -220,6 +220,9 @@ def test_inspect_reports_applicable_diagnostics_and_reasons(run: Run, folder: Pa
     for name, result in document["diagnostics"].items():
         single = json.loads(run(f"inspect 9.trace 19.trace --only {name} --json -")[1])["diagnostics"]
         assert single == {name: result}
+    assert (
+        "Likelihood maps: slow diagnostic; include it with --all" in run("inspect 9.trace --filter ekf.safetensors")[1]
+    )
     # The filter is not built in, so diagnostics that need its checkpoint are not available.
     code, out, _ = run("inspect 9.trace")
     assert code == 0

@@ -30,7 +30,7 @@ def inspect(
       beliefscope inspect run.trace --only saliency --option step=68 --option target=beta:image
       beliefscope inspect run.trace --filter mine.safetensors --all --json -
     """
-    from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
+    from beliefscope.inspect.catalog import DIAGNOSTICS, reason_text, run_diagnostics
     from beliefscope.inspect.diagnostics.plotting import write_figure
     from beliefscope.recordings.open_trace import open_traces, run_files
 
@@ -58,7 +58,7 @@ def inspect(
             if (figure := result.plot(traces[0].episode.time)).axes:  # of several traces, some have tables only
                 write_figure(figure, figures / f"{name}.{format}")
     text = [f"{DIAGNOSTICS[name].title}: {result.text}" for name, result in results.items()]
-    text += [f"{DIAGNOSTICS[name].title}: not available: {reason}" for name, reason in reasons.items()]
+    text += [f"{DIAGNOSTICS[name].title}: {reason_text(reason)}" for name, reason in reasons.items()]
     document = {
         "task": traces[0].task.name,
         "filter": traces[0].filter,

@@ -48,6 +48,7 @@ def report(
       beliefscope report runs/*.trace -o report --title "Doors, 40 % image blackout" --pdf
       beliefscope report run.trace --event 35 --event 68 --all
     """
+    from beliefscope.inspect.catalog import reason_text
     from beliefscope.inspect.maps.map_engine import no_maps
     from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
@@ -86,7 +87,7 @@ def report(
         )
         document = write_report(content, output, chromium, lambda fraction: advance(0.6 + 0.4 * fraction))
     lines = [f"{content.titles[name][0]}: {verdict}" for name, verdict in document["diagnostics"].items()]
-    lines += [f"{title}: not available: {reason}" for title, reason in document["not_made"].items()]
+    lines += [f"{title}: {reason_text(reason)}" for title, reason in document["not_made"].items()]
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
     lines.append(f"{output / 'report.html'} ({len(document['files'])} files, {size / 1e6:.1f} MB)")
     return console.Result(document | {"path": str(output)}, "\n\n".join(lines))
