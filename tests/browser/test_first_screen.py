@@ -39,6 +39,25 @@ def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: A
     parts = ["#finding strong", "#finding span", "#heatmaps canvas", "#step-table", "#tracks .cursor", "#intro .chip"]
     assert page.page.evaluate(VISIBLE, parts) == []
     assert not page.violations()
+    labels = page.page.locator(".pickers label:not([hidden]) span")
+    assert labels.all_text_contents() == ["Task", "Filter", "Episode", "Faults"]
+    clipping = "(spans) => spans.map((span) => getComputedStyle(span).clipPath)"
+    assert set(labels.evaluate_all(clipping)) == {"none"}
+    assert page.page.locator("#episode").get_attribute("title").startswith("Episode: 13 · pushed")
+    assert "brackets: end effector" in page.page.locator(".marks .key-marks").get_attribute("title")
+
+    # Long evidence has two lines; on focus, the complete text is below it.
+    page.page.evaluate("(text) => (document.querySelector('#finding .sentence span').textContent = text)", "word " * 60)
+    lines = "({ scrollHeight, clientHeight }) => [scrollHeight - clientHeight, clientHeight]"
+    assert page.page.locator("#finding .sentence span").evaluate(lines)[1] == 2 * 15
+    page.page.locator("#find").focus()
+    page.page.keyboard.press("Shift+Tab")
+    finding.focus()
+    full = page.page.locator("#finding .full-text")
+    page.until("() => document.querySelector('#finding .full-text').matches(':popover-open')")
+    assert full.text_content() == finding.get_attribute("title")
+    page.page.keyboard.press("Escape")
+    assert not full.is_visible()
     page.page.locator("#finding .go-to-step").click()
     page.until(f"() => beliefscope.state().step === {step + 1}")
 

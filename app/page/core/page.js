@@ -21,6 +21,7 @@ import { Timeline } from '../timeline/timeline.js';
 import { CommandPalette } from '../widgets/command_palette.js';
 import { FaultDialog } from '../widgets/fault_dialog.js';
 import { FindingBar } from '../widgets/finding_bar.js';
+import { showFullText } from '../widgets/full_text.js';
 import { Intro } from '../widgets/intro.js';
 import { Jobs } from '../widgets/jobs.js';
 import { setPanelError, setPanelState } from '../widgets/panel_state.js';
@@ -129,6 +130,7 @@ export class Page {
       store.restore(state);
     });
     bindControls(this);
+    for (const selector of ['#finding .sentence', '#step-summary']) showFullText(html(selector));
     this.showTab(store.state.tab);
     this.#run.load();
     Promise.race([useful, delayed]).then(() => this.loadTabs());

@@ -85,7 +85,7 @@ export function connectPickers(store, dialog, findEpisode) {
     const find = isComplete(set) ? [] : [[FIND, `Find one of ${set.count} episodes…`]];
     const options = [...find, ...set.episodes.map((entry) => [entry.index, episodeLabel(entry)])];
     setOptions(episode, options, index);
-    episode.title = selectedLabel(episode); // where the picker is narrow
+    episode.title = `Episode: ${selectedLabel(episode)}`; // where the picker is narrow
   };
   episode.addEventListener('change', () => {
     if (episode.value !== FIND)
@@ -102,7 +102,9 @@ export function connectPickers(store, dialog, findEpisode) {
     data.value = state.data;
     if (['task', 'data', 'episode'].some((key) => changed.has(key))) showEpisodes();
     speed.value = String(state.speed);
-    for (const select of [filter, data]) select.title = selectedLabel(select);
+    task.title = `Task: ${selectedLabel(task)}`;
+    filter.title = `Filter: ${selectedLabel(filter)}`;
+    data.title = `Data: ${selectedLabel(data)}`;
   };
   show(store.state);
   store.listen(show);
