@@ -330,7 +330,7 @@ export class Diagnostics {
 }
 
 /**
- * Sorts diagnostics: those that are computed at once, slow ones, and those that do not apply.
+ * Sorts diagnostics: fast ones, slow ones, which are computed on request, and inapplicable ones.
  * @template {{slow: boolean, why_not: string | null}} T
  * @param {T[]} entries
  */

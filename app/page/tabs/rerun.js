@@ -101,7 +101,10 @@ export class Rerun {
     this.#bar.classList.toggle('other-run', !isOfRun);
     this.#close.textContent = isOfRun ? 'Close the recording' : 'Back to the current run';
     const text = files ? describeOpened(files, isOfRun, this.#store.state) : this.#problem;
-    this.#fileName.textContent = this.#fileName.title = text;
+    this.#fileName.textContent = text;
+    this.#fileName.title = [text, ...(files ?? []).map((file) => file.why_not)]
+      .filter(Boolean)
+      .join('\n');
   }
 
   /** Whether the tab is selected. */
