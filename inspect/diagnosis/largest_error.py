@@ -37,7 +37,7 @@ class LargestError:
 
     @property
     def text(self) -> str:
-        return f"{self.size}, of which {self.sources}" if self.sources else self.size
+        return f"{self.size} ({self.sources})" if self.sources else self.size
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)

@@ -75,8 +75,8 @@ class ErrorSources(RunDiagnostic):
         episode = f" of episode {self.worst_episode}" if self.trajectories > 1 else ""
         main = self.task.main_error
         sentences = [
-            f"Largest {main.name} error at step {self.worst_step}{episode}: {main.text(self.worst.sum())}, of which "
-            f"{parts_text(self.task, self.sources, self.worst)}."
+            f"Largest {main.name} error at step {self.worst_step}{episode}: {main.text(self.worst.sum())} "
+            f"({parts_text(self.task, self.sources, self.worst)})."
         ]
         shares = [
             ("" if phase.phase == "all" else f"in {phase.phase} ")

@@ -215,7 +215,7 @@ export class FinetuneRun {
 
 /**
  * Returns the text of the button that promotes a checkpoint, with the outcome of a criterion that is not met.
- * @param {SuccessInfo['outcome'] | undefined} outcome
+ * @param {Success['outcome'] | undefined} outcome
  */
 export function promoteText(outcome) {
   const reasons = { 'not met': 'criterion not met', inconclusive: 'criterion inconclusive' };

@@ -83,8 +83,35 @@ export interface components {
             scale: number;
         };
         /**
+         * Condition
+         * @description Values of a covariate: ``low < value <= high``, either end may be None; or a category.
+         *
+         *     Attributes:
+         *         covariate, unit: name, and unit of ``low`` and ``high``, that for display.
+         */
+        Condition: {
+            /** Covariate */
+            covariate: string;
+            /** Unit */
+            unit: string;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Category */
+            category: string | null;
+        };
+        /**
          * Curve
-         * @description A quantity over the steps of a trace.
+         * @description A quantity over the steps of one trace.
+         *
+         *     Attributes:
+         *         name: legend text.
+         *         values: (T,), NaN where undefined.
+         *         chart: title of the chart; curves of one chart share its axes.
+         *         unit: display unit.
+         *         layer: modality, ``fused`` or ``truth``; determines the colour.
+         *         bounds: expected range of the values, if any.
          */
         Curve: {
             /** Name */
@@ -154,21 +181,11 @@ export interface components {
          *     unmeasured: sensors without any, and statistics that the episodes or the healthy record do not have.
          *     outdated: whether an earlier version measured the healthy record, which lacks statistics.
          *     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
+         *     largest_error: of runs without a fault; None if the true state is unknown.
          */
         Diagnosis: {
-            /**
-             * State
-             * @enum {string}
-             */
-            state: "healthy" | "fault" | "unsure";
-            /** Masked */
-            masked: boolean;
-            /** Headline */
-            headline: string;
             /** Causes */
             causes: components["schemas"]["DiagnosisCause"][];
-            /** Deviations */
-            deviations: components["schemas"]["DiagnosisEvidence"][];
             /** Task */
             task: string;
             /** Filter */
@@ -203,6 +220,18 @@ export interface components {
             restarts?: {
                 [key: string]: number[];
             } | null;
+            largest_error?: components["schemas"]["LargestError"] | null;
+            /**
+             * State
+             * @enum {string}
+             */
+            state: "healthy" | "fault" | "unsure";
+            /** Masked */
+            masked: boolean;
+            /** Headline */
+            headline: string;
+            /** Deviations */
+            deviations: components["schemas"]["Evidence"][];
         };
         /**
          * DiagnosisCause
@@ -219,37 +248,18 @@ export interface components {
             component: string;
             /** Probability */
             probability: number;
+            recovered: components["schemas"]["Recovery"] | null;
             /** Episodes */
             episodes: number[];
             /** Steps */
-            steps: number[] | null;
+            steps: [
+                number,
+                number
+            ] | null;
             /** Evidence */
-            evidence: components["schemas"]["DiagnosisEvidence"][];
-            recovered: components["schemas"]["DiagnosisRecovery"] | null;
+            evidence: components["schemas"]["Evidence"][];
             /** Next */
             next: string;
-        };
-        /**
-         * DiagnosisEvidence
-         * @description A deviation that supports a cause. low, high: healthy range. episode, step: where it shows best.
-         */
-        DiagnosisEvidence: {
-            /** Text */
-            text: string;
-            /** Value */
-            value: number | null;
-            /** Low */
-            low: number | null;
-            /** High */
-            high: number | null;
-            /** Episode */
-            episode: number | null;
-            /** Step */
-            step: number | null;
-            /** Time */
-            time: number | null;
-            /** Sensor */
-            sensor: string;
         };
         /**
          * DiagnosisJob
@@ -258,22 +268,6 @@ export interface components {
         DiagnosisJob: {
             job: components["schemas"]["Job"] | null;
             preliminary: components["schemas"]["Diagnosis"];
-        };
-        /**
-         * DiagnosisRecovery
-         * @description Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats.
-         */
-        DiagnosisRecovery: {
-            /** Error */
-            error: number | null;
-            /** Low */
-            low: number | null;
-            /** High */
-            high: number | null;
-            /** Nll */
-            nll: number | null;
-            /** Measure */
-            measure: string;
         };
         /**
          * DiagnosticInfo
@@ -351,7 +345,16 @@ export interface components {
         };
         /**
          * EpisodeErrors
-         * @description Position errors of one episode.
+         * @description Fused position error over one episode, m.
+         *
+         *     Attributes:
+         *         index: index in the data set.
+         *         steps: T.
+         *         rmse: over all steps but those of the task's warm-up.
+         *         worst, worst_step: maximum over all steps; NaN and None without known errors.
+         *         worst_time: s from the first step to ``worst_step``; None without timestamps.
+         *         error: (P,) maximum in each of P equal parts of the episode.
+         *         contact: (P,) whether there is contact in each part.
          */
         EpisodeErrors: {
             /** Index */
@@ -442,6 +445,75 @@ export interface components {
         Error: {
             /** Error */
             error: string;
+        };
+        /**
+         * ErrorSlice
+         * @description A data slice with a larger score than the other steps.
+         *
+         *     Attributes:
+         *         conditions: one, or two that both hold.
+         *         inside, outside: mean score of its steps, and of all others; SI units.
+         *         ratio, low, high: inside / outside with its 95 % interval over episodes; NaN below five episodes.
+         *         episodes: indices in the data set of the episodes with steps in the slice.
+         *         worst: episode and step of its largest score, in an episode that is not the ``worst`` of a slice above, if any.
+         *         steps, share: number of its steps, and their share of all.
+         *         p_value: of the search, see ``inspect/slices/search.py``.
+         */
+        ErrorSlice: {
+            /** Conditions */
+            conditions: components["schemas"]["Condition"][];
+            /** Inside */
+            inside: number | null;
+            /** Outside */
+            outside: number | null;
+            /** Ratio */
+            ratio: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Episodes */
+            episodes: number[];
+            /** Worst */
+            worst: [
+                number,
+                number
+            ];
+            /** Steps */
+            steps: number;
+            /** Share */
+            share: number | null;
+            /** P Value */
+            p_value: number | null;
+        };
+        /**
+         * Evidence
+         * @description A deviation that supports a cause.
+         *
+         *     Attributes:
+         *         text: statistic, value and healthy range in words.
+         *         value, low, high: value of the statistic and its 95 % healthy range.
+         *         episode, step: where it shows best; None if it concerns whole episodes.
+         *         time: s from the first step to ``step``; None without timestamps.
+         *         sensor: observation key of the sensor that it is about, or ``control``; empty if it is about something else.
+         */
+        Evidence: {
+            /** Text */
+            text: string;
+            /** Value */
+            value: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Episode */
+            episode: number | null;
+            /** Step */
+            step: number | null;
+            /** Time */
+            time: number | null;
+            /** Sensor */
+            sensor: string;
         };
         /**
          * Example
@@ -546,8 +618,6 @@ export interface components {
             value: number | null;
             /** Nees */
             nees: number | null;
-            /** Ess */
-            ess: number | null;
             /** Effective Weights */
             effective_weights: (number | null)[] | null;
             /** Link */
@@ -572,6 +642,8 @@ export interface components {
             other_phases: string[];
             /** Error */
             error: (number | null)[];
+            /** Ess */
+            ess: number | null;
         };
         /**
          * FailureScore
@@ -607,37 +679,6 @@ export interface components {
             slices?: components["schemas"]["FailureSlices"] | null;
         };
         /**
-         * FailureSlice
-         * @description A data slice with a larger score. worst: episode and step of the largest one.
-         */
-        FailureSlice: {
-            /** Conditions */
-            conditions: components["schemas"]["SliceCondition"][];
-            /** Inside */
-            inside: number | null;
-            /** Outside */
-            outside: number | null;
-            /** Ratio */
-            ratio: number | null;
-            /** Low */
-            low: number | null;
-            /** High */
-            high: number | null;
-            /** Episodes */
-            episodes: number[];
-            /** Worst */
-            worst: [
-                number,
-                number
-            ];
-            /** Steps */
-            steps: number;
-            /** Share */
-            share: number | null;
-            /** P Value */
-            p_value: number | null;
-        };
-        /**
          * FailureSlices
          * @description Data slices in which a score is larger. summary: their number and the searched data, or why there are none.
          */
@@ -645,7 +686,7 @@ export interface components {
             /** Summary */
             summary: string;
             /** Rows */
-            rows: components["schemas"]["FailureSlice"][];
+            rows: components["schemas"]["ErrorSlice"][];
         };
         /**
          * Failures
@@ -810,20 +851,20 @@ export interface components {
                 number | null
             ][];
             /** Validations */
-            validations: components["schemas"]["ValidationInfo"][];
+            validations: components["schemas"]["Validation"][];
         };
         /**
          * FineTuneResult
          * @description Result of a fine-tuning run. frozen: modules with unchanged hashes. success: None without a criterion.
          */
         FineTuneResult: {
-            success?: components["schemas"]["SuccessInfo"] | null;
             finetuned: components["schemas"]["FineTunedCheckpoint"];
             comparison: components["schemas"]["ResultViews"];
             /** Frozen */
             frozen: string[];
             /** Events */
             events: components["schemas"]["RegressionEvent"][];
+            success?: components["schemas"]["Success"] | null;
         };
         /**
          * FineTuneRunInfo
@@ -875,7 +916,7 @@ export interface components {
             /** Saved As */
             saved_as: ("saved" | "default") | null;
             progress: components["schemas"]["FineTuneProgress"] | null;
-            success: components["schemas"]["SuccessInfo"] | null;
+            success: components["schemas"]["Success"] | null;
         };
         /**
          * FineTunedCheckpoint
@@ -1057,8 +1098,30 @@ export interface components {
             log: string;
         };
         /**
+         * LargestError
+         * @description The largest main error of several runs.
+         *
+         *     Attributes:
+         *         episode, step: where it is.
+         *         size: the error, and its largest deviation in standard deviations.
+         *         sources: the parts of the error by source; empty where they cannot be computed.
+         *         overconfident: whether the deviation is more than twice as large as a consistent one.
+         */
+        LargestError: {
+            /** Episode */
+            episode: number;
+            /** Step */
+            step: number;
+            /** Size */
+            size: string;
+            /** Sources */
+            sources: string;
+            /** Overconfident */
+            overconfident: boolean;
+        };
+        /**
          * Line
-         * @description A line of a plot.
+         * @description One series of a plot: x and y (S,), and the layer that determines its colour.
          */
         Line: {
             /** Name */
@@ -1322,17 +1385,21 @@ export interface components {
         };
         /**
          * Plot
-         * @description A plot whose x axis is not time. diagonal: draw y = x. names: labels of x = 0, 1, ...
+         * @description A plot whose x axis is not time.
+         *
+         *     Attributes:
+         *         diagonal: whether to draw the ideal y = x.
+         *         names: category names of x = 0, 1, ...
          */
         Plot: {
-            /** Lines */
-            lines: components["schemas"]["Line"][];
             /** Title */
             title: string;
             /** X Label */
             x_label: string;
             /** Y Label */
             y_label: string;
+            /** Lines */
+            lines: components["schemas"]["Line"][];
             /**
              * Kind
              * @enum {string}
@@ -1490,6 +1557,29 @@ export interface components {
              * @enum {string}
              */
             quantity: "likelihood" | "posterior";
+        };
+        /**
+         * Recovery
+         * @description Effect of undoing a cause on the filter, by replay with the same random numbers.
+         *
+         *     Attributes:
+         *         error: share of the error that the undo removes; NaN without ground truth.
+         *         low, high: 95 % interval over episodes; NaN for too few of them.
+         *         nll: decrease of the negative log-likelihood by step, in nats: of the true state; without ground truth, of the
+         *             virtual observations.
+         *         measure: the error, such as ``position`` or ``angle``: that which falls most.
+         */
+        Recovery: {
+            /** Error */
+            error: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Nll */
+            nll: number | null;
+            /** Measure */
+            measure: string;
         };
         /**
          * RegressionEvent
@@ -1720,16 +1810,15 @@ export interface components {
             data: string;
         };
         /**
-         * SliceChangeInfo
-         * @description Change of the criterion's measure in a slice.
+         * SliceChange
+         * @description Change of the criterion's measure in one slice.
+         *
+         *     Attributes:
+         *         slice: its name. before, after: in ``unit``, that of display.
+         *         change, low, high: relative change with its 95 % interval over episodes; NaN for too few.
+         *         limit: largest permitted change. outcome: whether it is kept.
          */
-        SliceChangeInfo: {
-            /** Change */
-            change: number | null;
-            /** Low */
-            low: number | null;
-            /** High */
-            high: number | null;
+        SliceChange: {
             /** Slice */
             slice: string;
             /** Before */
@@ -1738,6 +1827,12 @@ export interface components {
             after: number | null;
             /** Unit */
             unit: string;
+            /** Change */
+            change: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
             /** Limit */
             limit: number | null;
             /**
@@ -1745,22 +1840,6 @@ export interface components {
              * @enum {string}
              */
             outcome: "met" | "not met" | "inconclusive";
-        };
-        /**
-         * SliceCondition
-         * @description Values of a covariate: ``low < value <= high`` in its unit for display, either may be None; or a category.
-         */
-        SliceCondition: {
-            /** Covariate */
-            covariate: string;
-            /** Unit */
-            unit: string;
-            /** Low */
-            low: number | null;
-            /** High */
-            high: number | null;
-            /** Category */
-            category: string | null;
         };
         /**
          * SliceInfo
@@ -1863,12 +1942,14 @@ export interface components {
             rows: components["schemas"]["Row"][];
         };
         /**
-         * SuccessInfo
-         * @description Outcome by the success criterion.
+         * Success
+         * @description Outcome of a fine-tuning run by its criterion.
+         *
+         *     Attributes:
+         *         criterion: as text. statement: in words. outcome: of all slices. verdict: the outcome in words.
+         *         slices: that of the criterion first.
          */
-        SuccessInfo: {
-            /** Slices */
-            slices: components["schemas"]["SliceChangeInfo"][];
+        Success: {
             /** Criterion */
             criterion: string;
             /** Statement */
@@ -1880,6 +1961,8 @@ export interface components {
             outcome: "met" | "not met" | "inconclusive";
             /** Verdict */
             verdict: string;
+            /** Slices */
+            slices: components["schemas"]["SliceChange"][];
         };
         /**
          * SweepInfo
@@ -1909,7 +1992,7 @@ export interface components {
         };
         /**
          * Table
-         * @description Rows of values, None where a value is not available. Column names include the unit.
+         * @description Rows of values, None where a value is not available, such as NaN. Column names include the unit.
          *
          *     note: explains columns, below the table.
          */
@@ -2058,14 +2141,19 @@ export interface components {
             file: boolean;
         };
         /**
-         * ValidationInfo
-         * @description A validation.
+         * Validation
+         * @description Metrics on episodes that are not trained on.
+         *
+         *     Attributes:
+         *         step: steps done. loss: mean training loss since the previous validation; None for the first.
+         *         slices: slice -> ``Metrics.to_dict`` over the slice's steps, and ``error``: root mean square error in
+         *             standardised units over all components. score: over all slices (``score``).
          */
-        ValidationInfo: {
-            /** Loss */
-            loss: number | null;
+        Validation: {
             /** Step */
             step: number;
+            /** Loss */
+            loss: number | null;
             /** Slices */
             slices: {
                 [key: string]: {
@@ -2148,15 +2236,14 @@ export type Catalog = components['schemas']['Catalog'];
 export type Column = components['schemas']['Column'];
 export type Comparison = components['schemas']['Comparison'];
 export type Component = components['schemas']['Component'];
+export type Condition = components['schemas']['Condition'];
 export type Curve = components['schemas']['Curve'];
 export type DataInfo = components['schemas']['DataInfo'];
 export type DeletedFile = components['schemas']['DeletedFile'];
 export type DeletedId = components['schemas']['DeletedId'];
 export type Diagnosis = components['schemas']['Diagnosis'];
 export type DiagnosisCause = components['schemas']['DiagnosisCause'];
-export type DiagnosisEvidence = components['schemas']['DiagnosisEvidence'];
 export type DiagnosisJob = components['schemas']['DiagnosisJob'];
-export type DiagnosisRecovery = components['schemas']['DiagnosisRecovery'];
 export type DiagnosticInfo = components['schemas']['DiagnosticInfo'];
 export type DiagnosticOption = components['schemas']['DiagnosticOption'];
 export type DiagnosticResult = components['schemas']['DiagnosticResult'];
@@ -2167,13 +2254,14 @@ export type EpisodeResult = components['schemas']['EpisodeResult'];
 export type EpisodeResults = components['schemas']['EpisodeResults'];
 export type EpisodeSummary = components['schemas']['EpisodeSummary'];
 export type Error = components['schemas']['Error'];
+export type ErrorSlice = components['schemas']['ErrorSlice'];
+export type Evidence = components['schemas']['Evidence'];
 export type Example = components['schemas']['Example'];
 export type ExperimentRow = components['schemas']['ExperimentRow'];
 export type Experiments = components['schemas']['Experiments'];
 export type Failure = components['schemas']['Failure'];
 export type FailureEvent = components['schemas']['FailureEvent'];
 export type FailureScore = components['schemas']['FailureScore'];
-export type FailureSlice = components['schemas']['FailureSlice'];
 export type FailureSlices = components['schemas']['FailureSlices'];
 export type Failures = components['schemas']['Failures'];
 export type FaultInfo = components['schemas']['FaultInfo'];
@@ -2194,6 +2282,7 @@ export type HealthyRecord = components['schemas']['HealthyRecord'];
 export type Job = components['schemas']['Job'];
 export type JobReply = components['schemas']['JobReply'];
 export type JobWithLog = components['schemas']['JobWithLog'];
+export type LargestError = components['schemas']['LargestError'];
 export type Line = components['schemas']['Line'];
 export type Lineage = components['schemas']['Lineage'];
 export type LineageMember = components['schemas']['LineageMember'];
@@ -2215,6 +2304,7 @@ export type Progress = components['schemas']['Progress'];
 export type RecordingEntry = components['schemas']['RecordingEntry'];
 export type RecordingList = components['schemas']['RecordingList'];
 export type RecordingRequest = components['schemas']['RecordingRequest'];
+export type Recovery = components['schemas']['Recovery'];
 export type RegressionEvent = components['schemas']['RegressionEvent'];
 export type RepairedInterval = components['schemas']['RepairedInterval'];
 export type ReportEntry = components['schemas']['ReportEntry'];
@@ -2223,15 +2313,14 @@ export type ReportRequest = components['schemas']['ReportRequest'];
 export type ResultViews = components['schemas']['ResultViews'];
 export type Row = components['schemas']['Row'];
 export type RunNames = components['schemas']['RunNames'];
-export type SliceChangeInfo = components['schemas']['SliceChangeInfo'];
-export type SliceCondition = components['schemas']['SliceCondition'];
+export type SliceChange = components['schemas']['SliceChange'];
 export type SliceInfo = components['schemas']['SliceInfo'];
 export type SmallestRepair = components['schemas']['SmallestRepair'];
 export type StudyFilter = components['schemas']['StudyFilter'];
 export type StudyInfo = components['schemas']['StudyInfo'];
 export type StudyList = components['schemas']['StudyList'];
 export type StudyTask = components['schemas']['StudyTask'];
-export type SuccessInfo = components['schemas']['SuccessInfo'];
+export type Success = components['schemas']['Success'];
 export type SweepInfo = components['schemas']['SweepInfo'];
 export type SweepList = components['schemas']['SweepList'];
 export type Table = components['schemas']['Table'];
@@ -2239,7 +2328,7 @@ export type TaskInfo = components['schemas']['TaskInfo'];
 export type TraceDiagnosticInfo = components['schemas']['TraceDiagnosticInfo'];
 export type TraceHeader = components['schemas']['TraceHeader'];
 export type TrainedSeed = components['schemas']['TrainedSeed'];
-export type ValidationInfo = components['schemas']['ValidationInfo'];
+export type Validation = components['schemas']['Validation'];
 export type ViewAddresses = components['schemas']['ViewAddresses'];
 export type ViewRequest = components['schemas']['ViewRequest'];
 export type Weakness = components['schemas']['Weakness'];

@@ -175,7 +175,8 @@ def test_sensors_without_statistics_are_named() -> None:
     *sensors_, statistic = result.to_json()["unmeasured"]
     assert sensors_ == [name.replace("_", " ") for name in checkpoint().task.observations if name != "force"]
     assert statistic == "level of force (x) in free motion"
-    assert result.unmeasured[-1] == statistic and result.tables()[-1].rows[-1] == (statistic,)
+    assert result.unmeasured[-1] == statistic
+    assert result.tables()[-1].rows[-1] == (statistic,)
     assert not result.to_json()["outdated"]
     newer = [{**row, "opposed/control x/all": 1.0} for row in rows]
     document = healthy(compared(inputs, runs(), newer, sensed, record, 0.05)).to_json()
