@@ -104,7 +104,11 @@ class ErrorSources(RunDiagnostic):
         main = self.task.main_error
         chart = f"Parts of the {main.name} error along its direction"
         values = main.factor * self.parts
-        curves = [Curve(_title(name), values[:, s], chart, main.unit, name) for s, name in enumerate(self.sources)]
+        layers = ["" if name == START else name for name in self.sources]
+        curves = [
+            Curve(_title(name), values[:, s], chart, main.unit, layer)
+            for s, (name, layer) in enumerate(zip(self.sources, layers, strict=True))
+        ]
         return [Curve("error", values.sum(1), chart, main.unit, "fused"), *curves] if len(self.parts) else []
 
 

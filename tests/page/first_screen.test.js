@@ -3,6 +3,7 @@ import { test } from 'node:test';
 
 import './browser.js';
 import { divergence, finding, largest, outageFinding } from '../../app/page/step/finding.js';
+import { largestError } from '../../app/page/tabs/diagnosis_cause.js';
 import { STEPS as TOUR, placeBeside } from '../../app/page/widgets/tour.js';
 
 const STEPS = 20;
@@ -184,6 +185,25 @@ test('a fault comes first, then the outage, then the largest error', () => {
     'Healthy: all is normal.',
     'the record, which the diagnosis describes',
   );
+});
+
+test('the largest error of several episodes is an evidence with its sources', () => {
+  const error = {
+    episode: 165,
+    step: 8,
+    size: 'position error 2.53 cm',
+    sources: '',
+    overconfident: true,
+  };
+  const [{ text, episode, step }] = largestError({ episodes: 10, largest_error: error });
+  assert.deepEqual([text, episode, step], ['largest position error 2.53 cm', 165, 8]);
+  const withSources = { ...error, sources: 'image 2.56 cm' };
+  assert.match(
+    largestError({ episodes: 2, largest_error: withSources })[0].text,
+    / \(image 2\.56 cm\)$/,
+  );
+  assert.deepEqual(largestError({ episodes: 1, largest_error: error }), [], 'the headline has it');
+  assert.deepEqual(largestError({ episodes: 10 }), []);
 });
 
 test('an error that grows to the end is a divergence, shown where it begins', () => {

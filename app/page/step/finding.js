@@ -51,7 +51,12 @@ export function finding(trace, component, diagnosis) {
   const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
   const failed = worst.tone === 'bad' ? worst.step : null;
   const outage = fault ? null : outageFinding(trace, component, failed);
-  if (outage) return { ...outage, tone: diagnosis ? healthy : 'none' };
+  if (outage) {
+    const { headline, step } = worst;
+    const elsewhere = cause && step !== outage.step ? `${headline} ${cause}` : '';
+    const evidence = `${outage.evidence} ${elsewhere}`.trim();
+    return { ...outage, evidence, tone: diagnosis ? healthy : 'none' };
+  }
   if (trace.header.failure) return failureFinding(trace.header.failure);
   const defect = trace.header.defects?.[0];
   if (defect) return { ...worst, tone: 'bad', headline: sentence(defect), evidence: summary };

@@ -15,7 +15,7 @@ import { affectedComponent, largest } from '../step/finding.js';
 import { readingCharts } from '../timeline/reading_charts.js';
 import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { choice } from '../widgets/pickers.js';
-import { causeItem, evidenceItem, isTrainable, withCode } from './diagnosis_cause.js';
+import { causeItem, evidenceItem, isTrainable, largestError, withCode } from './diagnosis_cause.js';
 import { Repair } from './repair.js';
 
 /** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
@@ -249,7 +249,9 @@ export class Diagnosis {
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
-    const items = deviations.map((item) => evidenceItem(item, alone, open(), charts));
+    const items = [...largestError(result), ...deviations].map((item) =>
+      evidenceItem(item, alone, open(), charts),
+    );
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';
     html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;
@@ -366,8 +368,9 @@ export class Diagnosis {
  * The state of a finished diagnosis for its colour.
  * @param {Result} result
  */
-function findingOf({ state, masked, miscalibrated }) {
-  if (state === 'healthy') return miscalibrated ? 'miscalibrated' : state;
+function findingOf({ state, masked, miscalibrated, episodes, largest_error }) {
+  const overconfident = episodes === 1 && largest_error?.overconfident;
+  if (state === 'healthy') return miscalibrated || overconfident ? 'miscalibrated' : state;
   return masked ? 'masked' : state;
 }
 

@@ -1,7 +1,7 @@
 /** A cause in the Diagnosis tab: its probability, evidence, the effect of undoing it and the next action. */
 
 /** @import { ReadingCharts } from '../timeline/reading_charts.js' */
-/** @import { DiagnosisCause, Evidence } from '../types/server.js' */
+/** @import { Diagnosis, DiagnosisCause, Evidence } from '../types/server.js' */
 
 import { create, createButton } from '../core/dom.js';
 import {
@@ -54,7 +54,18 @@ export function causeItem(cause, alone, open, charts, actions) {
 }
 
 /**
- * @param {Evidence} evidence
+ * The largest error of several episodes as an evidence; the headline has that of one.
+ * @param {Pick<Diagnosis, 'episodes' | 'largest_error'> | null | undefined} result
+ */
+export function largestError(result) {
+  if (!result?.largest_error || result.episodes === 1) return [];
+  const { episode, step, size, sources } = result.largest_error;
+  const text = `largest ${size}${sources && ` (${sources})`}`;
+  return [{ text, episode, step, time: null, sensor: '' }];
+}
+
+/**
+ * @param {Pick<Evidence, 'text' | 'episode' | 'step' | 'time' | 'sensor'>} evidence
  * @param {boolean} alone whether the displayed episode is the only one
  * @param {OpenStep} open
  * @param {ReadingCharts} charts
