@@ -218,7 +218,8 @@ def test_inspect_reports_applicable_diagnostics_and_reasons(run: Run, folder: Pa
     }
     assert [trace["episode"] for trace in document["traces"]] == [9, 19]
     for name, result in document["diagnostics"].items():
-        single = json.loads(run(f"inspect 9.trace 19.trace --only {name} --json -")[1])["diagnostics"]
+        command = f"inspect 9.trace 19.trace --filter ekf.safetensors --only {name} --json -"
+        single = json.loads(run(command)[1])["diagnostics"]
         assert single == {name: result}
     assert (
         "Likelihood maps: slow diagnostic; include it with --all" in run("inspect 9.trace --filter ekf.safetensors")[1]

@@ -23,7 +23,7 @@ from beliefscope.filters.engine import Progress, one_thread
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import rollout
 from beliefscope.inspect.diagnostics.base import Entry, RunDiagnostic, drawn_steps, fields_of
-from beliefscope.inspect.diagnostics.views import Array, Curve, Table
+from beliefscope.inspect.diagnostics.views import Array, Curve, Line, Plot, Table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import part_of
@@ -104,12 +104,24 @@ class ErrorSources(RunDiagnostic):
         main = self.task.main_error
         chart = f"Parts of the {main.name} error along its direction"
         values = main.factor * self.parts
-        layers = ["" if name == START else name for name in self.sources]
         curves = [
-            Curve(_title(name), values[:, s], chart, main.unit, layer)
-            for s, (name, layer) in enumerate(zip(self.sources, layers, strict=True))
+            Curve(_title(name), values[:, s], chart, main.unit, _layer(name)) for s, name in enumerate(self.sources)
         ]
         return [Curve("error", values.sum(1), chart, main.unit, "fused"), *curves] if len(self.parts) else []
+
+    def plots(self) -> list[Plot]:
+        phases, at = [entry.phase for entry in self.phases], np.arange(len(self.phases), dtype=np.float64)
+        lines = tuple(
+            Line(_title(name), at, np.array([100.0 * entry.shares[s] for entry in self.phases]), _layer(name))
+            for s, name in enumerate(self.sources)
+        )
+        title = f"Sources of the {self.task.main_error.name} error"
+        return [Plot(title, "", "% of the mean squared error", lines, "bars", names=tuple(phases))]
+
+
+def _layer(source: str) -> str:
+    """Layer that determines the colour of a source."""
+    return "" if source == START else source
 
 
 def _title(source: str) -> str:

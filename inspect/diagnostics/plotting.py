@@ -252,7 +252,9 @@ def draw_plot(axes: Axes, plot: Plot) -> None:
     axes.set_title(plot.title, loc="left")
     axes.set_xlabel(plot.x_label)
     axes.set_ylabel(plot.y_label)
-    if any(line.name for line in plot.lines):
+    if any(line.name for line in plot.lines) and plot.kind == "bars":  # beside them, as bars have no free corner
+        axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    elif any(line.name for line in plot.lines):
         points = sum(len(line.x) for line in plot.lines)
         axes.legend(frameon=False, loc="upper right" if points > MAX_LEGEND_POINTS else "best")
 

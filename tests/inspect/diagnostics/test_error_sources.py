@@ -56,6 +56,8 @@ def test_parts_add_up_to_the_error(task: str, name: str) -> None:
     assert (START in result.sources) == (task == "push-field")  # which starts beside the true state
     assert result.sources[-1] == DYNAMICS
     assert len(result.curves()) == 1 + len(result.sources)
+    (plot,) = result.plots()
+    assert plot.names == tuple(entry.phase for entry in result.phases)
 
 
 def test_a_wrong_start_is_a_source_until_the_sensors_correct_it() -> None:
