@@ -74,9 +74,10 @@ export class Diagnosis {
         this.#healthyFilter = select.value;
         this.load();
       });
-    html('.gain button', host).addEventListener('click', () =>
-      store.set({ tab: 'diagnostics', diagnostic: 'efficiency', options: '' }),
-    );
+    html('.gain', host).addEventListener('click', ({ target }) => {
+      const { diagnostic } = /** @type {HTMLElement} */ (target).dataset;
+      if (diagnostic) store.set({ tab: 'diagnostics', diagnostic, options: '' });
+    });
   }
 
   /** Whether the panel is visible. The diagnosis of the displayed episode is also requested before, for the finding. */
