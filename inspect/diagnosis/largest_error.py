@@ -18,6 +18,10 @@ CONSISTENT = 2.0
 """Largest deviation of one component in standard deviations that is consistent."""
 
 
+MAX_STEPS = 1000
+"""Largest number of steps of a run whose sources are computed with every diagnosis."""
+
+
 @dataclass(frozen=True)
 class LargestError:
     """The largest main error of several runs.
@@ -55,9 +59,9 @@ def largest_error(checkpoint: Checkpoint, traces: Sequence[Trace]) -> LargestErr
     components = trace.task.components
     sigmas, component = _largest_deviation(trace, step)
     if math.isfinite(sigmas):
-        text += f", {sigmas:.1f} standard deviations of {components[component].label}"
+        text += f", {sigmas:.1f} standard deviations in {components[component].label}"
     sources = ""
-    if error_sources.ENTRY.refusal(trace, checkpoint) is None:
+    if len(trace) <= MAX_STEPS and error_sources.ENTRY.refusal(trace, checkpoint) is None:
         parts = error_sources.along_error(checkpoint, trace)[step]
         sources = error_sources.parts_text(trace.task, error_sources.names_of(trace), parts)
     limit = 2.0 * math.sqrt(CONSISTENT**2 + 2.0 * math.log(len(components)))  # the largest of several deviations

@@ -35,6 +35,10 @@ MIN_SHARE = 0.1
 """Share of an error, positive or negative, from which a source is named."""
 
 
+MAX_STEPS = 5000
+"""Largest number of steps of a run: a step takes about 2 ms."""
+
+
 @dataclass(frozen=True)
 class PhaseSources:
     """Mean parts of the squared error of the main error in one phase.
@@ -83,7 +87,8 @@ class ErrorSources(RunDiagnostic):
             + ", ".join(f"{title} {percent(share)}" for title, share in named_parts(self.sources, phase.shares))
             for phase in self.phases
         ]
-        return " ".join([*sentences, f"Shares of the mean squared error: {'; '.join(shares)}."])
+        sentences += [f"Shares of the mean squared error: {'; '.join(shares)}."] if shares else []
+        return " ".join(sentences)
 
     def tables(self) -> list[Table]:
         main = self.task.main_error
@@ -213,7 +218,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
         return f"filter {trace.filter} has no virtual observations, whose errors could be removed"
     if not np.isfinite(trace.episode.states).all():
         return "the true state is unknown at some steps"
-    return None
+    return f"the run has {len(trace)} steps; at most {MAX_STEPS} are repeated" if len(trace) > MAX_STEPS else None
 
 
 ENTRY = Entry(

@@ -85,3 +85,9 @@ def test_filters_without_virtual_observations_have_a_reason() -> None:
     assert found is not None
     assert not found.sources
     assert "standard deviations" in found.size
+
+
+def test_long_runs_are_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint, run = traced("push", "crossmodal-ekf", 9)
+    monkeypatch.setattr("beliefscope.inspect.diagnostics.error_sources.MAX_STEPS", 59)
+    assert "60 steps; at most 59" in str(DIAGNOSTICS["sources"].refusal(run, checkpoint))
