@@ -49,6 +49,7 @@ class Consistency(RunDiagnostic):
         levels: (P,) levels of the calibration curves.
         nees, nis: (T, L), (T, K) NEES / n and NIS / n by step of a single trace; (0, L), (0, K) for several.
         healthy: comparison with the filter's healthy record, if it has one.
+        updates_note: of the verdict on single-modality updates.
         indefinite: number of counted steps of all traces whose fused covariance is not positive definite.
     """
 
@@ -58,6 +59,7 @@ class Consistency(RunDiagnostic):
     nees: Array
     nis: Array
     healthy: Comparison | None = None
+    updates_note: str = measures.UPDATES_NOTE
     indefinite: int = 0
 
     def entry(self, layer: str, phase: str = ALL) -> LayerConsistency:
@@ -118,8 +120,8 @@ class Consistency(RunDiagnostic):
         where = "all steps" if worst.phase == ALL else worst.phase
         return (
             f"Least consistent single-modality update: {display_name(worst.layer)} in {where}, {worst.assessment} "
-            f"(NEES/n {number(worst.nees)}). {measures.UPDATES_NOTE}"
-        )
+            f"(NEES/n {number(worst.nees)}). {self.updates_note}"
+        ).strip()
 
     def _innovation_sentence(self) -> str:
         colored = [test for test in self.whiteness if not test.white]
@@ -235,6 +237,7 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
         nees=pooled["nees"][:keep],
         nis=pooled["nis"][:keep, : len(first.modalities) if has_nis else 0],
         healthy=healthy,
+        updates_note=measures.updates_note(first),
         indefinite=sum(
             int(_is_indefinite(trace.estimate_covariance[measures.counted(trace)].astype(float)).sum())
             for trace in traces

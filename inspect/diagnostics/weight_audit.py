@@ -90,6 +90,7 @@ class WeightAudit(RunDiagnostic):
         excess: relative excess of the position error over that with the best constant weights by phase, and its 95 %
             interval over episodes; NaN for too few of them.
         healthy: comparison with the filter's healthy record, if it has one.
+        updates_note: of the verdict on single-modality updates.
     """
 
     modalities: tuple[str, ...]
@@ -101,6 +102,7 @@ class WeightAudit(RunDiagnostic):
     regret: Array
     excess: tuple[float, float, float]
     healthy: Comparison | None = None
+    updates_note: str = measures.UPDATES_NOTE
 
     @property
     def alarms(self) -> tuple[str, ...]:
@@ -148,7 +150,7 @@ class WeightAudit(RunDiagnostic):
             f"{' (mean over components)' if len(self._columns) > 1 else ''}; oracle: {mean_weights('oracle')}.",
             f"{main.title} RMSE {main.text(total.fused[0], 3)}, {main.text(unimodal[strongest], 3)} for the "
             f"{measures.layer_label(self.modalities[strongest])}, {main.text(total.hindsight[0], 3)} with the oracle's "
-            f"weights, which no filter can reach. {measures.UPDATES_NOTE}",
+            f"weights, which no filter can reach. {self.updates_note}".strip(),
             self._comparison_with_constant_weights(),
         ]
         source = "beta" if self.beta_is_effective else "effective_weights"
@@ -286,6 +288,7 @@ def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightA
         regret=pooled["regret"][:keep],
         excess=excess_error(traces, step_values),
         healthy=healthy,
+        updates_note=measures.updates_note(traces[0]),
     )
 
 

@@ -28,7 +28,14 @@ def layers(trace: Trace) -> tuple[str, ...]:
 
 
 UPDATES_NOTE = "Updates start from the fused prior; the diagnostic Standalone modalities measures each by itself."
-"""Part of every verdict that compares modalities by their updates."""
+"""Part of every verdict that compares modalities by their updates from a common prior."""
+
+
+def updates_note(trace: Trace) -> str:
+    """``UPDATES_NOTE``; that of a bank without feedback, whose filters have their own priors, is empty."""
+    prior = trace.predicted_mean
+    is_common = prior is None or np.allclose(prior, prior[:, :1], equal_nan=True)
+    return UPDATES_NOTE if is_common or trace.kind == "external" else ""
 
 
 UNKNOWN_TRUTH = "the true state is unknown"

@@ -259,3 +259,11 @@ def test_single_model_filters_are_refused() -> None:
     assert ENTRY.refusal(first, None) == "filter image-ekf has only one measurement model, image"
     for name in REAL:
         assert ENTRY.refusal(plant.real(name), None) is None
+
+
+def test_updates_of_a_bank_without_feedback_have_their_own_priors() -> None:
+    run = erring(0.01, 0.02, 0.5)
+    common = np.zeros((len(run), 2, len(run.task.components)), np.float32)
+    for prior, is_common in ((common, True), (common + 0.01 * np.arange(2)[:, None], False), (None, True)):
+        verdict = audit([replace(run, predicted_mean=prior, kind="ekf")]).verdict
+        assert (UPDATES_NOTE in verdict) == is_common
