@@ -64,13 +64,18 @@ def test_missing_outputs_are_explained(open_page: Any, start_server: Any, tmp_pa
     page.screenshot("external-filter-weights")
 
 
+def serve_boats(start_server: Any, folder: Path, name: str, steps: int = 1000) -> str:
+    """Address of a server with a filter of boats, by its name, and at most this many steps of three episodes."""
+    (folder / "boats.py").write_text(BOATS)
+    write_dataset(folder / "boats.h5", task(4), [sail(seed).part(0, steps) for seed in range(3)])
+    options = ["--task", f"{folder}/boats.py:TASK", "--data", str(folder / "boats.h5")]
+    return str(start_server(*options, "--filter", f"{folder}/boats.py:{name}").url)
+
+
 def test_reported_innovations_are_charts_and_rows_of_the_step(
     open_page: Any, start_server: Any, tmp_path: Path
 ) -> None:
-    (tmp_path / "boats.py").write_text(BOATS)
-    write_dataset(tmp_path / "boats.h5", task(4), [sail(seed) for seed in range(3)])
-    options = ["--task", f"{tmp_path}/boats.py:TASK", "--data", str(tmp_path / "boats.h5")]
-    url = start_server(*options, "--filter", f"{tmp_path}/boats.py:right").url
+    url = serve_boats(start_server, tmp_path, "right")
     page = open_page("?episode=0&step=40&track=innovation&charts=track,readings/radar", url=url)
     names = ["radar x", "radar y", "compass"]
     legends = "() => [...document.querySelectorAll('#tracks .track')].map((t) => [...t.querySelectorAll('dt')]"
@@ -96,10 +101,7 @@ def test_reported_innovations_are_charts_and_rows_of_the_step(
 def test_wrong_equations_are_the_finding_of_a_filter_without_a_record(
     open_page: Any, start_server: Any, tmp_path: Path
 ) -> None:
-    (tmp_path / "boats.py").write_text(BOATS)
-    write_dataset(tmp_path / "boats.h5", task(4), [sail(seed) for seed in range(3)])
-    options = ["--task", f"{tmp_path}/boats.py:TASK", "--data", str(tmp_path / "boats.h5")]
-    page = open_page(url=start_server(*options, "--filter", f"{tmp_path}/boats.py:wrong").url)
+    page = open_page(url=serve_boats(start_server, tmp_path, "wrong"))
     finding = page.page.locator("#finding")
     assert finding.locator("strong").text_content().startswith("The Jacobian of radar differs from finite differences")
     finding.get_by_role("button", name="Equations").click()
@@ -112,10 +114,7 @@ def test_wrong_equations_are_the_finding_of_a_filter_without_a_record(
 def test_restarts_of_a_failing_filter_are_marked_in_the_timeline(
     open_page: Any, start_server: Any, tmp_path: Path
 ) -> None:
-    (tmp_path / "boats.py").write_text(BOATS)
-    write_dataset(tmp_path / "boats.h5", task(4), [sail(seed).part(0, 40) for seed in range(3)])
-    options = ["--task", f"{tmp_path}/boats.py:TASK", "--data", str(tmp_path / "boats.h5")]
-    page = open_page(url=start_server(*options, "--filter", f"{tmp_path}/boats.py:failing").url)
+    page = open_page(url=serve_boats(start_server, tmp_path, "failing", steps=40))
     marks = page.page.locator("#marks button")
     assert marks.count() == 2
     label = "Step 15 (1.50 s): the filter is restarted at the true state"
