@@ -15,6 +15,7 @@ from beliefscope.app.protocol import map_format, messages
 from beliefscope.app.runs.result_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
+from beliefscope.inspect.diagnosis.largest_error import MAX_SIGMAS
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
 from beliefscope.inspect.maps.map_engine import COARSE, FINE
 
@@ -40,6 +41,7 @@ def constants() -> dict[str, tuple[str, object]]:
         "CELL_STEPS": ("Largest value of a map's cell.", map_format.LEVELS),
         "SHOWN": ("Smallest probability of a cause of a fault that is listed.", SHOWN),
         "LARGEST": ("Largest probability that is displayed as a number.", LARGEST),
+        "MAX_SIGMAS": ("Largest consistent deviation of one component, in standard deviations.", MAX_SIGMAS),
         "HASH_DIGITS": ("Digits of its hash at the end of the name of a checkpoint of a sweep.", HASH_DIGITS),
         "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning run.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),

@@ -14,7 +14,7 @@ from beliefscope.inspect.diagnostics import error_sources
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 
-CONSISTENT = 2.0
+MAX_SIGMAS = 2
 """Largest deviation of one component in standard deviations that is consistent."""
 
 
@@ -64,7 +64,7 @@ def largest_error(checkpoint: Checkpoint, traces: Sequence[Trace]) -> LargestErr
     if len(trace) <= MAX_STEPS and error_sources.ENTRY.refusal(trace, checkpoint) is None:
         parts = error_sources.along_error(checkpoint, trace)[step]
         sources = error_sources.parts_text(trace.task, error_sources.names_of(trace), parts)
-    limit = 2.0 * math.sqrt(CONSISTENT**2 + 2.0 * math.log(len(components)))  # the largest of several deviations
+    limit = 2.0 * math.sqrt(MAX_SIGMAS**2 + 2.0 * math.log(len(components)))  # the largest of several deviations
     return LargestError(trace.episode_index, step, text, sources, limit < sigmas < math.inf)
 
 

@@ -20,6 +20,9 @@ export const SHOWN = /** @type {const} */ (0.05);
 /** Largest probability that is displayed as a number. */
 export const LARGEST = /** @type {const} */ (0.99);
 
+/** Largest consistent deviation of one component, in standard deviations. */
+export const MAX_SIGMAS = /** @type {const} */ (2);
+
 /** Digits of its hash at the end of the name of a checkpoint of a sweep. */
 export const HASH_DIGITS = /** @type {const} */ (8);
 

@@ -2,10 +2,10 @@
 
 /** @import { Trace } from '../data/trace.js' */
 
+import { MAX_SIGMAS } from '../core/constants.js';
 import { displayName, fixed, percent, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 
-const MAX_SIGMAS = 2; // an error of one component up to this many standard deviations is consistent
 const DOMINANT_SHARE = 0.6; // effective weight from which a modality is dominant
 const FEW_PARTICLES = 0.05; // share of the particles
 /** Another estimate counts as more accurate if its error is lower by this many units for display, and by this factor. */
