@@ -179,8 +179,8 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
 
 
 def _known_steps(trace: Trace) -> Mask:
-    """(T,): counted steps with a known true state."""
-    return measures.counted(trace) & np.isfinite(trace.episode.states).all(1)
+    """(T,): counted steps with a known main error."""
+    return measures.counted(trace) & np.isfinite(trace.episode.states[:, list(trace.task.main_error.indices)]).all(1)
 
 
 def errors_of(traces: Sequence[Trace]) -> Errors:

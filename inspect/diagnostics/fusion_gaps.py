@@ -91,7 +91,7 @@ def _sensor_errors(trace: Trace) -> tuple[Array, Array, measures.Mask]:
     error = trace.task.difference(trace.observation_mean, trace.episode.states[:, None])
     keep = measures.counted(trace)
     precision = np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
-    return error[keep], precision, ~measures.without_reading(trace)[keep]
+    return error[keep], precision, ~measures.absent_modalities(trace)[keep]
 
 
 def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:

@@ -27,7 +27,7 @@ from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, Likelihoo
 from beliefscope.inspect.maps.map_statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.maps.plane import OTHERS, Others, Plane, describe_others, other_components, plane_of
-from beliefscope.inspect.statistics.measures import without_reading, wrap_angles
+from beliefscope.inspect.statistics.measures import absent_modalities, wrap_angles
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.data import check_origin, check_step
 
@@ -123,7 +123,7 @@ class MapEngine:
         self._calls_models = has_likelihood(checkpoint)
         self._planes: dict[tuple[str, ...], Plane] = {}
         self._anchors = trace.anchors
-        self._present = ~without_reading(trace)  # (T, K)
+        self._present = ~absent_modalities(trace)  # (T, K)
         missing = missing_quantities(checkpoint, trace)
         self.quantities = tuple(quantity for quantity in QUANTITIES if quantity not in missing)
 

@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import correlation_interval
-from beliefscope.inspect.statistics.measures import Array, counted, without_reading
+from beliefscope.inspect.statistics.measures import Array, absent_modalities, counted
 from beliefscope.inspect.traces.data import Trace
 
 AnyArray = NDArray[np.floating[Any]]
@@ -85,7 +85,7 @@ def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
         return None
     z, predicted, r, p = (np.asarray(part, dtype=np.float64) for part in parts)
     innovation = trace.task.difference(z, predicted)
-    return np.where(without_reading(trace)[..., None], np.nan, innovation), p + r
+    return np.where(absent_modalities(trace)[..., None], np.nan, innovation), p + r
 
 
 @dataclass(frozen=True)

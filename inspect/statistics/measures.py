@@ -210,7 +210,7 @@ def absent(trace: Trace, modality: str) -> Mask:
     return ~np.logical_or.reduce(present) if present else np.zeros(len(trace), dtype=bool)
 
 
-def without_reading(trace: Trace) -> Mask:
+def absent_modalities(trace: Trace) -> Mask:
     """(T, K): ``absent`` for each modality of the trace."""
     steps = [absent(trace, modality) for modality in trace.modalities]
     return np.stack(steps, axis=-1) if steps else np.zeros((len(trace), 0), dtype=bool)

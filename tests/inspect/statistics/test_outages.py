@@ -136,3 +136,14 @@ def test_groups_of_a_slow_sensor_are_its_outages() -> None:
     phases = [Survey.from_episodes([EpisodeScores.from_trace(trace_)]).phases for trace_ in (run, steady)]
     assert {"fix", "no fix"} <= set(phases[0])
     assert "fix" not in phases[1], "it would be the phase of all other steps"
+
+
+def test_steps_count_where_the_main_error_is_known() -> None:
+    run = point_estimate({(100, 150): 2.0})
+    states = run.episode.states.copy()
+    states[:, 2:] = np.nan  # components that no map has
+    partly = replace(run, episode=replace(run.episode, states=states))
+    (expected, *_), (group, *_) = (DIAGNOSTICS["errors"]([each]).groups for each in (run, partly))
+    assert (group.steps, group.position) == (expected.steps, expected.position)
+    unknown = replace(run, episode=replace(run.episode, states=np.full_like(states, np.nan)))
+    assert DIAGNOSTICS["errors"].refusal(unknown, None) == measures.UNKNOWN_TRUTH
