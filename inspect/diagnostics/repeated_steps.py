@@ -65,7 +65,7 @@ def repeat_steps(trace: Trace, checkpoint: ExternalFilter, at_truth: bool = Fals
         at_truth: from beliefs with the true states as means, where functions are as curved as in other episodes,
             although the filter may have lost the state.
     """
-    steps = _steps(trace)
+    steps = _steps(trace, with_narrowest=not at_truth)
     if not len(steps):
         return None
     for calls in (1, 2):
@@ -80,8 +80,11 @@ def repeat_steps(trace: Trace, checkpoint: ExternalFilter, at_truth: bool = Fals
     return None
 
 
-def _steps(trace: Trace) -> NDArray[np.intp]:
-    """Steps to repeat: of each modality as many with its measurement, mostly early ones: the filter may diverge."""
+def _steps(trace: Trace, with_narrowest: bool) -> NDArray[np.intp]:
+    """Steps to repeat: of each modality as many with its measurement, mostly early ones: the filter may diverge.
+
+    with_narrowest: also those with the narrowest predictions, where functions are nearly linear within the belief.
+    """
     beliefs = 2 + 3 * len(trace.task.components)
     count = int(np.clip(COST * len(trace) / beliefs, 1, MOST))
     used = np.ones((len(trace), 1), bool)
@@ -90,6 +93,11 @@ def _steps(trace: Trace) -> NDArray[np.intp]:
     chosen = [at for column in used.T if len(at := np.flatnonzero(column[1:]) + 1)]
     early = 2 ** np.arange(-(-count // max(1, len(chosen)))) - 1  # 0, 1, 3, ...
     rows = [at[early[early < len(at)]] for at in chosen]
+    if with_narrowest:
+        _, covariance = _beliefs(trace, np.arange(len(trace)), False)
+        width = np.linalg.slogdet(covariance)[1]
+        width = np.where(np.isfinite(width), width, np.inf)
+        rows += [at[[width[at].argmin()]] for at in chosen]
     return np.unique(np.concatenate(rows)) if rows else np.empty(0, dtype=np.intp)
 
 
