@@ -42,6 +42,7 @@ def test_list_has_verdicts_and_reasons(open_page: Any) -> None:
     assert row(page, "Particle health").get_attribute("data-state") == "refused"
     assert row(page, "Particle health").locator(".verdict").text_content() == "Filter crossmodal-ekf has no particles."
     assert "NEES/n" in row(page, "Consistency").locator(".verdict").text_content()
+    page.until("() => document.querySelector('#step-summary').textContent.includes('By source: ')")
     overflow = page.page.evaluate(
         "() => [...document.querySelectorAll('#diagnostics, #diagnostics .top, #diagnostics .list, .bar')]"
         ".map((e) => e.scrollWidth - e.clientWidth)"

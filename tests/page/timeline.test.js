@@ -2,6 +2,7 @@ import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { cssVariable } from '../../app/page/core/colours.js';
+import { errorSourcesText } from '../../app/page/step/error_sources.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
 import { shadeIntervals } from '../../app/page/timeline/chart.js';
 import { chartData, valueRange } from '../../app/page/timeline/chart_data.js';
@@ -225,6 +226,32 @@ test('the summary of a step names error, deviation and dominant modality', () =>
   const close = { shape: [2, 3], values: [0, 0, 0, 0, 0, 0] };
   const small = stepSummary(makeTrace({ ...FUSION, truth, estimate_mean: close }), 0, 0);
   assert.match(small.text, /^Fused estimate: error 0\.01 cm/, 'not 0.0 cm');
+});
+
+test('the summary of a step names the sources of most of its error, the largest first', () => {
+  /** @type {[string, number[]][]} */
+  const values = [
+    ['error', [5, 0]],
+    ['image', [1.5, 0.3]],
+    ['first belief', [0.4, 0]],
+    ['haptics', [4, -0.3]],
+    ['dynamics', [-0.9, 0]],
+  ];
+  const curves = values.map(([name, parts]) => ({
+    name,
+    values: parts,
+    chart: '',
+    unit: 'cm',
+    layer: '',
+    bounds: null,
+  }));
+  const text = 'By source: haptics 4.00 cm, image 1.50 cm, dynamics -0.90 cm.';
+  assert.equal(errorSourcesText(curves, 0).replace('\u2212', '-'), text);
+  assert.match(
+    stepSummary(trace, 0, 0, text).text,
+    /larger than predicted\. By source: .* Dominated/,
+  );
+  assert.equal(errorSourcesText([], 0), '');
 });
 
 test('the largest deviation of many components may be larger than that of few', () => {

@@ -1,8 +1,10 @@
 /** Parts of the page that several panels share: loading states, properties of the trace and the current step. */
 
 /** @import { Trace } from '../data/trace.js' */
+/** @import { Curve } from '../types/server.js' */
 
 import { ServerError } from '../data/api.js';
+import { errorSourcesText } from '../step/error_sources.js';
 import { stepSummary } from '../step/step_summary.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { element, html, messageOf } from './dom.js';
@@ -118,10 +120,11 @@ export function showCount(trace, step) {
  * @param {Trace} trace
  * @param {number} step
  * @param {string} component
+ * @param {Curve[]} sources of the error
  */
-export function showSummary(trace, step, component) {
+export function showSummary(trace, step, component, sources) {
   const index = trace.components.findIndex(({ name }) => name === component);
-  const { tone, text } = stepSummary(trace, step, index);
+  const { tone, text } = stepSummary(trace, step, index, errorSourcesText(sources, step));
   const line = html('#step-summary');
   line.dataset.tone = tone;
   line.textContent = line.title = text;

@@ -23,6 +23,9 @@ export const LARGEST = /** @type {const} */ (0.99);
 /** Largest consistent deviation of one component, in standard deviations. */
 export const MAX_SIGMAS = /** @type {const} */ (2);
 
+/** Share of an error, positive or negative, from which a source is named. */
+export const MIN_SHARE = /** @type {const} */ (0.1);
+
 /** Digits of its hash at the end of the name of a checkpoint of a sweep. */
 export const HASH_DIGITS = /** @type {const} */ (8);
 

@@ -1,6 +1,7 @@
 /** The displayed run: its trace, which follows the selection in the state, and the panels, which follow both. */
 
 /** @import { Trace } from '../data/trace.js' */
+/** @import { Curve } from '../types/server.js' */
 /** @import { Handlers } from '../data/view_socket.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */
 /** @import { Page } from './page.js' */
@@ -8,6 +9,7 @@
 
 import * as api from '../data/api.js';
 import { mapChoices } from '../maps/map_choices.js';
+import { loadErrorSources } from '../step/error_sources.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
 import {
@@ -37,6 +39,8 @@ export class DisplayedRun {
   /** @type {Trace | null} */
   trace = null;
   failure = ''; // why the last trace could not be loaded
+  /** @type {Curve[]} */
+  #errorSources = [];
 
   /**
    * @param {Page} page
@@ -76,7 +80,7 @@ export class DisplayedRun {
     if (!task) return;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());
-    [this.trace, this.failure] = [null, ''];
+    [this.trace, this.failure, this.#errorSources] = [null, '', []];
     page.clock.show(null);
     page.scene.failure = '';
     page.tabs?.diagnosis.show(null);
@@ -87,6 +91,7 @@ export class DisplayedRun {
       const trace = await api.loadTrace(task, selection, loadingState.progress, loading.signal);
       loadingState.stop();
       this.#show(trace);
+      this.#loadErrorSources(trace, loading.signal);
     } catch (error) {
       loadingState.stop();
       if (loading.signal.aborted) return;
@@ -124,6 +129,25 @@ export class DisplayedRun {
     this.#showComponent(trace);
     this.#move(trace);
     document.documentElement.classList.add('started');
+  }
+
+  /**
+   * Adds the sources of the error to the summary of the step, after what the page displays first.
+   * @param {Trace} trace
+   * @param {AbortSignal} signal
+   */
+  async #loadErrorSources(trace, signal) {
+    await Promise.race([useful, delayed]);
+    const sources = signal.aborted ? [] : await loadErrorSources(trace, signal).catch(() => []);
+    if (signal.aborted) return;
+    this.#errorSources = sources;
+    this.#showSummary(trace);
+  }
+
+  /** @param {Trace} trace */
+  #showSummary(trace) {
+    const { step, component } = this.#store.state;
+    showSummary(trace, step, component, this.#errorSources);
   }
 
   /**
@@ -183,7 +207,7 @@ export class DisplayedRun {
     page.timeline.redraw();
     page.stepTable.show(trace, state.component);
     page.stepTable.move(state.step);
-    showSummary(trace, state.step, state.component);
+    this.#showSummary(trace);
   }
 
   /** @param {Trace} trace */
@@ -198,7 +222,7 @@ export class DisplayedRun {
     page.tabs?.move(step, origin === 'rerun');
     const cursor = { ...trace.selection, step, angle, against, ...mapChoices(state, trace) };
     page.socket.move({ ...cursor, comparison_maps: state.beside === 'gain' }, inputTime);
-    showSummary(trace, step, state.component);
+    this.#showSummary(trace);
     showCount(trace, step);
   }
 

@@ -18,13 +18,14 @@ const MAX_RATIO = 0.8;
  * @param {Trace} trace
  * @param {number} step
  * @param {number} component whose effective weights are compared
+ * @param {string} [sources] of the error, in words
  * @returns {{tone: Tone, text: string}}
  */
-export function stepSummary(trace, step, component) {
+export function stepSummary(trace, step, component, sources = '') {
   const { tone, text } = trace.hasTruth(step)
     ? accuracy(trace, step)
     : { tone: /** @type {Tone} */ ('none'), text: 'True state unknown.' };
-  const sentences = [text];
+  const sentences = [text, sources].filter(Boolean);
   const dominant = dominantModality(trace, step, component);
   if (dominant) {
     const uninformative = uninformativeReason(dominant.name, trace, step);
