@@ -72,12 +72,13 @@ class RecordingsTab:
 
 @pytest.mark.long
 def test_recordings_are_renamed_searched_restored_and_compared(open_page: Callable[..., Any], runs: list[Path]) -> None:
-    tab = RecordingsTab(open_page("?tab=recordings"))
+    mine, other = (path.name for path in runs)
+    tab = RecordingsTab(open_page(f"?tab=recordings&recording={mine}"))
     page = tab.page.page
     tab.add(runs)
-    mine, other = (path.name for path in runs)
     tab.edit(mine, "Rename", "best run")
     tab.wait_for("best run.rrd")
+    assert tab.page.state["recording"] == "best run.rrd"
     assert page.evaluate("() => document.activeElement.textContent") == "best run.rrd", (
         "the focus does not return to the name"
     )

@@ -283,6 +283,11 @@ export class Recordings {
     this.#recordings.edit(file, `New name of ${file.name}`, stem, async (text) => {
       const { name } = await api.renameRecording(file, text);
       this.#selection.rename(file.name, name);
+      const opened = this.#store.state.recording.split('/');
+      if (opened.includes(file.name)) {
+        const recording = opened.map((each) => (each === file.name ? name : each)).join('/');
+        this.#store.set({ recording });
+      }
       this.#highlighted = name;
       await this.load();
     });
