@@ -1,8 +1,7 @@
-"""Results of a study: tables, and bar charts as SVG and PNG."""
+"""Results of a study: tables, and bar charts as SVG, PDF and PNG."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import STAY
 from beliefscope.filters.training.study import Cell, write_tables
 from beliefscope.filters.training.study_table import TRIVIAL, Document, Row
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
+from beliefscope.inspect.diagnostics.plotting import FORMATS, STYLE, WIDTH, write_figure
 from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS
 
 FAMILIES = {
@@ -54,15 +52,12 @@ def write_study(folder: Path, cells: Sequence[Cell], preset: str) -> tuple[list[
 
 
 def write_results(rows: Sequence[Row], folder: Path, tasks: Mapping[str, Task] = TASKS) -> list[Path]:
-    """Write ``results.svg`` and ``results.png`` (300 dpi); see ``results``."""
-    paths = []
+    """Write ``results.svg``, ``results.pdf`` and ``results.png`` (300 dpi); see ``results``."""
     with rc_context(STYLE):
         figure = results(rows, tasks)
-        for suffix, options in (("svg", {"metadata": {"Date": None}}), ("png", {"dpi": 300})):
-            data = io.BytesIO()
-            figure.savefig(data, format=suffix, **options)
-            paths.append(folder / f"results.{suffix}")
-            write_atomically(paths[-1], data.getvalue())
+    paths = [folder / f"results.{suffix}" for suffix in FORMATS]
+    for path in paths:
+        write_figure(figure, path)
     return paths
 
 

@@ -7,21 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import channels_of, reported_innovations, virtual_innovations
+from beliefscope.inspect.statistics.channels import innovation_channels, reading_channels
+from beliefscope.inspect.statistics.innovations import virtual_innovations
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.sensors import camera_images, displayed_sensors
 
 SENSORS = ("effector_position", "force")
 """Observations from which the 3D scene draws the force."""
-
-MAX_CHANNELS = 16
-"""Largest number of channels of a sensor or an innovation that has columns; more, as those of a lidar, are no chart."""
-
-FloatArray = NDArray[np.floating[Any]]
 
 
 def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
@@ -29,7 +25,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
 
     Descriptions of columns (T, d) of channels also have ``channels``: names and units of at most d channels.
     """
-    reported, groups = _reported_innovations(trace), measures.shaded_groups(trace)
+    reported, groups = innovation_channels(trace), measures.shaded_groups(trace)
     innovation = None if reported else virtual_innovations(trace)
     unimodal, faulty = bool(trace.modalities_with_posterior), measures.faulty(trace)
     arrays: dict[str, NDArray[Any] | None] = {
@@ -51,7 +47,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "faulty": faulty if faulty.any() else None,
     }
     arrays |= {f"extra/{name}": values for name, values in trace.extra.items()}
-    of_channels = _readings(trace) | reported
+    of_channels = reading_channels(trace) | reported
     arrays |= {name: values for name, (values, _) in of_channels.items()}
     descriptions: list[dict[str, Any]] = []
     buffers: list[bytes] = []
@@ -65,38 +61,6 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
             buffers.append(np.ascontiguousarray(array, dtype="<f4").tobytes())
             offset += len(buffers[-1])
     return descriptions, b"".join(buffers)
-
-
-def _readings(trace: Trace) -> dict[str, tuple[FloatArray, list[Component]]]:
-    """Column -> readings (T, d) of a vector sensor as the filter received them, or the controls, and their channels.
-
-    NaN at steps without a reading. Scans, which are drawn, and vectors of more than ``MAX_CHANNELS`` have no column.
-    """
-    task, episode = trace.task, trace.episode
-    result = {}
-    for key, values in {**episode.observations, "control": episode.controls}.items():
-        if values.ndim == 2 and 1 <= values.shape[1] <= MAX_CHANNELS and key not in task.scans:
-            present = episode.present(key)[:, None]
-            channels = [task.channel(key, i) for i in range(values.shape[1])]
-            result[f"readings/{key}"] = (np.where(present, values, np.nan).astype(np.float32), channels)
-    return result
-
-
-def _reported_innovations(trace: Trace) -> dict[str, tuple[FloatArray, list[Component]]]:
-    """Column -> innovation of a modality (T, d) in the space of its measurements, or its standard deviation.
-
-    NaN without a measurement; empty if the filter does not report them.
-    """
-    if (pair := reported_innovations(trace)) is None:
-        return {}
-    innovation, deviations = pair[0], measures.deviations(pair[1])
-    result = {}
-    for k, (modality, channels) in enumerate(zip(trace.modalities, channels_of(trace, innovation), strict=True)):
-        if not np.isfinite(innovation[:, k, MAX_CHANNELS:]).any():
-            for name, values in (("innovation", innovation), ("innovation_sigma", deviations)):
-                # The width does not depend on the steps, so that those of blocks of a live run agree.
-                result[f"{name}/{modality}"] = (values[:, k, :MAX_CHANNELS], channels[:MAX_CHANNELS])
-    return result
 
 
 def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLayer]:

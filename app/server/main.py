@@ -26,6 +26,7 @@ from beliefscope.app.api import (
     diagnostics,
     experiments,
     failures,
+    figures,
     finetune,
     jobs as api_jobs,
     lineage,
@@ -121,6 +122,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     diagnosis.add_routes(app, store, jobs)
     diagnostics.add_routes(app, store, jobs)
     comparison.add_routes(app, store)
+    figures.add_routes(app, store, files.writer)
     failures.add_routes(app, store, jobs)
     finetune.add_routes(app, store, jobs)
     recordings.add_routes(app, store, files, jobs)

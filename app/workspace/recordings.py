@@ -56,7 +56,8 @@ class Recording:
 class RecordingFolder:
     """The recordings of one folder. Methods may be called from any thread, and may block.
 
-    writer: writes recordings in one thread, as matplotlib keeps fonts open per thread.
+    writer: writes recordings and figures in one thread, as matplotlib keeps fonts open per thread and has one style for
+        all threads.
     """
 
     def __init__(self, folder: Path) -> None:

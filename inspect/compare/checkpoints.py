@@ -362,10 +362,11 @@ def _module_row(m: ModuleChange) -> dict[str, Value]:
 
 
 def write_comparison(folder: Path, document: Mapping[str, Any], text: str, figure: Figure) -> None:
-    """Write a comparison into a new folder as JSON, figure and Markdown."""
+    """Write a comparison into a new folder as JSON, figure (SVG and PDF) and Markdown."""
     from beliefscope.inspect.diagnostics.plotting import write_figure  # matplotlib is slow to import
 
     folder.mkdir()
-    write_figure(figure, folder / "change.svg")
+    for suffix in ("svg", "pdf"):
+        write_figure(figure, folder / f"change.{suffix}")
     write_atomically(folder / "change.md", f"```\n{text}\n```\n".encode())
     write_atomically(folder / "change.json", (json.dumps(document, indent=2) + "\n").encode())

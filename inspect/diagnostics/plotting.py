@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -31,6 +31,7 @@ STYLE: dict[Any, Any] = {
     "axes.linewidth": 0.6,
     "hatch.linewidth": 0.4,
     "svg.fonttype": "none",  # text stays text
+    "pdf.fonttype": 42,  # embedded TrueType fonts; journals refuse Type 3
     "svg.hashsalt": "beliefscope",  # reproducible files
 }
 
@@ -54,8 +55,8 @@ BANDS = {
 }
 OTHER_BAND = {"facecolor": "#999999", "alpha": 0.25}
 
-LEGEND_ENTRY, LEGEND_ROW = 4.8, 1.5
-"""Width of a legend entry without its text, and height of a row, in font sizes."""
+LEGEND_ROW = 1.5
+"""Height of a row of a legend in font sizes."""
 
 MARGIN = 0.75
 """Inches beside the axes of a chart."""
@@ -88,19 +89,23 @@ class StepAxis:
 
 def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure as SVG, PDF or PNG (300 dpi) depending on the suffix. Raises BadInput for other suffixes."""
-    suffix = figure_format(path)
+    write_atomically(path, encoded_figure(figure, figure_format(path)))
+
+
+def encoded_figure(figure: Figure, format: str) -> bytes:
+    """The file of a figure in one of ``FORMATS``."""
     data = io.BytesIO()
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        figure.savefig(data, format=suffix, **FORMATS[suffix])
-    write_atomically(path, data.getvalue())
+        figure.savefig(data, format=format, **FORMATS[format])
+    return data.getvalue()
 
 
-def figure_format(path: Path) -> str:
-    """``svg``, ``pdf`` or ``png`` depending on the suffix. Raises BadInput for other suffixes."""
+def figure_format(path: Path, formats: Container[str] = FORMATS) -> str:
+    """``svg``, ``pdf`` or ``png`` depending on the suffix. Raises BadInput for a suffix of no format."""
     suffix = path.suffix.removeprefix(".").lower()
-    check_name("figure format", suffix, FORMATS)
+    check_name("figure format", suffix, formats)
     return suffix
 
 
@@ -182,12 +187,17 @@ def draw_chart(
     draw_legend(axes, name)
 
 
-def draw_legend(axes: Axes, title: str = "") -> None:
-    """Draw the title above the axes, and the legend beside it where there is room, else in rows below it."""
+def draw_legend(axes: Axes, title: str = "", width: float = WIDTH) -> None:
+    """Draw the title above the axes, and the legend beside it where there is room, else in rows below it.
+
+    width: of the figure in inches.
+    """
     labels = axes.get_legend_handles_labels()[1]
-    columns, rows = _legend_layout(labels, title)
+    columns, rows = _legend_layout(labels, title, width)
     style: dict[str, Any] = {"frameon": False, "ncols": columns, "borderaxespad": 0.0}
-    if rows == 0:
+    if not labels:
+        axes.set_title(title, loc="left")
+    elif rows == 0:
         axes.set_title(title, loc="left")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), **style)
     else:
@@ -195,17 +205,24 @@ def draw_legend(axes: Axes, title: str = "") -> None:
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.97), **style)
 
 
-def legend_height(labels: Sequence[str], title: str = "") -> float:
-    """Inches that the rows of a legend below its title need."""
-    return _legend_layout(labels, title)[1] * LEGEND_ROW * float(STYLE["font.size"]) / 72.0
+def legend_height(labels: Sequence[str], title: str = "", width: float = WIDTH) -> float:
+    """Inches that the rows of a legend below its title need. width: of the figure in inches."""
+    return _legend_layout(labels, title, width)[1] * LEGEND_ROW * float(STYLE["font.size"]) / 72.0
 
 
-def _legend_layout(labels: Sequence[str], title: str) -> tuple[int, int]:
+def _legend_layout(labels: Sequence[str], title: str, width: float) -> tuple[int, int]:
     """Columns of a legend, and rows between title and axes: 0 beside the title; as many columns as have room."""
+    from matplotlib import rcParams
     from matplotlib.textpath import TextPath
 
-    size, available = float(STYLE["font.size"]), 72.0 * (WIDTH - MARGIN)
-    widths = [size * LEGEND_ENTRY + TextPath((0, 0), text, size=size).get_extents().width for text in labels if text]
+    size, available = float(STYLE["font.size"]), 72.0 * (width - MARGIN)
+    handle, spaces = (
+        rcParams["legend.handlelength"],
+        rcParams["legend.handletextpad"] + rcParams["legend.columnspacing"],
+    )
+    widths = [
+        size * (handle + spaces) + TextPath((0, 0), text, size=size).get_extents().width for text in labels if text
+    ]
     head = TextPath((0, 0), title, size=STYLE["axes.titlesize"]).get_extents().width if title else 0.0
     if head + 2.0 * size + sum(widths) <= available:
         return max(1, len(widths)), 0

@@ -1,15 +1,46 @@
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import write_atomically
+
+
+@dataclass(frozen=True)
+class TimelineOptions:
+    """Options of the figure of a timeline, see ``inspect.figures.timeline.View``."""
+
+    charts: Annotated[
+        list[str] | None,
+        opt.option(
+            "NAME",
+            "Chart of a timeline, from top to bottom: weights, estimate, error, signed, nees, innovation, particles, "
+            "readings/SENSOR, readings/control, innovation/MODALITY or extra/NAME. Repeatable. Default: weights, "
+            "estimate and error.",
+            ...,
+            "--chart",
+        ),
+    ] = None
+    component: Annotated[
+        str, opt.option("NAME", "State component of a timeline's charts. Default: the first one of the map.")
+    ] = ""
+    beta: Annotated[bool, opt.flag("Fusion weights beta in place of effective weights.", "--beta", default=...)] = False
+    window: Annotated[str, opt.option("FIRST-LAST", "Visible steps of a timeline, such as 20-60. Default: all.")] = ""
+    seconds: Annotated[bool, opt.flag("Time in s in place of the step.", "--seconds", default=...)] = False
+    group: Annotated[
+        str, opt.option("NAME", "Group of steps that a timeline shades. Default: the first one, such as contact.")
+    ] = ""
 
 
 def figure(
     *,
-    kind: Literal["maps", "weights"] = opt.argument("maps|weights", "Kind of figure."),
+    kind: Literal["maps", "weights", "timeline"] = opt.argument("maps|weights|timeline", "Kind of figure."),
     run: opt.Run,
-    output: Path = opt.output_file("FIGURE", "Output figure: .svg, .pdf or .png.", default=...),
+    output: Path = opt.output_file(
+        "FIGURE", "Output figure: .svg, .pdf or .png; of a timeline also its values, .csv.", default=...
+    ),
     steps: list[int] | None = opt.option(
         "T",
         "Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle of the "
@@ -19,30 +50,37 @@ def figure(
         parser=opt.integer(0),
     ),
     quantity: opt.Quantity | None = None,
+    view: TimelineOptions,
 ) -> console.Result:
-    """Draw a figure of the paper from a filter run.
+    """Draw a figure for a paper from a filter run.
 
     maps: likelihood or posterior of each modality around the true position, in free motion and in contact. For a task
     without contact, the maps are at one step; for a state with one map component, they are curves.
     weights: estimates of each modality and of the fused filter over time, with the fusion weights below and contact
     shaded.
+    timeline: charts of the page's timeline in the width of one column, 8.5 cm, or their values as CSV.
 
     \b
     Examples:
       beliefscope figure maps door --filter crossmodal-pf -o maps.svg
       beliefscope figure maps door --filter crossmodal-ekf --map posterior -o posterior.svg
       beliefscope figure weights push --filter crossmodal-ekf --episode 9 -o weights.pdf
+      beliefscope figure timeline door --filter crossmodal-ekf --faults blackout=0.4 --window 20-60 -o timeline.pdf
+      beliefscope figure timeline door --filter crossmodal-pf --chart error --chart particles -o timeline.csv
     """
+    from beliefscope.inspect.diagnostics import plotting
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.figures import paper
+    from beliefscope.inspect.figures.timeline import DEFAULT_CHARTS, FORMATS, View, timeline
     from beliefscope.inspect.maps.map_engine import no_maps
     from beliefscope.inspect.maps.plane import is_outside
 
-    figure_format(output)
-    if kind == "weights" and steps:
-        raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")
-    if kind == "weights" and quantity:
-        raise BadInput(f"--map {quantity}: only the figure maps has a quantity")
+    format = figure_format(output, FORMATS if kind == "timeline" else plotting.FORMATS)
+    if kind != "maps":
+        _refuse("maps", {"step": steps, "map": quantity})
+    if kind != "timeline":
+        _refuse("timeline", {"chart": view.charts} | {k: v for k, v in vars(view).items() if k != "charts"})
+    shown = View(**vars(view) | {"charts": tuple(view.charts or DEFAULT_CHARTS)})
     checkpoint, faults = run.open()
     episode, index = run.read_episode(checkpoint.task)
     selection = paper.steps_by_contact(episode, index, steps or ()) if kind == "maps" else {}
@@ -59,6 +97,19 @@ def figure(
                 console.note(f"Warning: at step {step}, the fused estimate is outside of the map")
         write_figure(paper.maps_figure(checkpoint, trace, selection, quantity=quantity), output)
         extra["map_steps"] = {paper.STATES[state] if with_contact else "all": step for state, step in selection.items()}
-    else:
+    elif kind == "weights":
         write_figure(paper.weights_figure(trace), output)
+    else:
+        drawn = timeline(trace, shown)
+        for name, reason in drawn.missing.items():
+            console.note(f"no chart {name}: {reason}")
+        write_atomically(output, drawn.encoded(format))
     return opt.trace_result(trace, output, figure=kind, **extra)
+
+
+def _refuse(kind: str, values: Mapping[str, Any]) -> None:
+    """Raise BadInput for a value of an option that only another kind of figure has."""
+    for option, value in values.items():
+        if value:
+            text = " ".join(map(str, value)) if isinstance(value, list) else value
+            raise BadInput(f"--{option} {text}: only the figure {kind} has this option")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.inspect.diagnosis.checks.test_innovations import BIAS, STD, Boat, sail
 
-from beliefscope.app.protocol.trace_format import MAX_CHANNELS, columns, header
+from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -18,6 +18,7 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
+from beliefscope.inspect.statistics.channels import MAX_CHANNELS
 from beliefscope.inspect.trace import Trace, trace
 
 Columns = dict[str, np.ndarray[Any, Any]]

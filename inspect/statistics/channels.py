@@ -1,0 +1,50 @@
+"""Channels of a trace over time, with their names and units: readings, controls and reported innovations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.task import Component
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.innovations import channels_of, reported_innovations
+from beliefscope.inspect.traces.data import Trace
+
+MAX_CHANNELS = 16
+"""Largest number of channels of a sensor or an innovation that has columns; more, as those of a lidar, are no chart."""
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+def reading_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Component]]]:
+    """Column -> readings (T, d) of a vector sensor as the filter received them, or the controls, and their channels.
+
+    NaN at steps without a reading. Scans, which are drawn, and vectors of more than ``MAX_CHANNELS`` have no column.
+    """
+    task, episode = trace.task, trace.episode
+    result = {}
+    for key, values in {**episode.observations, "control": episode.controls}.items():
+        if values.ndim == 2 and 1 <= values.shape[1] <= MAX_CHANNELS and key not in task.scans:
+            present = episode.present(key)[:, None]
+            channels = [task.channel(key, i) for i in range(values.shape[1])]
+            result[f"readings/{key}"] = (np.where(present, values, np.nan).astype(np.float32), channels)
+    return result
+
+
+def innovation_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Component]]]:
+    """Column -> innovation of a modality (T, d) in the space of its measurements, or its standard deviation.
+
+    NaN without a measurement; empty if the filter does not report them.
+    """
+    if (pair := reported_innovations(trace)) is None:
+        return {}
+    innovation, deviations = pair[0], measures.deviations(pair[1])
+    result = {}
+    for k, (modality, channels) in enumerate(zip(trace.modalities, channels_of(trace, innovation), strict=True)):
+        if not np.isfinite(innovation[:, k, MAX_CHANNELS:]).any():
+            for name, values in (("innovation", innovation), ("innovation_sigma", deviations)):
+                # The width does not depend on the steps, so that those of blocks of a live run agree.
+                result[f"{name}/{modality}"] = (values[:, k, :MAX_CHANNELS], channels[:MAX_CHANNELS])
+    return result
