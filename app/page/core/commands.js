@@ -131,10 +131,17 @@ function actionCommands(page) {
     words: 'figure download save',
     run,
   }));
+  const charts = clickable('#chart-menu .export button', 'Action').map(({ title, run }) => ({
+    group: 'Action',
+    title: `Export the timeline as ${title}`,
+    words: 'figure charts download save paper',
+    run,
+  }));
   return [
     ...listed,
     ...clickable('#report', 'Action', { words: 'figures tables pdf download export' }),
     ...exports,
+    ...charts,
     ...clickable('#help', 'Action', { title: 'Keyboard shortcuts', keys: '?' }),
   ];
 }

@@ -148,6 +148,25 @@ export const sensorImages = async (selection, sensor) =>
   ).arrayBuffer();
 
 /**
+ * Loads a file with the charts of the timeline, and waits while the server computes the trace and its comparison run.
+ * @param {Selection} selection
+ * @param {string} format `svg`, `pdf`, `png` or `csv`
+ * @param {string[][]} query charts and how they are displayed (docs/api.md)
+ * @returns {Promise<{content: Blob, name: string}>}
+ */
+export async function timelineFile(selection, format, query) {
+  const url = `${traceUrl(selection, `timeline.${format}`)}&${new URLSearchParams(query)}`;
+  let response = await request(url);
+  while (response.status === 202) {
+    await pause(POLL_INTERVAL);
+    response = await request(url);
+  }
+  const [, name = ''] =
+    /filename="(.+)"/.exec(response.headers.get('content-disposition') ?? '') ?? [];
+  return { content: await response.blob(), name };
+}
+
+/**
  * Checks that a trace can be computed. Throws ServerError for an unknown name or an invalid fault injection.
  * @param {Selection} selection
  */

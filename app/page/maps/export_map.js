@@ -9,6 +9,7 @@ import { download } from '../core/download.js';
 import { columnName, fixed, sentence } from '../core/units.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap } from './draw_map.js';
+import { ROW, drawLegend, legendRows } from './export_legend.js';
 import { mapTitle } from './map_summary.js';
 import { isCurve, logLikelihood, rangeDigits, rangeLabels } from './map_values.js';
 import { SvgContext } from './svg_context.js';
@@ -164,8 +165,9 @@ async function png(sheets) {
 
 /** @param {DisplayedMaps[]} sheets */
 function sheetSize(sheets) {
-  const { padding, title, footer } = SHEET;
+  const { padding, title } = SHEET;
   const { length } = sheets[0].layers;
+  const footer = SHEET.footer + ROW * legend(sheets).length;
   if (sheets.length > 1) {
     const pitch = TILE.side + TILE.gap;
     const left = TILE.names + MARGIN.left;
@@ -178,6 +180,13 @@ function sheetSize(sheets) {
     2 * padding + length * COLUMN,
     padding + title + SIDE + MARGIN.bottom + MARGIN.name + footer + padding,
   ];
+}
+
+/** @param {DisplayedMaps[]} sheets */
+function legend(sheets) {
+  const { length } = sheets.length > 1 ? sheets : sheets[0].layers;
+  const width = sheets.length > 1 ? TILE.names + length * TILE.side : length * COLUMN;
+  return legendRows(sheets, INK, width);
 }
 
 /**
@@ -195,6 +204,9 @@ function drawSheet(context, sheets, width, height) {
   if (sheets.length > 1) drawSteps(context, sheets);
   else drawStep(context, sheets[0]);
   const [{ maps, title }] = sheets;
+  const rows = legend(sheets);
+  [context.font, context.fillStyle] = [TEXT, INK];
+  drawLegend(context, rows, padding, height - padding - 16 - ROW * rows.length);
   write(context, caption(sheets), padding, height - padding - 12);
   write(context, `${mapTitle(maps)}. Colour: ${title}`, padding, height - padding);
 }

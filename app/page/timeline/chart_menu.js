@@ -1,4 +1,4 @@
-/** The menu that adds, removes and reorders the charts of the timeline, and selects its time axis. */
+/** The menu that adds, removes, reorders and exports the charts of the timeline, and selects its time axis. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
@@ -6,6 +6,7 @@
 import { create, createButton, html } from '../core/dom.js';
 import { choice } from '../widgets/pickers.js';
 import { chartKeys, formatCharts, moved, toggled } from './chart_list.js';
+import { bindExport } from './export_charts.js';
 import { chartOptions } from './tracks.js';
 
 const MARGIN = 8; // px to the edge of the window
@@ -32,6 +33,7 @@ export class ChartMenu {
       menu.style.maxHeight = `${top - MARGIN}px`;
       this.#draw();
     });
+    bindExport(menu, store, () => this.#trace);
     html('.reset', menu).addEventListener('click', () => {
       resetSizes();
       this.#set([]);
