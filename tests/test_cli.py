@@ -50,7 +50,8 @@ OPTIONS = {
     "diagnose": "--filter --data --skip-bad --episode --base --alarm-rate --faults --particles --seed --json",
     "report": "-o --title --event --filter --data --all --url --pdf --json",
     "counterfactual": "--filter --data --episode --faults --weights --from --to --particles --seed --trace -o --json",
-    "figure": "--filter --data --skip-bad --episode --step --faults --particles --seed -o --json",
+    "figure": "--filter --data --skip-bad --episode --step --map --chart --component --beta --window --seconds --group "
+    "--faults --particles --seed -o --json",
     "failures": "--filter --data --skip-bad --faults --by --top --phase --all --url --engine --workers --particles "
     "--seed --json",
     "slices": "--filter --data --skip-bad --faults --by --alpha --all --particles --seed --json",
@@ -227,6 +228,10 @@ BAD = [
     f"figure maps {EKF} -o new.gif",
     f"figure maps {EKF} -o taken",
     f"figure weights {EKF} --step 40 -o new.svg",
+    f"figure weights {EKF} -o new.csv",
+    f"figure weights {EKF} --window 20-60 -o new.svg",
+    f"figure timeline {EKF} --map posterior -o new.svg",
+    f"figure timeline {EKF} --window 20 -o new.svg",
     f"live {EKF} --rate -1",
     f"live {EKF} --name a/b",
     f"live {EKF} --workspace notes.txt",

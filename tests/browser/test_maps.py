@@ -81,6 +81,7 @@ def test_values_and_exports_match_the_engine_and_the_quantity_is_a_switch(
     assert len(drawing.findall(".//{*}clipPath")) == 3
     texts = [text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")]
     assert {*(f"{layer} likelihood" for layer in expected.layers), "Δ hinge x (cm)"} <= {*texts}
+    assert {"truth", "image-only update", "haptics-only update", "fused", "50 % region"} <= {*texts}
     assert files["png"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     page.page.keyboard.press("Escape")
     check_quantity(page)

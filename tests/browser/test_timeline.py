@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -245,3 +247,34 @@ def test_event_marks_and_comparison_run(open_page: Any) -> None:
     page.page.locator("#episode").select_option("8")
     page.until("() => document.querySelector('#comparison-key').hidden && !document.querySelector('#marks button')")
     assert len(legend(page, 1)["fused"]) == 1
+
+
+def test_export_has_the_displayed_charts_steps_and_values(open_page: Any, tmp_path: Path) -> None:
+    page = open_page(
+        LINK + "&window=20-60&charts=estimate,track,readings/force&track=error&component=angle&time=seconds"
+    )
+    page.page.locator("#charts").click()
+    files = {}
+    for kind in ("SVG", "PDF", "CSV"):
+        with page.page.expect_download() as download:
+            page.page.locator("#chart-menu .export").get_by_text(kind).click()
+        files[kind] = tmp_path / download.value.suggested_filename
+        download.value.save_as(files[kind])
+        page.until("() => document.querySelector('#chart-menu output').textContent === 'Saved.'")
+    assert files["CSV"].name == f"door-crossmodal-ekf-episode{EPISODE}-timeline.csv"
+    header, *rows = csv.reader(files["CSV"].read_text().splitlines())
+    values = dict(zip(header, np.array(rows, dtype=float).T, strict=True))
+    assert values["step"].tolist() == list(range(20, 61))
+    for row, name in ((40, "fused"), (40, "haptics-only update")):
+        key = name.replace(" ", "_").replace("-", "_")
+        shown = [legend(page, track)[name][0] for track in (0, 1)]
+        plotted = [values[f"{title}_{key}_deg"][row - 20] for title in ("angle", "angle_error")]
+        assert shown == [near(value) for value in plotted]
+    np.testing.assert_allclose(values["force_readings_x_N"], column(page, "readings/force")[20:61, 0], rtol=1e-6)
+    assert files["PDF"].read_bytes().startswith(b"%PDF")
+    assert "time (s)" in files["SVG"].read_text()
+
+    page.page.evaluate("() => document.querySelector('#group').append(new Option('rain', 'rain', true, true))")
+    page.page.locator("#chart-menu .export").get_by_text("CSV").click()
+    page.until("() => document.querySelector('#chart-menu output').textContent.startsWith('Export failed: Group')")
+    page.errors.clear()

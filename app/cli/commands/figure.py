@@ -82,6 +82,8 @@ def figure(
         _refuse("timeline", {"chart": view.charts} | {k: v for k, v in vars(view).items() if k != "charts"})
     shown = View(**vars(view) | {"charts": tuple(view.charts or DEFAULT_CHARTS)})
     checkpoint, faults = run.open()
+    if view.component:
+        checkpoint.task.index(view.component)
     episode, index = run.read_episode(checkpoint.task)
     selection = paper.steps_by_contact(episode, index, steps or ()) if kind == "maps" else {}
     trace = run.over(checkpoint, episode, index, faults)
@@ -111,5 +113,5 @@ def _refuse(kind: str, values: Mapping[str, Any]) -> None:
     """Raise BadInput for a value of an option that only another kind of figure has."""
     for option, value in values.items():
         if value:
-            text = " ".join(map(str, value)) if isinstance(value, list) else value
-            raise BadInput(f"--{option} {text}: only the figure {kind} has this option")
+            words = value if isinstance(value, list) else [] if value is True else [value]
+            raise BadInput(f"{' '.join(map(str, ['--' + option, *words]))}: only the figure {kind} has this option")

@@ -36,9 +36,9 @@ def study(
 
     Trains each filter once per seed and evaluates it with 0, 40, 80 and 95 % image blackout on the test episodes, from
     starts at the truth and from offset starts. Writes checkpoints and metrics to DIR/cells, and updates DIR/table.md,
-    table.csv, results.svg and results.png after each run. Completed runs are skipped, so the same command resumes an
-    interrupted study, and several processes can share one DIR. Checkpoints and external filters given with --filter are
-    evaluated only; each is a row with one seed.
+    table.csv, results.svg, results.pdf and results.png after each run. Completed runs are skipped, so the same command
+    resumes an interrupted study, and several processes can share one DIR. Checkpoints and external filters given with
+    --filter are evaluated only; each is a row with one seed.
 
     \b
     Examples:

@@ -239,6 +239,7 @@ def test_figure_contains_filters_and_quantities(finished: Path) -> None:
     image = Image.open(finished / "results.png").convert("RGB")
     assert image.width == round(300 * 7.16)
     assert len(image.getcolors(image.width * image.height)) > 20
+    assert (finished / "results.pdf").read_bytes().startswith(b"%PDF")
     text = (finished / "results.svg").read_text()
     for word in ("door: hinge", "door: angle", "RMSE (cm)", "RMSE (deg)", "image blackout", "40%", *FILTERS, TRIVIAL):
         assert word in text, word

@@ -168,6 +168,7 @@ def test_change_command(run: Run, family: Path, tmp_path: Path) -> None:
     assert json.loads((report / "change.json").read_text()) == document
     assert document["verdict"] in (report / "change.md").read_text()
     assert (report / "change.svg").read_text().startswith("<?xml")
+    assert (report / "change.pdf").read_bytes().startswith(b"%PDF")
     for line in (
         "change crossmodal-ekf crossmodal-pf",
         f"change crossmodal-ekf {finetuned} -o {report}",
