@@ -10,6 +10,7 @@ from fastapi.responses import Response
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.inspect.figures.timeline import DEFAULT_CHARTS, View, timeline
+from beliefscope.inspect.figures.timeline_figure import encoded_timeline
 
 MEDIA_TYPES = {"svg": "image/svg+xml", "pdf": "application/pdf", "png": "image/png", "csv": "text/csv"}
 
@@ -32,6 +33,6 @@ def add_routes(app: FastAPI, store: TraceStore, drawing: Executor) -> None:
         view = View(tuple(charts), component, weights == "raw", window, time == "seconds", group)
         other = finished_run(store, selection.comparison(against)).trace if against else None
         result = timeline(finished_run(store, selection).trace, view, other)
-        content = drawing.submit(result.encoded, format).result()
+        content = drawing.submit(encoded_timeline, result, format).result()
         name = {"Content-Disposition": f'attachment; filename="{selection.file_stem}-timeline.{format}"'}
         return Response(content, media_type=MEDIA_TYPES[format], headers=name)

@@ -15,15 +15,12 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.task import display_name
-from beliefscope.inspect.diagnostics import plotting
 from beliefscope.inspect.figures.timeline_charts import Chart, chart_names, chart_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Mask
 from beliefscope.inspect.trace import Trace
 
 DEFAULT_CHARTS = ("weights", "estimate", "error")
-FORMATS = (*plotting.FORMATS, "csv")
-"""Formats of files."""
 WINDOW = r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)"
 
 
@@ -94,14 +91,6 @@ class Timeline:
         """(T,) s since step 0."""
         time = self.trace.episode.time
         return np.asarray(np.arange(len(self.trace)) * self.trace.episode.dt if time is None else time, np.float64)
-
-    def encoded(self, format: str) -> bytes:
-        """The file in one of ``FORMATS``: the figure, or the values as CSV."""
-        if format == "csv":
-            return self.csv().encode()
-        from beliefscope.inspect.figures.timeline_figure import timeline_figure  # matplotlib is slow to import
-
-        return plotting.encoded_figure(timeline_figure(self), format)
 
     def csv(self) -> str:
         """Rows: the visible steps. Columns: the lines with their units, and 1 for steps with a mark."""

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from beliefscope.inspect.diagnostics import plotting
 from beliefscope.inspect.diagnostics.plotting import BANDS, STYLE, StepAxis, draw_legend, legend_height, new_figure
 from beliefscope.inspect.figures.timeline import Timeline
 from beliefscope.inspect.figures.timeline_charts import Chart, Series, value_range
 from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS, colour
 from beliefscope.inspect.statistics.measures import intervals
+
+if TYPE_CHECKING:  # functions import matplotlib when they draw
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = (*plotting.FORMATS, "csv")
+"""Formats of files of a timeline."""
 
 WIDTH = 8.5 / 2.54
 """Inches: one column of a paper."""
@@ -58,10 +63,19 @@ GROUP_STRIP = (0.0, 0.09)
 """The group of steps in a chart that is filled with areas."""
 
 
+def encoded_timeline(timeline: Timeline, format: str) -> bytes:
+    """The file in one of ``FORMATS``: the figure, or the values as CSV."""
+    if format == "csv":
+        return timeline.csv().encode()
+    return plotting.encoded_figure(timeline_figure(timeline), format)
+
+
 def timeline_figure(timeline: Timeline) -> Figure:
     """The charts below one another over the visible steps. A label is in the legend of the first chart that has it."""
     trace, in_seconds = timeline.trace, timeline.view.seconds
     axis = StepAxis.from_times(len(trace), timeline.time if in_seconds else None)
+    from matplotlib import rc_context
+
     with rc_context(STYLE | NARROW):
         figure = new_figure(layout="constrained")
         rows = figure.subplots(len(timeline.charts), 1, sharex=True, squeeze=False)[:, 0]

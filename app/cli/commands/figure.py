@@ -71,7 +71,8 @@ def figure(
     from beliefscope.inspect.diagnostics import plotting
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.figures import paper
-    from beliefscope.inspect.figures.timeline import DEFAULT_CHARTS, FORMATS, View, timeline
+    from beliefscope.inspect.figures.timeline import DEFAULT_CHARTS, View, timeline
+    from beliefscope.inspect.figures.timeline_figure import FORMATS, encoded_timeline
     from beliefscope.inspect.maps.map_engine import no_maps
     from beliefscope.inspect.maps.plane import is_outside
 
@@ -105,7 +106,7 @@ def figure(
         drawn = timeline(trace, shown)
         for name, reason in drawn.missing.items():
             console.note(f"no chart {name}: {reason}")
-        write_atomically(output, drawn.encoded(format))
+        write_atomically(output, encoded_timeline(drawn, format))
     return opt.trace_result(trace, output, figure=kind, **extra)
 
 

@@ -21,7 +21,7 @@ from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
 from beliefscope.inspect.figures.timeline import Timeline, View, timeline
 from beliefscope.inspect.figures.timeline_charts import Chart, Series, chart_names, value_range
-from beliefscope.inspect.figures.timeline_figure import timeline_figure
+from beliefscope.inspect.figures.timeline_figure import encoded_timeline, timeline_figure
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
 
@@ -174,13 +174,13 @@ def test_figure_has_one_column_with_axes_units_legend_and_marks(ekf: Trace) -> N
 
 def test_files_have_embedded_fonts_and_are_reproducible(ekf: Trace) -> None:
     drawn = timeline(ekf, View(("estimate",)))
-    pdf = drawn.encoded("pdf")
+    pdf = encoded_timeline(drawn, "pdf")
     assert b"/FontFile2" in pdf  # TrueType
     assert b"/Type3" not in pdf
-    assert pdf == drawn.encoded("pdf")
-    drawing = ElementTree.fromstring(drawn.encoded("svg"))
+    assert pdf == encoded_timeline(drawn, "pdf")
+    drawing = ElementTree.fromstring(encoded_timeline(drawn, "svg"))
     assert {"Hinge x", "cm", "fused"} <= {text.text for text in drawing.iter(f"{SVG}text")}
-    assert drawn.encoded("csv").startswith(b"step,time_s,hinge_x_truth_cm")
+    assert encoded_timeline(drawn, "csv").startswith(b"step,time_s,hinge_x_truth_cm")
 
 
 def test_the_range_leaves_out_outliers_of_modalities_only() -> None:
