@@ -268,6 +268,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     if first.probability < SURE and similar:
         actions = " ".join(dict.fromkeys(c.next for c in (first, *similar)))
         *titles, last = (first.cause.title, *(_lower(c.cause.title) for c in similar))
+        if _are_alike([first, *similar]):
+            return f"{', '.join(titles)} and {last}, by one cause or by several; try: {actions}"
         return f"{', '.join(titles)} or {last}, not separable; try: {actions}"
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
@@ -279,6 +281,13 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     if masked:
         text += "; the filter is unaffected" if is_known else "; the errors of the filter are in the healthy range"
     return text if first.probability >= SURE else f"{text}; try: {first.next}"
+
+
+def _are_alike(candidates: Sequence[Candidate]) -> bool:
+    """Whether all have evidence of their own for the same mechanism, such as updates with each of several sensors."""
+    evidence = [item.text for candidate in candidates for item in candidate.evidence]
+    mechanisms = {candidate.cause.name.rpartition(".")[2] for candidate in candidates}
+    return len(mechanisms) == 1 and len(evidence) == len(set(evidence)) and all(c.evidence for c in candidates)
 
 
 def _lower(title: str) -> str:

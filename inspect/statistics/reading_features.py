@@ -15,6 +15,9 @@ from beliefscope.inspect.statistics.signals import Array
 
 Indices = NDArray[np.intp]
 
+CONTROL = "control"
+"""Key of the controls in the place of a sensor's."""
+
 FIRST_CHANGES = 2
 """First step with all features, which need two earlier ones."""
 
@@ -34,18 +37,18 @@ SEARCHED = 400
 """Largest number of positions that the search compares."""
 
 
-def features(episode: Episode) -> tuple[Array, list[Indices]]:
+def features(episode: Episode, with_controls: bool) -> tuple[Array, list[Indices]]:
     """(T, F): the state, its first and second changes by step, all in the body frame, and all of them in contact.
 
-    Angles that wrap have their cosine and sine as well, rotations are their matrices. Changes are zero where they are
-    unknown, at the first two steps. Also returns the groups of features among which the model of a channel chooses, as
-    their indices.
+    Angles that wrap have their cosine and sine as well, rotations are their matrices. Angles among the controls, such
+    as a measured heading, also turn vectors into the body frame. Changes are zero where they are unknown, at the first
+    two steps. Also returns the groups of features among which the model of a channel chooses, as their indices.
     """
     task, states = episode.task, episode.states.astype(np.float64)
     change, second = np.zeros((2, *states.shape))
     change[1:] = task.difference(states[1:], states[:-1])
     second[2:] = change[2:] - change[1:-1]
-    others, frames = _values(task, states)
+    others, frames = _values(episode, with_controls)
     vectors = np.concatenate([others, change, second], axis=1)
     in_frames = (frames[:, :, None] * vectors[:, None]).reshape(len(states), -1)
     all_ = np.concatenate([others, frames, change, second, in_frames], axis=1)
@@ -61,11 +64,12 @@ def monomials(episode: Episode, with_controls: bool, degree: int) -> Array:
 
     Angles that wrap are their cosine and sine, rotations their matrices.
     """
-    task, states = episode.task, episode.states.astype(np.float64)
-    others, frames = _values(task, states)
+    task = episode.task
+    others, frames = _values(episode, with_controls)
     turned = {i for at in task.rotations for i in range(at.start, at.stop)}
     wraps = np.array([c.wraps for i, c in enumerate(task.components) if i not in turned], dtype=bool)
-    controls = episode.controls.astype(np.float64) if with_controls else states[:, :0]
+    plain = [i for i in range(task.control_size) if with_controls and not task.channel(CONTROL, i).wraps]
+    controls = episode.controls[:, plain].astype(np.float64)
     values = np.concatenate([others[:, ~wraps], frames, controls], axis=1)
     count = values.shape[1]
     if math.comb(count + degree, degree) > MAX_TERMS:
@@ -124,16 +128,21 @@ def _agreement(inputs: Array, targets: Array) -> Array:
     return np.asarray(np.square(x @ y) / np.maximum(np.square(x).sum(1) * np.square(y).sum(), 1e-24))
 
 
-def _values(task: Task, states: Array) -> tuple[Array, Array]:
+def _values(episode: Episode, with_controls: bool) -> tuple[Array, Array]:
     """State components (T, V) that do not jump, and those (T, R) that turn vectors of the world into the body frame.
 
-    Angles that wrap around are among both, unwrapped.
+    Angles that wrap around are among both, unwrapped; those of controls are among the latter only.
     """
+    task, states = episode.task, episode.states.astype(np.float64)
     turning = {i for i, c in enumerate(task.components) if c.wraps}
     rotated = {i for at in task.rotations for i in range(at.start, at.stop)}
     others = [np.unwrap(x, axis=0) if i in turning else x for i, x in enumerate(states.T) if i not in rotated]
     functions: tuple[Callable[[Array], Array], ...] = (np.cos, np.sin)
-    frames = [f(states[:, i]) for i in turning for f in functions]
+    angles = [states[:, i] for i in turning]
+    if with_controls:
+        controls = episode.controls.T.astype(np.float64)
+        angles += [x for i, x in enumerate(controls) if task.channel(CONTROL, i).wraps]
+    frames = [f(x) for x in angles for f in functions]
     if task.rotations:
         from scipy.spatial.transform import Rotation  # takes most of a second
 

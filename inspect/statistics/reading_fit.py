@@ -9,6 +9,7 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.inspect.statistics.reading_features import (
+    CONTROL,
     DEGREES,
     Indices,
     features,
@@ -18,7 +19,6 @@ from beliefscope.inspect.statistics.reading_features import (
     positions,
 )
 from beliefscope.inspect.statistics.reading_model import (
-    CONTROL,
     ChannelModel,
     ReadingModel,
     angle_of,
@@ -70,9 +70,10 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
     episodes = [episode for episode in episodes if np.isfinite(episode.states).all()]
     if len(episodes) < MIN_EPISODES or not keys:
         return ()
-    inputs, (groups, *_) = zip(*(features(episode) for episode in episodes), strict=True)
+    by_controls = {c: [features(episode, c) for episode in episodes] for c in {key != CONTROL for key in keys}}
     result = []
     for key in keys:
+        inputs, (groups, *_) = zip(*by_controls[key != CONTROL], strict=True)
         present = [np.flatnonzero(steps_of(episode, key)) for episode in episodes]
         stride = 1 + sum(map(len, present)) // MAX_STEPS
         rows = [

@@ -14,6 +14,7 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.inspect.statistics.reading_features import (
+    CONTROL,
     FIRST_CHANGES,
     Indices,
     features,
@@ -22,9 +23,6 @@ from beliefscope.inspect.statistics.reading_features import (
     positions,
 )
 from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, significant, wrapped
-
-CONTROL = "control"
-"""Key of the model of the controls."""
 
 DIGITS = 8
 """Significant digits of stored coefficients."""
@@ -46,6 +44,15 @@ class ComparedReadings:
     def readings(self) -> Array:
         near = self.expected + wrapped(self.measured - self.expected)
         return np.where(self.model.is_angle, near, self.measured)
+
+    @property
+    def fresh(self) -> Mask:
+        """(T,): steps with a reading other than the one before, which may be repeated; all those of controls."""
+        steps = np.flatnonzero(self.present)
+        is_repeated = (np.diff(self.measured[steps], axis=0) == 0.0).all(1) & (self.model.key != CONTROL)
+        result = self.present.copy()
+        result[steps[1:][is_repeated]] = False
+        return result
 
     def pairs(self, delay: int = 0) -> tuple[Array, Array]:
         """Readings (S, A) and the readings expected ``delay`` steps earlier, of the ``steps``."""
@@ -73,6 +80,13 @@ class ComparedReadings:
         signs = np.array([1.0, -1.0])[:, None, None, None]
         difference = readings[:, :, None] - signs * expected[:, None]  # (2, S, B, A)
         return np.asarray(np.square(self.model.relative(difference)).mean(1))
+
+    def errors_with_biases(self, delay: int = 0) -> Array:
+        """(A,): mean square of readings minus expected readings minus a bias each, of ``pairs``, as ``errors``."""
+        readings, expected = self.pairs(delay)
+        if len(readings) < MIN_STEPS:
+            return np.full(readings.shape[1], np.nan)
+        return np.asarray(self.model.relative(readings - expected).var(0))
 
 
 @dataclass(frozen=True)
@@ -209,7 +223,7 @@ class ReadingModel:
 
     def is_complete(self, episode: Episode) -> bool:
         """Whether all channels have models, of the state and controls at one step: neither of changes nor contact."""
-        _, (state, *_) = features(episode)
+        _, (state, *_) = features(episode, self.key != CONTROL)
         of_features = (m for m in self.of_channels if not len(m.landmark) and not m.degree)
         others = (np.delete(model.coefficients, state, axis=0) for model in of_features)
         count = readings_of(episode, self.key).shape[1]
@@ -219,7 +233,7 @@ class ReadingModel:
         """(T, A) expected readings of the states of an episode; NaN if the model has features of another version."""
         degrees = {model.degree for model in self.of_channels} - {0}
         inputs = {degree: monomials(episode, self.key != CONTROL, degree) for degree in degrees}
-        inputs[0] = features(episode)[0]
+        inputs[0] = features(episode, self.key != CONTROL)[0]
         of_features = (m for m in self.of_channels if not len(m.landmark))
         if any(len(m.coefficients) != inputs[m.degree].shape[1] for m in of_features):
             return np.full((len(episode), len(self.of_channels)), np.nan)

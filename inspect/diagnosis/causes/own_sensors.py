@@ -37,6 +37,9 @@ DELAYED = (
 )
 """As ``BIASED``, of a delay."""
 
+NOT_LATE = ("[!r]*", "r[!e]*", "reading [!l]*")
+"""All kinds but ``reading lag``, that of new readings: a sensor that is stuck has no delay."""
+
 CONNECTION = "Check the connection of the sensor and the load of the computer that receives its messages."
 """Next action of lost readings."""
 
@@ -79,11 +82,13 @@ def sensor_causes(task: Task) -> tuple[Cause, ...]:
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in known}
     result = []
     for key, modality in keys.items():
-        changed = f"{_patterns(key, '*')}|lag/*|{_downstream(modality)}"
+        others = f"lag/*|{_downstream(modality)}"
+        changed = f"{_patterns(key, '*')}|{others}"
         for kinds, mechanism, word, action in IMAGE if key in task.images else VECTOR:
             symptom = Symptom(_patterns(key, *kinds.split("|")))
             title = f"Sensor {display_name(key)} {word}"
-            result.append(Cause(f"{key}.{mechanism}", title, (symptom,), changed, action, f"drop {modality}"))
+            explained = f"{_patterns(key, *NOT_LATE)}|{others}" if mechanism == "stuck" else changed
+            result.append(Cause(f"{key}.{mechanism}", title, (symptom,), explained, action, f"drop {modality}"))
         if key in task.masks:
             lost = Symptom(_patterns(key, "absent"))
             title = f"Readings of sensor {display_name(key)} lost"
@@ -256,7 +261,8 @@ def _delays(task: Task) -> tuple[Cause, ...]:
             Symptom(f"reading lag/{key}/*", weight=2.0, optional=True),
         )
         title = f"Sensor {display_name(key)} delayed"
-        # The readings of a sensor with gaps then jump at other steps than its gaps.
-        noise = _patterns(key, "noise") if key in task.masks else ""
-        result.append(Cause(f"{key}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {key}", raises=noise))
+        # The readings of a sensor with gaps then jump at other steps than its gaps. A growing delay repeats some.
+        raised = [*(["noise"] if key in task.masks else []), *([] if has_labels_only(task) else ["stuck"])]
+        raises = _patterns(key, *raised)
+        result.append(Cause(f"{key}.delay", title, symptoms, changed, SYNCHRONISE, f"advance {key}", raises=raises))
     return tuple(result)

@@ -9,7 +9,8 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import LENGTHS
-from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
+from beliefscope.inspect.statistics.reading_features import CONTROL
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array
 
 STEP = 0.1

@@ -9,9 +9,8 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task, axis_name
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, commands_hand
-from beliefscope.inspect.statistics.reading_features import FIRST_CHANGES
+from beliefscope.inspect.statistics.reading_features import CONTROL, FIRST_CHANGES
 from beliefscope.inspect.statistics.reading_model import (
-    CONTROL,
     ComparedReadings,
     ReadingModel,
     readings_of,
@@ -23,7 +22,8 @@ MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
 
 SIMPLER = 2.0
-"""Largest error with another sign and order, relative to that with a delay, at which the former is preferred."""
+"""Largest error with another sign and order, relative to that with a delay or biases, at which the former is preferred.
+"""
 
 SURELY = 4.0
 """Smallest number of standard errors of a slope."""
@@ -60,13 +60,14 @@ def modelled_keys(task: Task) -> list[str]:
 def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict[str, float]:
     """Of each channel that the labels explain, against its expected readings.
 
-    ``reading lag``: steps by which the readings of a sensor follow the expected ones; of a short delay, also fractions.
+    ``reading lag``: steps by which new readings of a sensor follow the expected ones; of a short delay, also fractions.
     The others are those at this lag. ``reading bias``: mean error relative to the noise. ``reading drift``: change of
     the error over the episode, likewise. ``reading gain``: slope of the readings on the expected ones. ``reading
     noise``: standard deviation from this line, relative to the noise.
     ``inverted``: half the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then
-    fit (``FITS``). ``exchanged``: likewise, of the errors of two channels to those with these channels exchanged,
-    whatever their signs, for the best other channel; or of one channel to those of a channel without a model.
+    fit (``FITS``), hardly worse than with biases (``SIMPLER``). ``exchanged``: likewise, of the errors of two channels
+    to those with these channels exchanged, whatever their signs, for the best other channel; or of one channel to those
+    of a channel without a model.
     """
     values: dict[str, float] = {}
     for model in (model for model in models if model.channels):
@@ -78,13 +79,13 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         values[f"reading lag/{model.key}/all"] = _short_delay(compared) if delay == 0.0 and is_own else delay
         whole = 0 if np.isnan(delay) else int(delay)
         line = _line(*compared.pairs(whole), compared.steps(whole) / len(episode), model.gain_spreads)
-        least = errors.min(0)
+        least, biased = errors.min(0), compared.errors_with_biases(whole)
         own = np.diagonal(least)
-        exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS)
-        inverted = _evidence(np.diagonal(errors[0]), np.diagonal(errors[1]), FITS)
+        exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS, biased[:, None] + biased)
+        inverted = _evidence(np.diagonal(errors[0]), np.diagonal(errors[1]), FITS, biased)
         all_readings = readings_of(episode, model.key)
         others = np.delete(all_readings, model.channels, axis=1)
-        replaced = _evidence(own, compared.errors(whole, others).min((0, 1), initial=np.inf), FITS)
+        replaced = _evidence(own, compared.errors(whole, others).min((0, 1), initial=np.inf), FITS, biased)
         count = all_readings.shape[1]
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
@@ -107,7 +108,7 @@ def _short_delay(compared: ComparedReadings) -> float:
     """
     noise, biases = compared.model.noise, compared.model.biases
     error, change = compared.readings - compared.expected, np.gradient(compared.expected, axis=0)
-    error, change = (x[compared.present] / noise for x in (error, change))
+    error, change = (x[compared.fresh] / noise for x in (error, change))
     known = 1.0 - 1.0 / np.sqrt(1.0 + len(error) * np.square(biases / noise))
     error, change = (x - known * x.mean(0) for x in (error, change))
     return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
@@ -178,10 +179,11 @@ def _clustered(terms: Array) -> Array:
     return np.asarray(np.sqrt(np.square(np.add.reduceat(terms, starts, axis=0)).sum(0)))
 
 
-def _evidence(error: Array, other: Array, limit: float) -> Array:
-    """Half the log-ratio of errors to others that are below a limit; 0 where they are not, or not smaller."""
+def _evidence(error: Array, other: Array, limit: float, biased: Array) -> Array:
+    """Half the log-ratio of errors to others; 0 if these are not smaller, above a limit, or worse than with biases."""
     ratio = error / np.maximum(other, 1e-12)
-    return np.asarray(0.5 * np.log(np.where(other < limit, np.maximum(ratio, 1.0), 1.0)))
+    fits = other < np.minimum(limit, SIMPLER * biased)
+    return np.asarray(0.5 * np.log(np.where(fits, np.maximum(ratio, 1.0), 1.0)))
 
 
 def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]:
@@ -193,7 +195,7 @@ def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]
         dt: s per step.
     """
     known = (np.arange(len(compared.present)) >= FIRST_CHANGES) & compared.present.any()
-    delay = fitted_lag(compared.readings, compared.expected, compared.present, known, largest_lag(dt))
+    delay = fitted_lag(compared.readings, compared.expected, compared.fresh, known, largest_lag(dt))
     errors = compared.errors()
     if np.isnan(delay) or delay == 0.0:
         return delay, errors

@@ -24,7 +24,7 @@ from beliefscope.inspect.diagnosis.checks.vectors import (
 from beliefscope.inspect.diagnosis.undo.expected_readings import tare
 from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo, with_labels, with_readings
 from beliefscope.inspect.statistics.image_landmarks import LandmarkFilter
-from beliefscope.inspect.statistics.reading_model import CONTROL
+from beliefscope.inspect.statistics.reading_features import CONTROL
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
 from beliefscope.inspect.statistics.signals import MIN_STEPS
 

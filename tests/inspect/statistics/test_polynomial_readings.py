@@ -13,9 +13,9 @@ from tests.inspect.statistics.test_reading_model import smooth
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.checks.readings import modelled_keys, reading_statistics
-from beliefscope.inspect.statistics.reading_features import monomials
+from beliefscope.inspect.statistics.reading_features import CONTROL, monomials
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
-from beliefscope.inspect.statistics.reading_model import CONTROL, ReadingModel
+from beliefscope.inspect.statistics.reading_model import ReadingModel
 
 CART = Task(
     name="cart",
