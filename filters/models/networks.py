@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -178,6 +178,12 @@ class SpatialSoftmax(nn.Module):
         return torch.cat([share.sum(-2) @ along_x, share.sum(-1) @ along_y], dim=-1)
 
 
+class FeatureTable(Protocol):
+    """Features of images: a tensor, or one that is computed on demand."""
+
+    def __getitem__(self, indices: Tensor, /) -> Tensor: ...
+
+
 class ImageEncoder(nn.Module):
     """Images (B, H, W), standardised, to features (B, units).
 
@@ -187,12 +193,11 @@ class ImageEncoder(nn.Module):
 
     Attributes:
         chunk: largest number of images to encode at once.
-        table: (images + 1, units) cached features of each training image and, last, of a black one; only while the
-            encoder is frozen during training.
+        table: cached features (images, units) by image index; only while the encoder is frozen during training.
         images: image indices (...) to images (..., H, W), standardised; only while the encoder is trained on indices.
     """
 
-    table: Tensor | None = None
+    table: FeatureTable | None = None
     images: Callable[[Tensor], Tensor] | None = None
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Cached outputs of frozen image encoders: each distinct image is encoded once and then looked up by its index.
+"""Cached outputs of frozen image encoders: each distinct image is encoded once, on its first look-up by its index.
 
 Encoding images takes nearly all of a training step's time, and the output of a frozen encoder never changes.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,14 +16,14 @@ from torch import Tensor
 
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.models.networks import ImageEncoder
+from beliefscope.filters.models.networks import IMAGES_CHUNK, ImageEncoder
 
 Images = Mapping[str, Tensor]
 """Modality -> (P, H, W) uint8, all different."""
 
 
 def index_images(sets: Sequence[Steps]) -> tuple[list[Steps], Images]:
-    """The sets of steps with an index in place of each image, and the distinct images."""
+    """The sets of steps with an index in place of each image, and the distinct images, ordered by first occurrence."""
     observations = [dict(steps.observations) for steps in sets]
     images: dict[str, Tensor] = {}
     for modality, values in sets[0].observations.items():
@@ -32,15 +33,40 @@ def index_images(sets: Sequence[Steps]) -> tuple[list[Steps], Images]:
         rows = np.ascontiguousarray(joined.cpu().numpy().reshape(len(joined), -1))
         rows = rows.view(np.dtype((np.void, rows.shape[1]))).ravel()
         _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
-        images[modality] = joined[torch.from_numpy(first).to(values.device)]
-        indices = torch.from_numpy(inverse.astype(np.int64)).to(values.device)
+        images[modality] = joined[torch.from_numpy(np.sort(first)).to(values.device)]
+        ranks = np.argsort(np.argsort(first))  # consecutive steps are encoded together
+        indices = torch.from_numpy(ranks[inverse].astype(np.int64)).to(values.device)
         for indexed, part in zip(observations, indices.split([len(steps.states) for steps in sets]), strict=True):
             indexed[modality] = part
     return [replace(steps, observations=indexed) for steps, indexed in zip(sets, observations, strict=True)], images
 
 
-Tables = dict[tuple[str, bytes, bytes], Tensor]
-"""Modality, weights of an encoder, and mean and standard deviation of its images -> features (P, units) of these."""
+class LazyFeatures:
+    """Features (P, units) of images (P, H, W), uint8; blocks of them are encoded on first use.
+
+    Blocks do not depend on the order of use, and so the bits of the features do not either.
+    """
+
+    def __init__(self, filter_: Filter, modality: str, encoder: ImageEncoder, images: Tensor) -> None:
+        self._encode = partial(encode_images, filter_, modality, encoder)
+        self._images, self._features = images, torch.empty(0)
+        self._missing = torch.ones(-(-len(images) // IMAGES_CHUNK), dtype=torch.bool, device=images.device)
+
+    def __getitem__(self, indices: Tensor) -> Tensor:
+        """Indices (...) to features (..., units)."""
+        blocks = (indices.flatten() // IMAGES_CHUNK).unique()
+        for block in blocks[self._missing[blocks]].tolist():
+            first = min(block * IMAGES_CHUNK, max(len(self._images) - IMAGES_CHUNK, 0))  # the last one is whole, too
+            features = self._encode(self._images[first : first + IMAGES_CHUNK])
+            if not len(self._features):
+                self._features = features.new_empty(len(self._images), features.shape[-1])
+            self._features[first : first + IMAGES_CHUNK] = features
+            self._missing[block] = False
+        return self._features[indices]
+
+
+Tables = dict[tuple[str, bytes, bytes], LazyFeatures]
+"""Modality, weights of an encoder, and mean and standard deviation of its images -> features of these."""
 
 
 @contextmanager
@@ -67,7 +93,7 @@ def cached_encoders(filter_: Filter, images: Images, tables: Tables | None = Non
             scaling = torch.stack(filter_.statistics.mean_std(modality)).cpu().numpy().tobytes()
             key = modality, weights_key(encoder), scaling
             if key not in tables:
-                tables[key] = encode_images(filter_, modality, encoder, images[modality])
+                tables[key] = LazyFeatures(filter_, modality, encoder, images[modality])
             encoder.table = tables[key]
         yield
     finally:

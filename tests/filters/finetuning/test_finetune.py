@@ -22,8 +22,9 @@ from beliefscope.filters.finetuning.module_selection import freeze, named_tensor
 from beliefscope.filters.finetuning.report import no_change
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
 from beliefscope.filters.finetuning.slices import CLEAN, Slice
+from beliefscope.filters.models.networks import IMAGES_CHUNK, ImageEncoder
 from beliefscope.filters.training import losses
-from beliefscope.filters.training.encoder_cache import cached_encoders, index_images
+from beliefscope.filters.training.encoder_cache import LazyFeatures, cached_encoders, encode_images, index_images
 
 pytestmark = pytest.mark.slow
 
@@ -86,6 +87,7 @@ def test_cached_encoders_give_the_same_gradients(
         if type(module).__name__ == "ImageEncoder":
             module.register_forward_hook(lambda *_: calls.append(1))
     with cached_encoders(filter_, images):
+        gradients(mix.with_steps(steps))  # encodes the images of the step
         calls.clear()
         cached = gradients(mix.with_steps(steps))
     # One call for each trained encoder, none for frozen ones.
@@ -101,11 +103,28 @@ def test_cached_encoders_give_the_same_gradients(
     assert not any(hasattr(m, "table") and (m.table is not None or m.images is not None) for m in filter_.modules())
 
 
+def test_features_are_computed_on_first_use_with_the_same_bits(episodes: list[Episode]) -> None:
+    filter_ = copy.deepcopy(base("crossmodal-ekf").filter)
+    encoder = next(module for module in filter_.modules() if isinstance(module, ImageEncoder))
+    images = index_images([mix_of(episodes[:2], SMALL).steps])[1]["image"]
+    images = images[: 2 * IMAGES_CHUNK + 20]
+    expected = encode_images(filter_, "image", encoder, images)
+    encoded: list[int] = []
+    encoder.register_forward_hook(lambda module, arguments, output: encoded.append(len(output)))
+    features = LazyFeatures(filter_, "image", encoder, images)
+    last = torch.tensor([[len(images) - 1], [len(images) - 2]])
+    assert torch.equal(features[last], expected[last])
+    assert encoded == [IMAGES_CHUNK], "one block, which is whole"
+    assert torch.equal(features[torch.arange(len(images))], expected)
+    assert encoded == [IMAGES_CHUNK] * 3
+
+
 def test_image_indices_refer_to_distinct_images(episodes: list[Episode]) -> None:
     mix = mix_of(episodes[:3], SMALL)
     (steps,), images = index_images([mix.steps])
     assert torch.equal(images["image"][steps.observations["image"]], mix.steps.observations["image"])
     assert len(images["image"].flatten(1).unique(dim=0)) == len(images["image"])
+    assert steps.observations["image"].unique_consecutive().cummax(0).values.diff().max() == 1, "in order of first use"
     dark = steps.part(3, 6).rows()
     assert len(steps.observations["image"][dark].unique()) == 1, "all blacked-out images are one"
     assert torch.equal(steps.observations["haptics"], mix.steps.observations["haptics"])
