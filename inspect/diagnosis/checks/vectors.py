@@ -381,12 +381,13 @@ def saturated(values: Array) -> Mask:
     A single stretch of equal readings is a stuck axis, and so is a smallest or largest value to which they jump.
     """
     result, changes = np.zeros(len(values), dtype=bool), np.abs(np.diff(values))
-    usual = float(np.median(changes[changes > 0.0])) if changes.any() else 0.0
     for i, series in enumerate((np.abs(values), values, -values) if len(values) else ()):
         at = series == series.max()
-        into = changes[at[1:] & ~at[:-1]]
+        if np.count_nonzero(at) < 2 or np.diff(at, prepend=False).sum() <= 2:  # most readings reach it once
+            continue
+        into, usual = changes[at[1:] & ~at[:-1]], np.median(changes[changes > 0.0])
         jumps = i > 0 and len(into) > 0 and float(np.median(into)) > JUMP * usual
-        result |= at & (np.diff(at, prepend=False).sum() > 2) & (not jumps)
+        result |= at & (not jumps)
     return result
 
 
