@@ -23,7 +23,7 @@ from server_process import serving
 RUNS = ("push-field/information-ekf:image_noise=40", "door-field/information-ekf:image_noise=40")
 CLICKS, SECONDS = 5, 180.0  # bars
 TIMEOUT = 900_000  # ms
-STAGES = {"simulation": "simulating", "training": "step", "profile": "healthy record", "comparison": "comparing"}
+STAGES = {"simulation": "simulating", "training": "step", "comparison": "comparing"}
 """Stage of a run -> part of its message."""
 SIZE = {"width": 1280, "height": 720}
 
@@ -77,8 +77,10 @@ def travel(page: Any, url: str, run: str, screens: Path | None) -> Journey:
     journey.click("Fine-tune")
     for stage, text in STAGES.items():
         journey.until(stage, f"document.querySelector('#finetune .verdict').textContent.includes('{text}')")
-    journey.until("verdict", "document.querySelector('#finetune article').dataset.state === 'ready'")
+    state = "document.querySelector('#finetune article').dataset.state"
+    journey.until("verdict", f"['measuring', 'ready'].includes({state})")
     print(f"{run}: {page.locator('#finetune .verdict').text_content()}", flush=True)
+    journey.until("healthy record", f"{state} === 'ready'")
     journey.click("Promote to default")
     journey.until("promoted", f"window.beliefscope?.state?.().filter.startsWith('{filter_}-')")
     return journey

@@ -49,7 +49,11 @@ class FineTuneProgress(Reply):
 
 
 class FineTunedCheckpoint(Reply):
-    """A fine-tuned checkpoint. no_change: what to try, if the base checkpoint was best; else empty."""
+    """A fine-tuned checkpoint.
+
+    name, hash: of no meaning until the run has one (``FineTuneRunInfo.finetuned``). no_change: what to try, if the base
+    checkpoint was best; else empty.
+    """
 
     name: str
     hash: str
@@ -105,7 +109,7 @@ class FineTuneOffer(Choices):
 
 @dataclass(frozen=True)
 class FineTuneDetails(FineTuneRunInfo):
-    """A fine-tuning run with its progress and result."""
+    """A fine-tuning run with its progress and result, which precedes the checkpoint."""
 
     progress: FineTuneProgress | None
     result: FineTuneResult | None
@@ -168,8 +172,9 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
 
     def details(run: FineTuneRun) -> dict[str, Any]:
         current = info(run)
-        # Not the job's result: a saved filter outlasts its job.
-        result = runs.read(run.run, "result.json") if current.finetuned else None
+        # Not the job's result: a saved filter outlasts its job, which writes the result before it ends.
+        has_result = current.finetuned or (current.job is not None and current.job.state == "running")
+        result = runs.read(run.run, "result.json") if has_result else None
         return asdict(current) | {"progress": runs.read(run.run, "progress.json"), "result": result}
 
     def finetuned_name(run: FineTuneRun) -> str | None:

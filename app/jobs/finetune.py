@@ -1,7 +1,8 @@
-"""Job that fine-tunes a checkpoint and compares the result with its base."""
+"""Job that fine-tunes a checkpoint, compares the result with its base, and measures its healthy record."""
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
@@ -9,7 +10,7 @@ from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.io.atomic_write import write_atomically
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, partial_path, save_checkpoint
+from beliefscope.filters.checkpoint import Checkpoint, partial_path, save_checkpoint
 from beliefscope.filters.engine import one_thread
 from beliefscope.filters.finetuning.finetune import Callbacks, finetune
 from beliefscope.filters.finetuning.loop import Validation
@@ -24,7 +25,11 @@ from beliefscope.inspect.healthy import measure_profile
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Fine-tune, resuming if interrupted; write checkpoint and result into the run's folder."""
+    """Fine-tune, resuming if interrupted; write checkpoint and result into the run's folder.
+
+    The result is written twice: for display while the healthy record is measured, which takes as long as a short
+    training, and with the name and hash of the checkpoint, which contains that record.
+    """
     from beliefscope.recordings.rerun_log.training_curves import log_curves  # imports Rerun
 
     tuning = FineTune.from_json(arguments["tuning"])
@@ -32,7 +37,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     with store_of_job(arguments) as store, one_thread():
         settings = store.settings
         folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
-        path = folder / "finetuned.safetensors"
+        path, result_path = folder / "finetuned.safetensors", folder / "result.json"
+        result_path.unlink(missing_ok=True)  # of an earlier job
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         is_sample = data_name not in settings.data
@@ -66,15 +72,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             )
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
-        source = f"held-out episodes of {data_name}"
-
-        def on_profile(done: float) -> None:
-            report(share("profile", done), "measuring the healthy record")
-
-        on_profile(0.0)
-        profile = measure_profile(result.filter, base.name, episodes, source, is_sample, on_profile)
-        save_checkpoint(result.filter, base.name, result.record, path, profile)
-        finetuned = load_checkpoint(path)
+        finetuned = Checkpoint(result.filter, base.name, "", result.record)
         comparison = compare_checkpoints(
             base,
             finetuned,
@@ -84,9 +82,21 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             seed=settings.seed,
             progress=lambda done: report(share("comparison", done), "comparing the result with the base checkpoint"),
         )
-    success = None if tuning.success is None else judge(tuning.success, comparison, finetuned.task)
-    result_json = _result(comparison, finetuned, arguments["filter"], data_name) | {"success": success}
-    write_atomically(folder / "result.json", json.dumps(as_json(result_json), allow_nan=False).encode())
+        success = None if tuning.success is None else judge(tuning.success, comparison, base.task)
+
+        def write_result() -> None:
+            document = _result(comparison, finetuned, arguments["filter"], data_name) | {"success": success}
+            write_atomically(result_path, json.dumps(as_json(document), allow_nan=False).encode())
+
+        def on_profile(done: float) -> None:
+            report(share("profile", done), "measuring the healthy record")
+
+        write_result()
+        on_profile(0.0)
+        source = f"held-out episodes of {data_name}"
+        profile = measure_profile(result.filter, base.name, episodes, source, is_sample, on_profile)
+        finetuned = replace(finetuned, hash=save_checkpoint(result.filter, base.name, result.record, path, profile))
+        write_result()
     return {"verdict": success.verdict if success else comparison.verdict}
 
 

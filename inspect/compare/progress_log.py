@@ -19,7 +19,7 @@ from beliefscope.inspect.diagnostics.views import as_json
 
 WRITE_INTERVAL = 0.3  # s between writes
 
-COSTS = {"simulation": 4.0 / (os.cpu_count() or 1), "training": 0.5, "profile": 1.0, "comparison": 2.4}
+COSTS = {"simulation": 4.0 / (os.cpu_count() or 1), "training": 0.5, "comparison": 2.4, "profile": 1.0}
 """Relative time of a step of an episode, from which the remaining time of a run is estimated. Measured with
 ``push-field information-ekf``; only the simulation runs on all cores."""
 
@@ -67,8 +67,8 @@ class ProgressShares:
         counts = {
             "simulation": simulated * max(summary.steps for summary in data.summaries),
             "training": settings.steps * settings.windows * settings.length,
-            "profile": steps,
             "comparison": steps,
+            "profile": steps,
         }
         self._costs = {part: COSTS[part] * count for part, count in counts.items()}
 

@@ -34,6 +34,8 @@ const SAVED_AS = {
 };
 const NOT_SAVED =
   'The base checkpoint is unchanged. The fine-tuned one is not in the catalog yet: there is nothing to discard.';
+const MEASURING =
+  'The checkpoint can be promoted or saved when its healthy record is measured, which a diagnosis needs.';
 const RESUMES = 'The run resumes from its last validation.';
 
 const BODY = `
@@ -54,6 +56,7 @@ export class FinetuneRun {
   #store;
   #progress;
   #report;
+  #comparison = ''; // displayed, as JSON
 
   /**
    * @param {HTMLElement} host
@@ -94,9 +97,11 @@ export class FinetuneRun {
     html('.verdict', this.#host).dataset.outcome = success?.outcome ?? '';
     this.#drawSlices(success);
     const isPaused = job?.state === 'cancelled';
-    this.#host.dataset.state = result ? 'ready' : active || isPaused ? 'active' : 'ended';
+    const isComplete = Boolean(result && run.finetuned);
+    const state = result ? 'measuring' : active || isPaused ? 'active' : 'ended';
+    this.#host.dataset.state = isComplete ? 'ready' : state;
     const controls = html('.doing', this.#host);
-    controls.hidden = Boolean(result);
+    controls.hidden = isComplete;
     const bar = element('progress', HTMLProgressElement, controls);
     bar.hidden = !active;
     bar.value = job?.progress ?? 0;
@@ -106,8 +111,10 @@ export class FinetuneRun {
     this.#drawDecision(run);
     const task = this.#store.task(run.task);
     this.#progress.show(progress && task ? progressFigures(progress, task, settings) : null, null);
-    this.#report.show(result?.comparison ?? null, null);
-    this.#drawEvents(run, result?.events ?? [], task);
+    const comparison = JSON.stringify(result?.comparison ?? null);
+    if (comparison !== this.#comparison) this.#report.show(result?.comparison ?? null, null);
+    this.#comparison = comparison;
+    this.#drawEvents(run, isComplete ? (result?.events ?? []) : [], task);
   }
 
   /** @param {Success | null} success */
@@ -141,6 +148,7 @@ export class FinetuneRun {
     const host = html('.decide', this.#host);
     host.hidden = !result;
     if (!result) return;
+    if (!name) return host.replaceChildren(MEASURING);
     const { best_step: best, steps, seconds, no_change: noChange } = result.finetuned;
     const training = `${name}: step ${best} of ${steps}, trained in ${fixed(seconds, 0)} s.`;
     const text = place ? SAVED_AS[place] : `${training} ${NOT_SAVED}`;

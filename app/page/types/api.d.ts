@@ -783,7 +783,7 @@ export interface components {
         };
         /**
          * FineTuneDetails
-         * @description A fine-tuning run with its progress and result.
+         * @description A fine-tuning run with its progress and result, which precedes the checkpoint.
          */
         FineTuneDetails: {
             /** Run */
@@ -920,7 +920,10 @@ export interface components {
         };
         /**
          * FineTunedCheckpoint
-         * @description A fine-tuned checkpoint. no_change: what to try, if the base checkpoint was best; else empty.
+         * @description A fine-tuned checkpoint.
+         *
+         *     name, hash: of no meaning until the run has one (``FineTuneRunInfo.finetuned``). no_change: what to try, if the base
+         *     checkpoint was best; else empty.
          */
         FineTunedCheckpoint: {
             /** Name */
