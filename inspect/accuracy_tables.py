@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from beliefscope.datasets.task import display_name
-from beliefscope.filters.evaluate import STANDALONE, UPDATE
+from beliefscope.filters.evaluate import STANDALONE, STAY, UPDATE
 from beliefscope.inspect.diagnostics.views import Table
 
 LABELS = {
@@ -33,7 +33,7 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
         for name in metrics.get(key, {})
     ]
     rows += [(name, _number(metrics[name]), "", "") for name in ("nll", "nees", "coverage95")]
-    tables = [Table(title, ("measure", "filter", *metrics["baselines"]), rows)]
+    tables = [Table(title, ("measure", "filter", *metrics["baselines"]), rows, _start_note(metrics))]
     errors = {
         label.format(name): (metrics[key][name] or {}).get("rmse", {})
         for name in metrics.get("standalone", {})
@@ -46,6 +46,18 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
         note = f"The filter fails with {' and with '.join(map(display_name, failing))} only." if failing else ""
         tables.append(Table("Modalities", ("measure", *errors), rows, note))
     return tables
+
+
+def _start_note(metrics: Mapping[str, Any]) -> str:
+    """Names the errors that are no smaller than those of the start; empty without any."""
+    stay = (metrics["baselines"].get(STAY) or {}).get("rmse", {})
+    names = [name for name, value in metrics["rmse"].items() if name in stay and value >= stay[name]]
+    if not names:
+        return ""
+    return (
+        f"No better than {STAY}: rmse {', '.join(names)}. Of a state that hardly moves, a start at the true state hides"
+        " the errors of a filter that keeps it; --start-offset starts elsewhere."
+    )
 
 
 def _number(value: float | None) -> str | None:

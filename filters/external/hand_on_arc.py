@@ -1,6 +1,6 @@
 """An external filter for the door in plain PyTorch: no camera, no training, only the motion of the hand.
 
-beliefscope evaluate door --filter examples/04_own_filter.py:build
+beliefscope evaluate door --filter examples/04_own_filter.py:build --start-offset 3cm,20deg
 beliefscope record door --filter examples/04_own_filter.py:build -o own.rrd
 beliefscope serve --filter examples/04_own_filter.py:build
 """

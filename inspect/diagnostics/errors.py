@@ -55,6 +55,8 @@ class Errors(Diagnostic):
         readings: observation key that measures the map components (``Task.positions``) -> root mean square distances of
             its readings and of the estimate from the truth, in the steps with a reading, m.
         restarts: number of traces in which the filter was restarted at the true state.
+        stay: root mean square of the main error with the start as the estimate of all counted steps; NaN if unknown.
+        starts_at_truth: whether all traces start at the true state.
         distance: (T,) m, of a single trace. missing: modality -> (T,) steps of its outages, of a single trace.
     """
 
@@ -67,6 +69,8 @@ class Errors(Diagnostic):
     distance: Array
     missing: dict[str, Mask]
     restarts: int = 0
+    stay: float = math.nan
+    starts_at_truth: bool = False
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -90,6 +94,10 @@ class Errors(Diagnostic):
             text += f"; largest in {worst.name}: {self._text(worst.position)}"
             text += f" ({percent(worst.share)} of the squared error in {percent(steps)} of the steps)"
         parts = [f"{text}."]
+        if total.position >= self.stay:
+            start = "The start, which is the true state," if self.starts_at_truth else "The start"
+            error = self._text(self.stay)
+            parts.append(f"{start} as the estimate of all steps would have {error}: the filter is no better.")
         if self.restarts:
             parts.insert(0, restarted_runs_text(self.restarts, self.trajectories))
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
@@ -201,6 +209,16 @@ def errors_of(traces: Sequence[Trace]) -> Errors:
         distance=distance[0] if single else np.zeros(0),
         missing=missing[0] if single else {},
         restarts=sum(RESTARTS in trace.settings for trace in traces),
+        stay=root_mean_square(np.concatenate([_stay(t)[at] for t, at in zip(traces, counted, strict=True)])),
+        starts_at_truth=all(map(measures.starts_at_truth, traces)),
+    )
+
+
+def _stay(trace: Trace) -> Array:
+    """(T,): main error of the start as the estimate of all steps."""
+    states = trace.episode.states
+    return np.asarray(
+        trace.task.main_error.norm(trace.task.difference(np.broadcast_to(trace.start_mean, states.shape), states))
     )
 
 
