@@ -214,6 +214,7 @@ SCHEMA: tuple[Entity, ...] = (
     ),
     # Likelihood maps, at the steps for which they were computed.
     Entity("maps/title", "TextDocument", "static", "text", "maps", "likelihood or posterior, and the fusion rule"),
+    Entity("maps/step", "Points2D", "()", "text", "maps", "label in the views of maps: the step of the displayed ones"),
     Entity(
         "maps/{layer}",
         "EncodedDepthImage or LineStrips2D",

@@ -19,6 +19,7 @@ from beliefscope.inspect.statistics.measures import deviations
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab
 from beliefscope.recordings.rerun_log.entities import SIGMAS, angles, plane_height, positions
+from beliefscope.recordings.rerun_log.maps import STEP_LABEL
 from beliefscope.recordings.rerun_log.stream import escaped_path
 from beliefscope.recordings.schema import STEP
 
@@ -138,7 +139,8 @@ def _map(layer: str, first: LikelihoodMap) -> rrb.View:
     name = layer if first.quantity == "likelihood" else f"{layer} {first.quantity}"  # long titles are cut
     # Without bounds, the view would zoom out to include estimates outside the map.
     bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
-    return rrb.Spatial2DView(origin=escaped_path(f"maps/{layer}"), name=name, visual_bounds=bounds)
+    contents = ["$origin/**", f"/{STEP_LABEL}"]
+    return rrb.Spatial2DView(origin=escaped_path(f"maps/{layer}"), contents=contents, name=name, visual_bounds=bounds)
 
 
 def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:

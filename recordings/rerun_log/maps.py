@@ -19,19 +19,23 @@ from beliefscope.recordings.rerun_log.entities import rgba, series, sources
 
 Array = NDArray[Any]
 PLANE_CELLS = 60  # maximum per side of the map in the scene; the image view has the full resolution
+STEP_LABEL = "maps/step"
+"""Path of the label in all views of maps: at the steps without maps, a viewer shows the latest ones."""
 PNG_LEVEL = 6  # of zlib; a higher one takes several times as long for 3 % less
 
 
 def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
     """Static properties of all maps of a recording: quantity, size, colour map, markers."""
     yield "maps/title", rr.TextDocument(first.title)
+    side = len(first.offsets_x)
+    # The label is at the upper edge of every map.
+    yield STEP_LABEL, rr.Points2D.from_fields(positions=[[side / 2, 0.0]], radii=0.0, show_labels=True)
     if first.is_curve:
         for layer in first.layers:
             for path, source in (("", layer), ("/estimate", layer), ("/truth", "truth")):
                 hue = rgba(colour(source, trace.modalities), 1.0 if path != "/estimate" else 0.6)
                 yield f"maps/{layer}{path}", rr.LineStrips2D.from_fields(colors=hue, radii=rr.Radius.ui_points(1.2))
         return
-    side = len(first.offsets_x)
     pixels = rr.EncodedDepthImage.from_fields(media_type="image/png", colormap="Viridis", depth_range=[0.0, 255.0])
     for layer in first.layers:
         yield f"maps/{layer}", pixels
@@ -50,6 +54,7 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
 def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     """Columns of maps of one size, flipped so that y points up."""
     steps = [m.step for m in maps]
+    yield STEP_LABEL, rr.Points2D.columns(labels=[f"step {step}" for step in steps])
     shares = np.stack([m.normalised() for m in maps])
     peaks = np.stack([m.log_likelihood.max(axis=(1, 2)) for m in maps])
     for index, layer in enumerate(maps[0].layers):

@@ -195,6 +195,16 @@ def test_precision_of_maps(new_trace: Callable[..., Trace], new_map: MapMaker, t
     assert np.abs(shares * np.exp(log_peak) - likelihood).max() <= likelihood.max() / 510 * 1.0001
 
 
+def test_maps_are_labelled_with_their_step(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+    write_recording(trace, tmp_path / "run.rrd", [new_map(trace, step) for step in (0, 20)])
+    labels = {}
+    for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/maps/step"):
+        batch = chunk.to_record_batch()
+        if "Points2D:labels" in batch.schema.names:
+            labels = dict(zip(batch.column(STEP).to_pylist(), batch.column("Points2D:labels").to_pylist(), strict=True))
+    assert labels == {0: ["step 0"], 20: ["step 20"]}
+
+
 def test_recording_has_one_layout(trace: Trace, tmp_path: Path) -> None:
     write_recording(trace, tmp_path / "run.rrd")
     assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == 1
