@@ -294,3 +294,35 @@ def test_periodic_readings_with_the_opposite_sign_are_not_delayed() -> None:
         )
         assert abs(values["reading lag/gps/all"]) < 0.1, name
         assert (values["inverted/gps x/all"] > 1.0) == (sign < 0.0)
+
+
+def test_biases_of_two_channels_are_no_exchange() -> None:
+    """A rover that stands still reads about constants, which two biases can bring near to each other's."""
+    states = np.column_stack([0.01 * NEW.states[:, :2], NEW.states[:, 2]])
+    gps = NEW.observations["gps"] - NEW.states[:, :2] + states[:, :2]
+    standing = replace(NEW, states=states.astype(np.float32))
+    biases = np.array([3.0, -3.0]) * NOISE
+    exchanged, biased = (
+        reading_statistics(with_readings(standing, "gps", gps[:, ::-1] + b), models()) for b in (0.0, biases)
+    )
+    assert exchanged["exchanged/gps x/all"] > 3.0
+    assert biased["exchanged/gps x/all"] == 0.0
+
+
+def test_repeated_readings_have_no_delay_of_their_own() -> None:
+    """A clock that drifts repeats some readings late; a sensor that is stuck repeats one that was in time."""
+    steps, gps = np.arange(STEPS), NEW.observations["gps"]
+    drifting = gps[np.maximum(steps - np.linspace(0.0, 9.0, STEPS).astype(int), 0)]
+    stuck = gps[np.minimum(steps, STEPS // 2)]
+    late, in_time = (reading_statistics(with_readings(NEW, "gps", x), models()) for x in (drifting, stuck))
+    assert late["reading lag/gps/all"] > 2.0
+    assert in_time["reading lag/gps/all"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_heading_among_the_controls_turns_readings_into_the_body_frame() -> None:
+    heading = Component("yaw", "rad", wraps=True)
+    task = replace(PLANE, components=PLANE.components[:2], control_size=1, channels={"control": (heading,)})
+    episodes = [replace(e, task=task, states=e.states[:, :2], controls=e.states[:, 2:]) for e in EPISODES]
+    assert [(m.key, m.channels) for m in fit_reading_models(episodes, ["odometry"])] == [("odometry", (0, 1))]
+    unknown = replace(task, channels={})
+    assert fit_reading_models([replace(e, task=unknown) for e in episodes], ["odometry"]) == ()
