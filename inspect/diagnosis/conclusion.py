@@ -30,6 +30,7 @@ from beliefscope.inspect.diagnosis.cause import (
     probability_text,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
+from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
 from beliefscope.inspect.diagnosis.checks.sensors import covers_episode
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.largest_error import largest_error
@@ -62,6 +63,9 @@ MAX_NEES = 2.0
 
 WRONG_NEES = 10.0
 """As ``MAX_NEES``, from which the filter is not called healthy, although it does not deviate from its record."""
+
+BY_MODALITY = (LATE.name, "weights.ignores_likelihood", "weights.repeats_likelihood")
+"""Causes that concern some modalities, which their names do not tell."""
 
 LENGTHS = 1.5
 """Largest ratio of the number of steps of an episode to those of the record that is not mentioned."""
@@ -137,7 +141,14 @@ def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
     outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
-    return _other_lengths(case) + sensors + _likelihoods(case) + absent + (outdated if new else [])
+    return _other_lengths(case) + sensors + _unexpected(case) + _likelihoods(case) + absent + (outdated if new else [])
+
+
+def _unexpected(case: Case) -> list[str]:
+    """Sensors whose readings no model expects, so that channels may be exchanged or inverted without a deviation."""
+    task, models = case.inputs.checkpoint.task, {model.key for model in case.profile.readings}
+    keys = [key for key in modelled_sensors(task) if key not in models and models]
+    return [f"exchanged and inverted channels of {display_name(key)}" for key in keys]
 
 
 def _likelihoods(case: Case) -> list[str]:
@@ -298,7 +309,7 @@ def _lower(title: str) -> str:
 def channels_text(case: Case, cause: Cause) -> str:
     """The channels of a sensor or of the controls that a cause concerns: `` (elbow)``. Empty for all, or without names.
 
-    Channels with more than half of the largest deviation; the controls with a wrong effect; modalities of late updates.
+    Channels with more than half of the largest deviation; the controls with a wrong effect; of ``BY_MODALITY``, models.
     """
     task, key, alarms = case.inputs.checkpoint.task, cause.component.rpartition(".")[2], symptoms_of(cause, case.alarms)
     if key == "dynamics":
@@ -309,7 +320,8 @@ def channels_text(case: Case, cause: Cause) -> str:
         if channel := channel_of(alarm.statistic.split("/")[1], task):
             largest.setdefault(channel[1].name.removeprefix(f"{key} "), abs(alarm.t))
     limit, names = 0.5 * max(largest.values(), default=0.0), [channel.name for channel in task.channels.get(key, ())]
-    if cause.name == LATE.name:
+    if cause.name in BY_MODALITY:
+        alarms = [alarm for alarm in alarms if cause.symptoms[0].direction * alarm.t > 0.0]
         limit, names, largest = 0.0, list(task.modalities), {a.statistic.split("/")[1]: abs(a.t) for a in alarms}
     own = [name for name in names if largest.get(name, 0.0) > limit]
     return f" ({', '.join(map(display_name, own))})" if 0 < len(own) < len(names) else ""

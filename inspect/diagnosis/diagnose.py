@@ -256,7 +256,8 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
             source = checkpoint.source if is_code(checkpoint.source) else "FILE.py:FUNCTION"
         raise BadInput(
             f"{no_diagnosis(checkpoint)}; compare it with clean episodes: beliefscope diagnose "
-            f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
+            f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA; add "
+            "--profile-filter OLD if only an earlier version OLD is known to be right"
         )
     return profile
 

@@ -21,9 +21,7 @@ def change(
     seed: int = 0,
     engine: opt.Engine = "local",
     workers: int = 1,
-    output: Path | None = opt.option(
-        "DIR", "New folder for change.json, change.svg, change.pdf and change.md.", None, "-o"
-    ),
+    output: Path | None = opt.option("DIR", "New folder for change.json, .svg, .pdf and .md.", None, "-o"),
 ) -> console.Result:
     """Report improvements and regressions between filters.
 
