@@ -7,8 +7,8 @@ def plural(count: int, noun: str) -> str:
 
 
 def capitalised(text: str) -> str:
-    """The text with a capital first letter; the other letters stay as they are."""
-    return text[:1].upper() + text[1:]
+    """The text with a capital first letter; symbols, such as ``x``, and the other letters stay as they are."""
+    return text[:1].upper() + text[1:] if len(text) > 1 else text
 
 
 def percent(share: float, form: str = ".0f") -> str:
