@@ -15,7 +15,7 @@ from beliefscope.app.protocol import map_format, messages
 from beliefscope.app.runs.result_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
-from beliefscope.inspect.diagnosis.largest_error import MAX_SIGMAS
+from beliefscope.inspect.diagnosis.largest_error import MAX_SIGMAS, MAX_STEPS
 from beliefscope.inspect.diagnostics.error_sources import MIN_SHARE
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
 from beliefscope.inspect.maps.map_engine import COARSE, FINE
@@ -43,6 +43,7 @@ def constants() -> dict[str, tuple[str, object]]:
         "SHOWN": ("Smallest probability of a cause of a fault that is listed.", SHOWN),
         "LARGEST": ("Largest probability that is displayed as a number.", LARGEST),
         "MAX_SIGMAS": ("Largest consistent deviation of one component, in standard deviations.", MAX_SIGMAS),
+        "MAX_STEPS": ("Largest number of steps of a run whose sources of the error are always computed.", MAX_STEPS),
         "MIN_SHARE": ("Share of an error, positive or negative, from which a source is named.", MIN_SHARE),
         "HASH_DIGITS": ("Digits of its hash at the end of the name of a checkpoint of a sweep.", HASH_DIGITS),
         "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning run.", FineTune.clean_weight),

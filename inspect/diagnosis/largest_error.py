@@ -19,7 +19,7 @@ MAX_SIGMAS = 2
 
 
 MAX_STEPS = 1000
-"""Largest number of steps of a run whose sources are computed with every diagnosis."""
+"""Largest number of steps of a run whose sources are computed with every diagnosis, and whenever it is displayed."""
 
 
 @dataclass(frozen=True)

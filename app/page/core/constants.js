@@ -23,6 +23,9 @@ export const LARGEST = /** @type {const} */ (0.99);
 /** Largest consistent deviation of one component, in standard deviations. */
 export const MAX_SIGMAS = /** @type {const} */ (2);
 
+/** Largest number of steps of a run whose sources of the error are always computed. */
+export const MAX_STEPS = /** @type {const} */ (1000);
+
 /** Share of an error, positive or negative, from which a source is named. */
 export const MIN_SHARE = /** @type {const} */ (0.1);
 

@@ -3,7 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Curve } from '../types/server.js' */
 
-import { MIN_SHARE } from '../core/constants.js';
+import { MAX_STEPS, MIN_SHARE } from '../core/constants.js';
 import { fixed, withUnit } from '../core/units.js';
 import * as api from '../data/api.js';
 
@@ -16,7 +16,7 @@ const DIAGNOSTIC = 'sources';
  * @returns {Promise<Curve[]>}
  */
 export async function loadErrorSources(trace, signal) {
-  if (trace.live?.state === 'running') return [];
+  if (trace.live?.state === 'running' || trace.steps > MAX_STEPS) return [];
   const entries = await api.diagnostics(trace.selection, signal);
   if (entries.find(({ name }) => name === DIAGNOSTIC)?.why_not !== null) return [];
   return (await api.poll(api.diagnosticUrl(trace.selection, DIAGNOSTIC, {}), signal)).curves;
