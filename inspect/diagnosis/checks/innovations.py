@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -84,7 +85,9 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
 
     An update has ``det P / det P+ = det S / det R``, whatever the measurement function, and several updates in turn
     have the product of these ratios: the logarithms of the steps are linear equations for those of the modalities. For
-    modalities that are always used together, they only give the mean of all, ``measurement noise//all``.
+    modalities that are always used together, they only give the mean of all, ``measurement noise//all``. Several
+    updates at once lack the covariances between the measurements in ``det S``: where the filter also reports the
+    single-modality updates from the common prediction, each has an equation of its own.
 
     Only of filters that report their prediction and whose beliefs have a covariance of full rank.
 
@@ -99,6 +102,12 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     before, after = predicted.covariance, trace.estimate_covariance.astype(np.float64)
     (sign_s, of_s), (sign, of_before), (sign_after, of_after) = map(np.linalg.slogdet, (s, before, after))
     channels = used.sum(-1)  # (T, K)
+    if (own := _updates_of_one_prediction(trace)) is not None:
+        sign_own, of_own = np.linalg.slogdet(own)
+        each = 0.5 * (of_s - of_before[:, None] + of_own) / np.maximum(channels, 1)
+        valid = (counted(trace) & (sign > 0))[:, None] & (sign_s > 0) & (sign_own > 0) & (channels > 0)
+        known = {m: each[at, k] for k, (m, at) in enumerate(zip(trace.modalities, valid.T, strict=True))}
+        return _deviations({m: float(v.mean()) for m, v in known.items() if len(v) >= MIN_STEPS})
     keep = counted(trace) & (sign_s > 0).all(-1) & (sign > 0) & (sign_after > 0) & (channels.sum(-1) > 0)
     total = 0.5 * (of_s.sum(-1) - of_before + of_after)  # sum of the channels' log standard deviations
     if keep.sum() < MIN_STEPS:
@@ -106,7 +115,22 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     values = _by_modality(trace.modalities, channels[keep].astype(np.float64), total[keep])
     if len(values) < (channels[keep] > 0).any(0).sum():
         values[""] = float(np.mean(total[keep] / channels.sum(-1)[keep]))
-    return {f"measurement noise/{m}/all": math.exp(v) for m, v in values.items() if abs(v) < LARGEST_LOGARITHM}
+    return _deviations(values)
+
+
+def _updates_of_one_prediction(trace: Trace) -> Array | None:
+    """(T, K, n, n) covariances of the single-modality updates of one prediction; None for updates in turn."""
+    before, after = trace.predicted_covariance, trace.modality_covariance
+    if before is None or len(trace.modalities_with_posterior) < max(2, len(trace.modalities)):
+        return None
+    if not np.allclose(before, before[:, :1], rtol=1e-4):
+        return None
+    return after.astype(np.float64)
+
+
+def _deviations(logarithms: Mapping[str, float]) -> dict[str, float]:
+    """``measurement noise/MODALITY/all`` from the mean logarithms of the standard deviations."""
+    return {f"measurement noise/{m}/all": math.exp(v) for m, v in logarithms.items() if abs(v) < LARGEST_LOGARITHM}
 
 
 def accepted_channels(trace: Trace, used: Mask, keep: Mask | slice = slice(None)) -> Mask:

@@ -16,7 +16,7 @@ from beliefscope.inspect.statistics.reading_model import (
     readings_of,
 )
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, fitted_lag, largest_lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, largest_lag
 
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
@@ -24,6 +24,9 @@ MAX_CHANNELS = 24
 SIMPLER = 2.0
 """Largest error with another sign and order, relative to that with a delay or biases, at which the former is preferred.
 """
+
+PARTS = 3
+"""Number of parts of an episode, each with a delay of its own if the episode has none."""
 
 SURELY = 4.0
 """Smallest number of standard errors of a slope."""
@@ -190,14 +193,24 @@ def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]
     """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay.
 
     Periodic readings with the opposite sign look delayed: without a delay, channels may have another sign and order.
+    The delay of a clock that drifts is the mean of those of ``PARTS`` of the episode.
 
     Args:
         dt: s per step.
     """
     known = (np.arange(len(compared.present)) >= FIRST_CHANGES) & compared.present.any()
-    delay = fitted_lag(compared.readings, compared.expected, compared.fresh, known, largest_lag(dt))
-    errors = compared.errors()
-    if np.isnan(delay) or delay == 0.0:
+
+    def lag_of(fresh: Mask) -> float:
+        return fitted_lag(compared.readings, compared.expected, fresh, known, largest_lag(dt))
+
+    delay, errors = lag_of(compared.fresh), compared.errors()
+    if np.isnan(delay):
+        parts = np.arange(len(known)) * PARTS // len(known)
+        drifting = float(np.round(np.mean([lag_of(compared.fresh & (parts == part)) for part in range(PARTS)])))
+        is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())
+        is_late = is_own and not np.isnan(drifting)
+        return (drifting, compared.errors(int(drifting))) if is_late else (delay, errors)
+    if delay == 0.0:
         return delay, errors
     delayed = compared.errors(int(delay))
     is_arranged = errors.min((0, 2)).sum() < SIMPLER * np.diagonal(delayed[0]).sum()

@@ -316,6 +316,8 @@ def test_repeated_readings_have_no_delay_of_their_own() -> None:
     stuck = gps[np.minimum(steps, STEPS // 2)]
     late, in_time = (reading_statistics(with_readings(NEW, "gps", x), models()) for x in (drifting, stuck))
     assert late["reading lag/gps/all"] > 2.0
+    by_parts = gps[np.maximum(steps - np.linspace(0.0, 18.0, STEPS).astype(int), 0)]
+    assert reading_statistics(with_readings(NEW, "gps", by_parts), models())["reading lag/gps/all"] == 8.0
     assert in_time["reading lag/gps/all"] == pytest.approx(0.0, abs=0.05)
 
 
