@@ -5,10 +5,13 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import beliefscope as bs
 from beliefscope.inspect.diagnostics.kalman_equations import check_equations
+
+pytestmark = pytest.mark.slow
 
 Array = NDArray[np.float64]
 
