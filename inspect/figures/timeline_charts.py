@@ -113,7 +113,7 @@ def chart_of(name: str, trace: Trace, component: int, beta: bool = False) -> Cha
     if name.startswith("extra/"):
         title = display_name(name.removeprefix("extra/"))
         return Chart(title, "", _lines([("fused", trace.extra[name.removeprefix("extra/")], None)], trace))
-    if name in _innovation_columns(trace):
+    if name.startswith("innovation/"):
         return _reported_innovation(trace, [name])
     sensor = name.removeprefix("readings/")
     values, channels = reading_channels(trace)[name]

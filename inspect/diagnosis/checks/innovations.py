@@ -121,7 +121,7 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
 def _updates_of_one_prediction(trace: Trace) -> Array | None:
     """(T, K, n, n) covariances of the single-modality updates of one prediction; None for updates in turn."""
     before, after = trace.predicted_covariance, trace.modality_covariance
-    if before is None or len(trace.modalities_with_posterior) < max(2, len(trace.modalities)):
+    if before is None or len(trace.modalities_with_posterior) < 2:
         return None
     if not np.allclose(before, before[:, :1], rtol=1e-4):
         return None

@@ -78,8 +78,8 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
             continue
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)
-        is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())  # sign and order
-        values[f"reading lag/{model.key}/all"] = _short_delay(compared) if delay == 0.0 and is_own else delay
+        is_short = delay == 0.0 and _is_own_arrangement(errors)
+        values[f"reading lag/{model.key}/all"] = _short_delay(compared) if is_short else delay
         whole = 0 if np.isnan(delay) else int(delay)
         line = _line(*compared.pairs(whole), compared.steps(whole) / len(episode), model.gain_spreads)
         least, biased = errors.min(0), compared.errors_with_biases(whole)
@@ -189,6 +189,11 @@ def _evidence(error: Array, other: Array, limit: float, biased: Array) -> Array:
     return np.asarray(0.5 * np.log(np.where(fits, np.maximum(ratio, 1.0), 1.0)))
 
 
+def _is_own_arrangement(errors: Array) -> bool:
+    """Whether all channels have the smallest errors (2, A, A) with their own sign and order."""
+    return bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())
+
+
 def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]:
     """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay.
 
@@ -207,8 +212,7 @@ def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]
     if np.isnan(delay):
         parts = np.arange(len(known)) * PARTS // len(known)
         drifting = float(np.round(np.mean([lag_of(compared.fresh & (parts == part)) for part in range(PARTS)])))
-        is_own = bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())
-        is_late = is_own and not np.isnan(drifting)
+        is_late = _is_own_arrangement(errors) and not np.isnan(drifting)
         return (drifting, compared.errors(int(drifting))) if is_late else (delay, errors)
     if delay == 0.0:
         return delay, errors
