@@ -91,7 +91,7 @@ def _start(context: Any, function: Callable[[Item], object], processes: dict[Con
         try:
             process.start()
             break
-        except ConnectionError:  # the server of forks has ended with an interrupted start; it starts again
+        except (ConnectionError, EOFError):  # the server of forks ended with an interrupted start; it starts again
             if attempt == ATTEMPTS - 1:
                 raise
             time.sleep(PAUSE)
