@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -184,8 +185,8 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 
     ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality: of ``correction_slopes``. ``covariance update``: ``Updates.covariance_slope``, of
-    filters without fusion weights.
+    ``correction slope``, by modality: of ``correction_slopes``. ``covariance update``: ``Updates.covariance_slope`` of
+    nearly linear steps, of filters without fusion weights.
     """
     has_truth = bool(np.isfinite(trace.episode.states).all())
     repeated = None if why_not(trace, checkpoint) else repeat_steps(trace, checkpoint, at_truth=has_truth)
@@ -198,7 +199,9 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
         updates = expected_updates(repeated)
         columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated, updates))
         if trace.weights is None:
-            columns["covariance update"] = ([""], np.array([updates.covariance_slope]))
+            linear = repeated.linear()
+            slope = math.nan if linear is None else expected_updates(linear).covariance_slope
+            columns["covariance update"] = ([""], np.array([slope]))
     return {
         f"{kind}/{name}/all": float(value)
         for kind, (names, values) in columns.items()

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 import beliefscope as bs
-from beliefscope.inspect.diagnostics.kalman_equations import check_equations
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.diagnostics.kalman_equations import check_equations, jacobian_statistics
 
 pytestmark = pytest.mark.slow
 
@@ -35,25 +36,35 @@ def readings_of(states: Array) -> Array:
     return np.stack([distance, np.arctan2(y, x), (x * v + y * w) / distance], -1)
 
 
-def move(states: Array) -> Array:
-    return states + DT * np.concatenate([states[..., 2:], np.zeros_like(states[..., 2:])], -1)
+WALL = 12.5
+"""x in m at which targets turn back, in some tests."""
 
 
-def track(seed: int, steps: int = 28) -> bs.Episode:
+def move(states: Array, wall: float = np.inf) -> Array:
+    moved = states + DT * np.concatenate([states[..., 2:], np.zeros_like(states[..., 2:])], -1)
+    moved[..., 0] -= 2.0 * np.maximum(moved[..., 0] - wall, 0.0)
+    return moved
+
+
+def track(seed: int, steps: int = 28, wall: float = np.inf) -> bs.Episode:
     """Of so few steps that one of them is repeated at the start."""
     rng = np.random.default_rng(seed)
     state = np.array([12.0, 0.0, 0.5, 0.3]) + rng.normal(0.0, [1.5, 2.0, 0.3, 0.3])
-    states = np.array([state := move(state) + rng.normal(0.0, PROCESS) for _ in range(steps)])
+    states = np.array([state := move(state, wall) + rng.normal(0.0, PROCESS) for _ in range(steps)])
     readings = {"radar": readings_of(states) + rng.normal(0.0, NOISE, (steps, 3))}
     return bs.Episode(TASK, states, np.zeros((steps, 0)), readings, seed=seed, split="test")
 
 
 class Unscented:
-    """An unscented Kalman filter. factor: of its cross-covariance of state and bearing."""
+    """An unscented Kalman filter.
+
+    factor: of its cross-covariance of state and bearing. reduction: of that of the covariance by an update.
+    """
 
     task: ClassVar = TASK
 
-    def __init__(self, factor: float = 1.0) -> None:
+    def __init__(self, factor: float = 1.0, reduction: float = 1.0, wall: float = np.inf) -> None:
+        self.reduction, self.wall = reduction, wall
         self.factor = np.array([1.0, factor, 1.0])
         self.weights = np.full(9, 0.5 / SPREAD)
         self.weights[0] = 1.0 - 4.0 / SPREAD
@@ -67,7 +78,7 @@ class Unscented:
         return np.asarray(self.mean + np.concatenate([np.zeros((1, 4)), root, -root]))
 
     def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
-        moved = move(self.points())
+        moved = move(self.points(), self.wall)
         self.mean = self.weights @ moved
         d = moved - self.mean
         self.covariance = d.T @ (self.squares[:, None] * d) + np.diag(PROCESS**2)
@@ -79,7 +90,7 @@ class Unscented:
         gain = d.T @ (self.squares[:, None] * e) * self.factor @ np.linalg.inv(size)
         innovation = observations["radar"] - self.weights @ expected
         self.mean = self.mean + gain @ innovation
-        self.covariance = self.covariance - gain @ size @ gain.T
+        self.covariance = self.covariance - self.reduction * gain @ size @ gain.T
         return prediction | {
             "estimate_mean": self.mean,
             "estimate_covariance": self.covariance,
@@ -88,15 +99,29 @@ class Unscented:
         }
 
 
-def alarms(filter_: Unscented) -> tuple[str, ...]:
+def loaded(filter_: Unscented) -> ExternalFilter:
     adapter = bs.Adapter(filter_, batched=False, modalities=("radar",), initial_std=(2.0, 2.0, 2.0, 2.0), task=TASK)
-    checkpoint = bs.load_filter(adapter, name="unscented")
+    return bs.load_filter(adapter, name="unscented")
+
+
+def alarms(filter_: Unscented) -> tuple[str, ...]:
+    checkpoint = loaded(filter_)
     return check_equations([bs.trace(checkpoint, [track(seed)]) for seed in range(6)], checkpoint).alarms
 
 
 def test_wide_first_beliefs_do_not_make_a_right_filter_wrong() -> None:
     """Sigma points over which the bearing is curved have another covariance than its derivative."""
     assert alarms(Unscented()) == ()
+
+
+@pytest.mark.parametrize("reduction", [1.0, 0.5])
+def test_reductions_of_the_covariance_are_those_of_nearly_linear_steps(reduction: float) -> None:
+    """Where a target turns back at a wall, the prediction has two derivatives."""
+    checkpoint = loaded(Unscented(reduction=reduction, wall=WALL))
+    traces = [bs.trace(checkpoint, [track(seed, 80, WALL)]) for seed in range(8)]
+    slopes = np.array([jacobian_statistics(trace, checkpoint)["covariance update//all"] for trace in traces])
+    np.testing.assert_allclose(slopes[np.isfinite(slopes)], reduction, atol=0.03)
+    assert np.isfinite(slopes).sum() >= 4
 
 
 def test_a_wrong_gain_of_one_channel_is_still_named() -> None:
