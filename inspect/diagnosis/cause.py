@@ -24,7 +24,8 @@ class Symptom:
         weight: relative to the other symptoms of the cause.
         target: how the statistics together must deviate: ``mirrored``, to the healthy values with the opposite sign;
             ``shifted``, all by the same amount; ``common``, those of all modalities by the same amount in each
-            component; ``alone``, the opposite of ``common``; ``shrunk``, towards zero and not beyond.
+            component; ``alone``, the opposite of ``common``; ``shrunk``, towards zero and not beyond; ``exchanged``,
+            those of some subjects to each other's healthy values.
         otherwise: symptoms that may occur in its place. unmeasured: those in its place if it has no statistic.
         optional: whether it counts only where it can be observed.
     """
@@ -32,7 +33,7 @@ class Symptom:
     statistics: str
     direction: Literal[-1, 0, 1] = 1
     weight: float = 1.0
-    target: Literal["", "mirrored", "shifted", "common", "alone", "shrunk"] = ""
+    target: Literal["", "mirrored", "shifted", "common", "alone", "shrunk", "exchanged"] = ""
     otherwise: tuple[Symptom, ...] = ()
     unmeasured: tuple[Symptom, ...] = ()
     optional: bool = False

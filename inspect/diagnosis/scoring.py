@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice, permutations
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom, matches
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.diagnostics.statistic_kinds import ADJUSTED
+from beliefscope.inspect.statistics.measures import Array
 
 NOISE, GROWTH = 0.7, 1.0
 """Ratio of a t-value to its critical value up to which a deviation does not count, and scale of its growth."""
@@ -33,6 +35,9 @@ UNKNOWN = -0.3
 
 PAIR = 0.3
 """Penalty of two causes at a time."""
+
+MAX_ORDERS = 120
+"""Maximum number of orders of subjects that may be exchanged."""
 
 
 def strength(ratio: float) -> float:
@@ -69,11 +74,10 @@ def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
         beyond = (np.abs(value) > np.abs(healthy)) | (value * healthy < -0.1 * np.square(healthy))
         return 1.0 - 2.0 * float((weights * beyond).sum() / max(weights.sum(), 1e-9))
     if target == "mirrored":
-        distance = np.abs(value + healthy) / np.maximum(np.abs(shift), 1e-9)
         # Statistics that hardly deviate may have no part in it.
-        informative = np.minimum(1.0, np.abs(healthy) / width) * np.square([d.t for d in deviations])
-        fits = np.maximum(1.0 - 2.0 * distance, -1.0)
-        return float((informative * fits).sum() / max(informative.sum(), 1e-9))
+        return _fit(deviations, -healthy, np.minimum(1.0, np.abs(healthy) / width))
+    if target == "exchanged":
+        return _exchange(deviations)
     # Log-likelihood ratio of equal shifts against a shift of the most precise modality only; the width is 4 sigma.
     ratio = 0.0
     components = [d.statistic.split("/")[1].rpartition(" ")[2] for d in deviations]
@@ -84,6 +88,27 @@ def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
             sigma = np.hypot(width[k], width[first]) / 4.0
             ratio += float(shift[k] ** 2 - (shift[k] - shift[first]) ** 2) / (2.0 * sigma**2)
     return math.tanh(ratio if target == "common" else -ratio)
+
+
+def _fit(deviations: Sequence[Deviation], expected: Array, weights: Array) -> float:
+    """How well values agree with expected ones (D,), -1 to 1, by the squares of their t-values and further weights."""
+    value, healthy, t = np.array([(d.value, d.healthy, d.t) for d in deviations]).T
+    fits = np.maximum(1.0 - 2.0 * np.abs(value - expected) / np.maximum(np.abs(value - healthy), 1e-9), -1.0)
+    weights = weights * np.square(t)
+    return float((weights * fits).sum() / max(weights.sum(), 1e-9))
+
+
+def _exchange(deviations: Sequence[Deviation]) -> float:
+    """How well the values of subjects agree with each other's healthy values, in the best order but their own."""
+    healthy = {deviation.statistic: deviation.healthy for deviation in deviations}
+    names = [name.split("/") for name in healthy]
+    subjects = tuple(dict.fromkeys(subject for _, subject, _ in names))
+    best = -1.0
+    for order in islice(permutations(subjects), 1, MAX_ORDERS):
+        source = dict(zip(subjects, order, strict=True))
+        expected = [healthy.get(f"{kind}/{source[x]}/{phase}", math.inf) for kind, x, phase in names]
+        best = max(best, _fit(deviations, np.array(expected), np.ones(len(names))))
+    return best
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ def _with_true_starts(cause: Cause) -> Cause:
 def _in_predictions_of_run(cause: Cause) -> Cause:
     others = f"{DYNAMICS}|process noise/*|measurement function/*"
     changed = {
-        "weights": f"{others}|correction slope/*|covariance update/*",
+        "weights": f"{others}|correction slope/*|covariance update/*|measurement noise/*",
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
         "process_noise": _dynamics("bias", "error", "offset", "scatter", "spread"),
         "measurement_noise": f"{DYNAMICS}|process noise/*",

@@ -17,6 +17,16 @@ MODALITIES = ("image", "haptics")
 """Modalities whose measurement models have causes in the catalog."""
 
 
+EXCHANGED = Cause(
+    "weights.exchanged",
+    "Fusion weights exchanged between modalities",
+    (Symptom("beta logit/*|beta spread/*|beta contact/*", target="exchanged"),),
+    WEIGHTS,
+    "Check the order of the modalities in the filter and its weights.",
+    prior=0.2,  # the variation of one of them may fall, as that of constant weights
+)
+
+
 def model_causes(task: Task) -> tuple[Cause, ...]:
     """Causes beyond the sensors that the catalog does not have for the task."""
     return tuple(cause for part in (_models, _labels, _controls, _weights) for cause in part(task))
@@ -125,7 +135,12 @@ def _controls(task: Task) -> tuple[Cause, ...]:
 
 
 def _weights(task: Task) -> tuple[Cause, ...]:
-    """Fusion weights that ignore one of two modalities of other names than those of the catalog."""
+    """Fusion weights of several modalities that are exchanged; or that ignore one of two, if the catalog has no cause.
+
+    Exchanged weights of two modalities are called inverted.
+    """
+    if len(task.modalities) > 2:
+        return (EXCHANGED,)
     if len(task.modalities) != 2 or set(task.modalities) == set(MODALITIES):
         return ()
     return tuple(

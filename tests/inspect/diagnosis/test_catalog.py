@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.catalog import CAUSES
@@ -132,6 +133,20 @@ def test_mirrored_and_shifted_statistics_are_told_apart_by_their_values() -> Non
     shrunk = Symptom("beta logit/*", target="shrunk")
     assert support(shrunk, deviations((1.0, 0.5))) > 0.9 > 0.0 > support(shrunk, deviations((-11.0, -5.0)))
     assert support(shifted, deviations((3.0, -3.0))) > 0.9 > 0.0 > support(mirrored, deviations((3.0, -3.0)))
+
+
+def test_exchanged_statistics_have_the_healthy_values_of_each_other() -> None:
+    exchanged = Symptom("beta logit/*", target="exchanged")
+    names, healthy = ("camera", "sonar", "touch"), np.array([9.0, -4.0, 2.0])
+
+    def deviations(values: NDArray[np.float64]) -> list[Deviation]:
+        changes = zip(names, values - healthy, values, healthy, strict=True)
+        return [deviation(f"beta logit/{name}/all", t, value, h) for name, t, value, h in changes]
+
+    for order in ([1, 0, 2], [1, 2, 0]):
+        assert support(exchanged, deviations(healthy[order])) > 0.9
+    for others in (-healthy, healthy + 13.0, 0.0 * healthy):
+        assert support(exchanged, deviations(others)) < 0.5
 
 
 def test_strength_grows_from_insignificance_to_one() -> None:
