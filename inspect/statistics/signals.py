@@ -29,6 +29,12 @@ SMALL_REST = 0.3
 BETTER = 0.9
 """Largest unpredicted variance at a lag, relative to that without one."""
 
+DRIFTS = 0.6
+"""As ``BETTER``, of a lag that grows."""
+
+FASTEST, RATES = 0.25, 51
+"""Largest growth of a lag by step, and number of growths that are searched: an odd one."""
+
 MAX_PAIRS = 4_000
 """Number of steps of a signal that are compared at each lag, evenly spaced."""
 
@@ -199,25 +205,63 @@ def fitted_lag(late: Array, early: Array, late_known: Mask, early_known: Mask, l
     if min(late_known.sum(), early_known.sum()) < MIN_STEPS:
         return np.nan
     largest = min(largest, len(late) // 4)
-    steps, lags = np.flatnonzero(late_known), np.arange(-largest, largest + 1)
-    steps = steps[:: 1 + len(steps) // MAX_PAIRS]
-    source = steps[:, None] - lags  # (S, L): step of ``early`` that belongs to a step of ``late``
-    inside = source.clip(0, len(late) - 1)
-    paired = ((source == inside) & early_known[inside])[..., None]
-    count = np.maximum(paired.sum(0), 1)
-    a, b = (np.where(paired, x, 0.0) for x in (late[steps][:, None], early[inside]))  # (S, L, d)
-    a, b = (np.where(paired, x - x.sum(0) / count, 0.0) for x in (a, b))
-    correlation = (a * b).sum(0) / np.sqrt(np.maximum((a * a).sum(0) * (b * b).sum(0), 1e-24))
-    rest = 1.0 - np.square(np.maximum(correlation, 0.0))  # (L, d)
-    rest[count[:, 0] < MIN_STEPS] = 1.0
+    lags = np.arange(-largest, largest + 1)
+    source = np.flatnonzero(late_known)[:, None] - 1.0 * lags  # (S, L): step of ``early`` of a step of ``late``
+    rest, count = _left_by_lines(late[late_known], early, source, early_known)
     chosen = rest.min(0) < SMALL_REST
     if not chosen.any():
         return np.nan
     total = rest[:, chosen].sum(1)
     best = int(total.argmin())
-    smaller = np.log(np.maximum(rest[[largest, best]][:, chosen], 1e-9))
-    ratio = float(count[best, 0] * (smaller[0] - smaller[1]).sum())  # of log-likelihoods, with independent noise
-    return float(lags[best]) if total[best] < BETTER * total[largest] and ratio > MIN_RATIO else 0.0
+    is_better = total[best] < BETTER * total[largest] and _is_likely(rest[:, chosen], count, best)
+    return float(lags[best]) if is_better else 0.0
+
+
+def drifting_lag(late: Array, early: Array, late_known: Mask, early_known: Mask) -> float:
+    """Mean of the steps by which ``late`` (T, d) follows ``early`` (T, d) if the clock of one of them drifts.
+
+    The lag grows linearly from 0 at the first step. Arguments as of ``fitted_lag``. NaN if no such lag is clearly
+    better than none (``DRIFTS``, ``MIN_RATIO``). Columns count if a line then leaves less than ``SMALL_REST`` of them.
+    """
+    if min(late_known.sum(), early_known.sum()) < MIN_STEPS:
+        return np.nan
+    rates = np.linspace(-FASTEST, FASTEST, RATES)
+    source = np.flatnonzero(late_known)[:, None] * (1.0 - rates)
+    rest, count = _left_by_lines(late[late_known], early, source, early_known)
+    chosen = rest.min(0) < np.minimum(SMALL_REST, DRIFTS * rest[RATES // 2])
+    if not chosen.any():
+        return np.nan
+    best = int(rest[:, chosen].sum(1).argmin())
+    return 0.5 * float(rates[best]) * len(late) if _is_likely(rest[:, chosen], count, best) else np.nan
+
+
+def _left_by_lines(late: Array, early: Array, source: Array, known: Mask) -> tuple[Array, Array]:
+    """Share (L, d) of the variance of a signal (S, d) that a line of positive slope through another one leaves.
+
+    Also the numbers (L,) of pairs; 1 is left by too few of them. The other signal (T, d) is taken at steps (S, L), for
+    each of L lags, between which it is linear.
+    """
+    every = slice(None, None, 1 + len(late) // MAX_PAIRS)
+    late, source = late[every, None], source[every]
+    before = source.clip(0, len(early) - 1).astype(int)
+    after = np.minimum(before + 1, len(early) - 1)
+    part = (source - before)[..., None]
+    inside = (source >= 0) & (source <= len(early) - 1)
+    paired = (inside & known[before] & (known[after] | (source == before)))[..., None]
+    count = np.maximum(paired.sum(0), 1)
+    between = np.where(part > 0.0, (1.0 - part) * early[before] + part * early[after], early[before])
+    a, b = (np.where(paired, x, 0.0) for x in (late, between))  # (S, L, d)
+    a, b = (np.where(paired, x - x.sum(0) / count, 0.0) for x in (a, b))
+    correlation = (a * b).sum(0) / np.sqrt(np.maximum((a * a).sum(0) * (b * b).sum(0), 1e-24))
+    rest = 1.0 - np.square(np.maximum(correlation, 0.0))
+    rest[count[:, 0] < MIN_STEPS] = 1.0
+    return rest, count[:, 0]
+
+
+def _is_likely(rest: Array, count: Array, best: int) -> bool:
+    """Whether the log-likelihood of a lag exceeds that of none, in the middle of (L, d), with independent noise."""
+    smaller = np.log(np.maximum(rest[[len(rest) // 2, best]], 1e-9))
+    return float(count[best] * (smaller[0] - smaller[1]).sum()) > MIN_RATIO
 
 
 def largest_lag(dt: float) -> int:

@@ -16,7 +16,7 @@ from beliefscope.inspect.statistics.reading_model import (
     readings_of,
 )
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, fitted_lag, largest_lag
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, drifting_lag, fitted_lag, largest_lag
 
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
@@ -24,9 +24,6 @@ MAX_CHANNELS = 24
 SIMPLER = 2.0
 """Largest error with another sign and order, relative to that with a delay or biases, at which the former is preferred.
 """
-
-PARTS = 3
-"""Number of parts of an episode, each with a delay of its own if the episode has none."""
 
 SURELY = 4.0
 """Smallest number of standard errors of a slope."""
@@ -198,20 +195,17 @@ def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]
     """Delay of the readings in steps, NaN if they do not follow the expected ones, and ``errors`` at this delay.
 
     Periodic readings with the opposite sign look delayed: without a delay, channels may have another sign and order.
-    The delay of a clock that drifts is the mean of those of ``PARTS`` of the episode.
+    The delay of a clock that drifts far is its mean over the episode.
 
     Args:
         dt: s per step.
     """
     known = (np.arange(len(compared.present)) >= FIRST_CHANGES) & compared.present.any()
 
-    def lag_of(fresh: Mask) -> float:
-        return fitted_lag(compared.readings, compared.expected, fresh, known, largest_lag(dt))
-
-    delay, errors = lag_of(compared.fresh), compared.errors()
+    signals = compared.readings, compared.expected, compared.fresh, known
+    delay, errors = fitted_lag(*signals, largest_lag(dt)), compared.errors()
     if np.isnan(delay):
-        parts = np.arange(len(known)) * PARTS // len(known)
-        drifting = float(np.round(np.mean([lag_of(compared.fresh & (parts == part)) for part in range(PARTS)])))
+        drifting = np.round(drifting_lag(*signals))
         is_late = _is_own_arrangement(errors) and not np.isnan(drifting)
         return (drifting, compared.errors(int(drifting))) if is_late else (delay, errors)
     if delay == 0.0:

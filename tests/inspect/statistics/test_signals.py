@@ -8,6 +8,7 @@ import pytest
 from beliefscope.inspect.statistics.signals import (
     MAX_LAG,
     deviating_interval,
+    drifting_lag,
     fitted_lag,
     lag,
     long_runs,
@@ -113,6 +114,26 @@ def test_a_fitted_lag_is_that_of_a_smooth_signal_with_noise_whatever_its_gain(de
     pair = np.hstack([late, other]), np.hstack([signal[steps], smooth(len(steps), 1, seed=9)])
     assert fitted_lag(*pair, known, known) == delay
     assert fitted_lag(*pair, np.arange(len(steps)) % 4 == 0, known) == delay, "readings at every fourth step"
+
+
+@pytest.mark.parametrize("rate", [-0.1, 0.08, 0.2])
+def test_the_lag_of_a_clock_that_drifts_is_half_of_the_last_one(rate: float) -> None:
+    steps, known = np.arange(200), np.ones(200, dtype=bool)
+    rng, signal = np.random.default_rng(3), smooth(200, 2, seed=6)
+    late = np.stack([np.interp(steps * (1.0 - rate), steps, column) for column in signal.T], -1)
+    late = 3.0 * late + rng.normal(0.0, 0.2, late.shape)
+    assert drifting_lag(late, signal, known & (steps % 2 == 0), known) == pytest.approx(100.0 * rate, abs=1.0)
+
+
+def test_other_changes_of_a_signal_are_no_drift_of_its_clock() -> None:
+    steps, known = np.arange(200), np.ones(200, dtype=bool)
+    signal = smooth(200, 2, seed=6)
+    size = float(signal.std())
+    noise = np.random.default_rng(3).normal(0.0, size, signal.shape)
+    bias = 3.0 * size * ((steps > 60) & (steps < 120))[:, None]
+    drift = np.linspace(0.0, 5.0 * size, 200)[:, None]
+    for late in (signal, 2.0 * signal, signal + noise, signal + bias, signal + drift, 0.0 * signal, -signal):
+        assert np.isnan(drifting_lag(late, signal, known, known))
 
 
 def test_a_fitted_lag_needs_a_signal_of_the_same_sign_and_enough_steps() -> None:
