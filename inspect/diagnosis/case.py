@@ -225,4 +225,4 @@ def located(case: Case, deviation: Deviation, episode: Episode) -> tuple[int, in
         record = case.profile.statistics.items()
         others = (v for name, v in record if name.startswith(f"{start}/") and name != deviation.statistic)
         healthy = next((float(np.nanmedian(v)) for v in others if np.isfinite(v).any()), None)
-    return localise(deviation.statistic, episode, case.profile.reference, healthy)
+    return localise(deviation.statistic, episode, case.profile.reference, healthy, case.profile.readings)

@@ -103,7 +103,8 @@ class ErrorSources(RunDiagnostic):
             }
             for entry in self.phases
         ]
-        return [Table.from_rows(f"Shares of the mean squared {main.name} error by source", rows)]
+        title = f"Shares of the mean squared {main.name} error by source"
+        return [Table.from_rows(title, rows, "A large share may be that of a large weight: see the weight audit.")]
 
     def curves(self) -> list[Curve]:
         main = self.task.main_error

@@ -46,9 +46,6 @@ MORE_FEATURES = 0.99
 CLOSER = 0.8
 """Largest share of the variance that a landmark, or a polynomial, leaves of what simpler features leave."""
 
-MARGIN = 0.1
-"""Distance beyond the values of the record, relative to their range, in which a polynomial is evaluated."""
-
 MAX_STEPS = 20_000
 """Number of steps to which a model is fitted; of more, every second one and so on."""
 
@@ -191,12 +188,11 @@ class _Fitted:
 
 
 def _limits(rows: Sequence[Rows], degree: int) -> Array:
-    """(2, V) range of the values of monomials, with a margin; V is 0 without any."""
+    """(2, V) range of the values of monomials; V is 0 without any."""
     if not degree:
         return np.empty((2, 0))
     values = np.concatenate([row.monomials[1] for row in rows])
-    low, high = values.min(0), values.max(0)
-    return np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)])
+    return np.stack([values.min(0), values.max(0)])
 
 
 def _options(episodes: Sequence[Episode], key: str) -> list[Option]:

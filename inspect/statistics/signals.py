@@ -41,6 +41,9 @@ MAX_PAIRS = 4_000
 MIN_RATIO = 15.0
 """Smallest log-likelihood ratio of a lag to none, times two: that of a lag by chance is rarely larger."""
 
+MAX_EDGES = 1_001
+"""Maximum number of steps at which an interval may begin or end."""
+
 MIN_STEPS = 10
 """Minimum number of steps of an estimate."""
 
@@ -273,16 +276,18 @@ def deviating_interval(series: Array) -> tuple[int, int]:
     """First and last step of the interval whose mean exceeds that of the rest of a series (T,) the most.
 
     It maximises n m / T (mean - rest)^2, with n steps in the interval and m others: the likelihood ratio of a step
-    change and its end in Gaussian noise. All steps if none exceeds the rest.
+    change and its end in Gaussian noise. All steps if none exceeds the rest. It begins and ends at one of ``MAX_EDGES``
+    steps, evenly spaced.
     """
     steps = len(series)
-    total = np.concatenate([[0.0], np.cumsum(series - series.mean())])
-    first, end = np.triu_indices(steps + 1, 1)
-    length = end - first
+    edges = np.unique(np.linspace(0, steps, MAX_EDGES).astype(int))
+    total = np.concatenate([[0.0], np.cumsum(series - series.mean())])[edges]
+    first, end = np.triu_indices(len(edges), 1)
+    length = edges[end] - edges[first]
     excess = np.maximum(total[end] - total[first], 0.0)
     gain = np.where(length < steps, excess**2 / (length * np.maximum(steps - length, 1)), 1e-12)
     best = int(gain.argmax())
-    return int(first[best]), int(end[best]) - 1
+    return int(edges[first[best]]), int(edges[end[best]]) - 1
 
 
 def long_runs(mask: Mask, shortest: int = 3) -> Mask:

@@ -94,7 +94,7 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         Cause(
             "control.scale",
             "Controls scaled",
-            (Symptom("reading gain/control*", 0, otherwise=(Symptom("size/control*", 0),)), used),
+            (Symptom("reading gain/control*", 0, unmeasured=(Symptom("size/control*", 0),)), used),
             f"size/control*|{changed}",
             "Check the units of the controls.",
             "scale control",

@@ -32,7 +32,7 @@ RECORDED = (
         FILTER,
         "Compare the code and parameters of the filter with those of the healthy runs; as an external filter "
         "(docs/own_filter.md), the fault of its equations is named.",
-        prior=-0.1,  # wrong noises change the errors as well
+        prior=-0.3,  # wrong noises and faulty readings change the errors as well
     ),
 )
 """Of recorded runs."""

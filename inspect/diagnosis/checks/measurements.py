@@ -17,6 +17,7 @@ from beliefscope.inspect.diagnosis.checks.likelihoods import (
     likelihoods_at_truth,
 )
 from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
+from beliefscope.inspect.diagnostics.statistic_kinds import channel_of
 from beliefscope.inspect.statistics.innovations import channel_names, prediction
 from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
@@ -172,7 +173,8 @@ def _innovations_at_truth(trace: Trace) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of the innovations of steps from true states.
 
     ``innovation spread``, by channel: their standard deviation. ``innovation offset``, by channel: their mean relative
-    to it. ``innovation turns``, by modality: share of steps with about a full turn in a channel, also of networks.
+    to it. ``innovation turns``, by modality: share of steps with about a full turn in a channel, also of networks, but
+    not in units other than rad.
     """
     if trace.innovation is None:
         return {}
@@ -187,7 +189,10 @@ def _innovations_at_truth(trace: Trace) -> dict[str, float]:
             spread = max(float(nu[:, i].std()), 1e-12)
             values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
             values[f"innovation spread/{modality} {names[k][i]}/all"] = spread
-        values[f"innovation turns/{modality}/all"] = max(map(_turned, nu.T))
+        channels = [channel_of(f"{modality} {name}", trace.task) for name in names[k]]
+        metric = [channel is not None and channel[1].unit not in ("", "1", "rad") for channel in channels]
+        turns = (_turned(column) for column, skipped in zip(nu.T, metric, strict=False) if not skipped)
+        values[f"innovation turns/{modality}/all"] = max(turns, default=0.0)
     return values
 
 

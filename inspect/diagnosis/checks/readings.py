@@ -16,7 +16,14 @@ from beliefscope.inspect.statistics.reading_model import (
     readings_of,
 )
 from beliefscope.inspect.statistics.reference_images import CONTACT, HAND
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, drifting_lag, fitted_lag, largest_lag
+from beliefscope.inspect.statistics.signals import (
+    MIN_STEPS,
+    Array,
+    deviating_interval,
+    drifting_lag,
+    fitted_lag,
+    largest_lag,
+)
 
 MAX_CHANNELS = 24
 """Largest number of channels of a sensor whose channels are compared with each other."""
@@ -100,17 +107,48 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     return values
 
 
+def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingModel]) -> tuple[int, int] | None:
+    """First and last step of the interval in which a channel has most of its error against the expected readings.
+
+    None if the other steps have it as well, or if no model expects readings of the channel.
+    """
+    for model in models:
+        count = 0 if model.key not in (*episode.observations, CONTROL) else readings_of(episode, model.key).shape[1]
+        axes = [axis_name(model.key, channel, count) for channel in model.channels]
+        if subject not in axes:
+            continue
+        compared, i = model.compare(episode), axes.index(subject)
+        steps = compared.steps()
+        error = (compared.readings - compared.expected)[steps, i]
+        if len(error) < MIN_STEPS:
+            return None
+        error *= np.sign(error.mean())
+        first, last = deviating_interval(error)
+        others = np.delete(error, np.s_[first : last + 1])
+        if len(others) and others.mean() < CLEARLY * error[first : last + 1].mean():
+            return int(steps[first]), int(steps[last])
+    return None
+
+
 def _short_delay(compared: ComparedReadings) -> float:
     """Steps, with fractions: regression of the errors on the changes of the expected readings by step.
 
     The mean error of the episode is a random effect: it shows the delay of a steady motion, unless biases of this size
-    are healthy.
+    are healthy, or a bias, of the episode or in an interval, leaves clearly less (``CLEARLY``) than the delay.
     """
     noise, biases = compared.model.noise, compared.model.biases
     error, change = compared.readings - compared.expected, np.gradient(compared.expected, axis=0)
     error, change = (x[compared.fresh] / noise for x in (error, change))
+    unbiased = error - error.mean(0)
+    unbiased -= _interval_means(unbiased)
     known = 1.0 - 1.0 / np.sqrt(1.0 + len(error) * np.square(biases / noise))
     error, change = (x - known * x.mean(0) for x in (error, change))
+    delay = _delay(error, change)
+    is_bias = np.square(unbiased).sum() < CLEARLY * np.square(error + delay * change).sum()
+    return _delay(unbiased, change) if is_bias else delay
+
+
+def _delay(error: Array, change: Array) -> float:
     return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
 
 

@@ -21,7 +21,7 @@ from beliefscope.inspect.diagnosis.checks.images import (
     motion_statistics,
 )
 from beliefscope.inspect.diagnosis.checks.label_shift import label_shift_statistics
-from beliefscope.inspect.diagnosis.checks.readings import reading_statistics
+from beliefscope.inspect.diagnosis.checks.readings import biased_interval, reading_statistics
 from beliefscope.inspect.diagnosis.checks.vectors import (
     angle_channels,
     axis_index,
@@ -82,17 +82,25 @@ def with_continuous_angles(episode: Episode) -> Episode:
 
 
 def localise(
-    statistic: str, episode: Episode, reference: Reference | None, healthy: float | None = None
+    statistic: str,
+    episode: Episode,
+    reference: Reference | None,
+    healthy: float | None = None,
+    models: Sequence[ReadingModel] = (),
 ) -> tuple[int, int] | None:
     """First and last step that a statistic of sensors is about; None if it has no steps, such as a lag.
 
-    Lost, repeated and saturated readings are marked step by step; of noise, level and exposure it is the interval that
-    differs most from the rest of the episode; of other statistics of windows, the most deviating windows.
+    Lost, repeated and saturated readings are marked step by step; of noise, level, exposure and errors against the
+    expected readings it is the interval that differs most from the rest of the episode; of other statistics of
+    windows, the most deviating windows.
 
     Args:
         healthy: value of the statistic in a window; None if unknown.
+        models: of the expected readings.
     """
     kind, subject, phase = statistic.split("/")
+    if kind == "reading bias":
+        return biased_interval(subject, episode, models)
     key, axis = sensor_of(subject, episode.observations)
     if key not in episode.observations:
         return None

@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task, rotation
-from beliefscope.inspect.diagnosis.checks.readings import modelled_keys, modelled_sensors, reading_statistics
+from beliefscope.inspect.diagnosis.checks.readings import (
+    biased_interval,
+    modelled_keys,
+    modelled_sensors,
+    reading_statistics,
+)
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.signals import wrapped
@@ -316,9 +321,23 @@ def test_repeated_readings_have_no_delay_of_their_own() -> None:
     stuck = gps[np.minimum(steps, STEPS // 2)]
     late, in_time = (reading_statistics(with_readings(NEW, "gps", x), models()) for x in (drifting, stuck))
     assert late["reading lag/gps/all"] > 2.0
-    by_parts = gps[np.maximum(steps - np.linspace(0.0, 18.0, STEPS).astype(int), 0)]
-    assert reading_statistics(with_readings(NEW, "gps", by_parts), models())["reading lag/gps/all"] == 8.0
+    far = gps[np.maximum(steps - np.linspace(0.0, 18.0, STEPS).astype(int), 0)]
+    assert reading_statistics(with_readings(NEW, "gps", far), models())["reading lag/gps/all"] == 8.0
     assert in_time["reading lag/gps/all"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_bias_from_some_step_on_is_no_delay_of_a_motion_in_its_direction() -> None:
+    rng = np.random.default_rng(4)
+    x = np.cumsum(DT * (1.0 + 0.2 * np.sin(np.arange(STEPS) / 9.0)))
+    moving = replace(NEW, states=np.column_stack([x, 0.2 * x, np.zeros(STEPS)]).astype(np.float32))
+    gps = moving.states[:, :2] + np.array([3.0, -2.0]) + rng.normal(0.0, NOISE, (STEPS, 2))
+    bias = np.where(np.arange(STEPS) < 80, 0.0, 6.0 * NOISE)[:, None] * [1.0, 0.0]
+    biased, late = (with_readings(moving, "gps", readings) for readings in (gps + bias, np.roll(gps, 2, axis=0)))
+    assert reading_statistics(biased, models())["reading lag/gps/all"] == pytest.approx(0.0, abs=0.1)
+    assert reading_statistics(late, models())["reading lag/gps/all"] == pytest.approx(2.0, abs=0.2)
+    assert biased_interval("gps x", biased, models()) == (80, STEPS - 1)
+    assert biased_interval("gps x", with_readings(moving, "gps", gps + 6.0 * NOISE), models()) is None
+    assert biased_interval("battery x", biased, models()) is None
 
 
 def test_a_heading_among_the_controls_turns_readings_into_the_body_frame() -> None:

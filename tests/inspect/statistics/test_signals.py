@@ -78,6 +78,7 @@ def test_interval_and_runs() -> None:
     series = np.random.default_rng(5).normal(0.0, 0.2, 100)
     series[37:61] += 1.0
     assert deviating_interval(series) == (37, 60)
+    assert deviating_interval(np.repeat(series, 1000)) == (37_000, 60_999)
     mask = np.array([1, 0, 1, 1, 0, 1, 1, 1, 0, 1, 1, 1, 1], dtype=bool)
     np.testing.assert_array_equal(np.flatnonzero(long_runs(mask)), [5, 6, 7, 9, 10, 11, 12])
     assert not long_runs(np.zeros(5, dtype=bool)).any()
