@@ -277,11 +277,10 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     first = candidates[0]
     similar = [c for c in candidates[1:3] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if first.probability < SURE and similar:
-        actions = " ".join(dict.fromkeys(c.next for c in (first, *similar)))
         *titles, last = (first.cause.title, *(_lower(c.cause.title) for c in similar))
         if _are_alike([first, *similar]):
-            return f"{', '.join(titles)} and {last}, by one cause or by several; try: {actions}"
-        return f"{', '.join(titles)} or {last}, not separable; try: {actions}"
+            return f"{', '.join(titles)} and {last}, by one cause or by several; try: {first.next}"
+        return f"{', '.join(titles)} or {last}, not separable; try: {first.next}"
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"
