@@ -169,6 +169,9 @@ def _with_true_starts(cause: Cause) -> Cause:
         return replace(cause, symptoms=(first, Symptom("dynamics spread/*", 1)))
     if cause.name == "dynamics.inverted":  # of one control, such as one of two
         return replace(cause, symptoms=(Symptom(EFFECTS, target="mirrored", otherwise=cause.symptoms),))
+    if cause.name == "control.bias":  # not the expected controls alone, which are extrapolated to other motions
+        symptom = Symptom("dynamics bias/*|dynamics offset/*", 0, optional=True)
+        return replace(cause, symptoms=(*cause.symptoms, symptom))
     if cause.component in OF_DYNAMICS and cause.name not in (DRIFT.name, JACOBIAN.name):
         return cause
     unchanged = UNCHANGED_BY_DRIFT if cause.name == DRIFT.name else OF_TRUE_STATES

@@ -149,6 +149,7 @@ def _short_delay(compared: ComparedReadings) -> float:
 
 
 def _delay(error: Array, change: Array) -> float:
+    """Steps by which readings follow expected ones, from their errors and the changes of the latter (S, A)."""
     return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
 
 
