@@ -12,7 +12,7 @@ from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.channels import innovation_channels, reading_channels
-from beliefscope.inspect.statistics.innovations import virtual_innovations
+from beliefscope.inspect.statistics.innovations import update_sizes, virtual_innovations
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.sensors import camera_images, displayed_sensors
 
@@ -35,6 +35,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "estimate_sigma": measures.deviations(trace.estimate_covariance) if trace.has_covariance else None,
         "modality_mean": trace.task.near(trace.modality_mean, trace.episode.states[:, None]) if unimodal else None,
         "modality_sigma": measures.deviations(trace.modality_covariance) if unimodal else None,
+        "update_size": update_sizes(trace) if unimodal else None,
         "nees": measures.nees(trace) if trace.has_covariance else None,
         "innovation": None if innovation is None else innovation[0],
         "innovation_sigma": None if innovation is None else measures.deviations(innovation[1]),

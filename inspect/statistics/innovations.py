@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import correlation_interval
-from beliefscope.inspect.statistics.measures import Array, absent_modalities, counted
+from beliefscope.inspect.statistics.measures import Array, absent_modalities, counted, deviations
 from beliefscope.inspect.traces.data import Trace
 
 AnyArray = NDArray[np.floating[Any]]
@@ -106,6 +106,22 @@ def prediction(trace: Trace) -> Moments | None:
     return prediction_of(
         trace.task, trace.predicted_mean, trace.predicted_covariance, particles, trace.prior_log_weights
     )
+
+
+def update_sizes(trace: Trace) -> Array | None:
+    """(T, K, n): how far each single-modality update moves the prediction, in predicted standard deviations.
+
+    None if the prediction is not reported, or its particles are not kept.
+    """
+    mean: AnyArray | None = trace.predicted_mean
+    covariance: AnyArray | None = trace.predicted_covariance
+    if mean is None and (moments := prediction(trace)) is not None and moments.covariance is not None:
+        mean, covariance = moments.mean[:, None], moments.covariance[:, None]
+    if mean is None or covariance is None:
+        return None
+    difference = trace.task.difference(trace.modality_mean.astype(np.float64), mean.astype(np.float64))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.abs(difference) / deviations(covariance))
 
 
 def prediction_of(

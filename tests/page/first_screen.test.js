@@ -28,6 +28,7 @@ const run = (last, contact = 5) =>
     weightWidth: 1,
     fuses: true,
     has: () => false,
+    updateSize: () => undefined,
     hasTruth: () => true,
     largestDeviation: (/** @type {number} */ t) => ({ sigmas: t < 8 ? 1 : 5, component: 'x' }),
     blackout: series((t) => Number(t >= 8 && t <= last)),
@@ -122,7 +123,8 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.deepEqual(fault, {
     tone: 'bad',
     headline: 'Image frozen from step 31.',
-    evidence: 'Share of repeated images is 0.7.',
+    evidence:
+      'Largest position error 1.23 cm at step 10, 5.0σ in x. Share of repeated images is 0.7.',
     step: 33,
     component: undefined,
   });
@@ -138,7 +140,18 @@ test('a fault comes first, then the outage, then the largest error', () => {
       },
     ],
   });
-  assert.match(confirmed.evidence, /is 0\.7\. Undoing it removes 30 % of the hinge x error\.$/);
+  assert.match(
+    confirmed.evidence,
+    /σ in x\. Undoing it removes 30 % of the hinge x error\. Share of/,
+  );
+  const rises = finding({ ...run(14), error: () => series((t) => (t < 8 ? 0.5 : 2)) }, 0, {
+    ...FAULT,
+    causes: [{ ...FAULT.causes[0], steps: [8, STEPS] }],
+  });
+  assert.match(
+    rises.evidence,
+    /^Mean position error 0\.50 cm before, 2\.00 cm from then on\. Share/,
+  );
   assert.deepEqual([confirmed.component, confirmed.step], ['hinge_x', 10], 'the largest error');
   assert.equal(finding(run(14), 0, { ...FAULT, masked: true }).tone, 'warn');
   const unknown = finding(run(14), 0, { ...FAULT, state: 'unsure', causes: [] });
@@ -165,7 +178,7 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.match(finding(before, 0, HEALTHY).headline, /^No fault found/, 'it failed before');
   const plain = finding(run(11), 0, null);
   assert.equal(plain.headline, 'Largest error at step 10.');
-  assert.match(plain.evidence, /error 1\.23 cm; largest deviation 5\.0σ in x: overconfident/);
+  assert.match(plain.evidence, /error 1\.23 cm, 5\.0σ in x: overconfident/);
   assert.deepEqual([plain.tone, plain.step], ['bad', 10]);
   const header = { no_diagnosis: 'this filter has no healthy record' };
   const { evidence } = finding({ ...run(11), header }, 0, null);
@@ -175,10 +188,15 @@ test('a fault comes first, then the outage, then the largest error', () => {
     finding(consistent, 0, HEALTHY).headline,
     /^No fault found: mean position error 0\.54 cm; image has 38 % of/,
   );
-  const largest_error = { episode: 0, step: 10, size: '', sources: 'image 1.20 cm' };
+  const largest_error = {
+    episode: 0,
+    step: 10,
+    size: '',
+    sources: 'image 1.20 cm, dynamics -0.20 cm',
+  };
   const healthy = finding(run(11), 0, { ...HEALTHY, largest_error });
   assert.equal(healthy.headline, 'No fault found, but the filter is overconfident at step 10.');
-  assert.match(healthy.evidence, /^Largest error at step 10\. By source: image 1\.20 cm\. Fused/);
+  assert.match(healthy.evidence, /By source: image 1\.20 cm, dynamics \u22120\.20 cm\. Fused/);
   const poor = finding(run(11), 0, { ...HEALTHY, miscalibrated: true });
   assert.equal(
     poor.headline,
@@ -211,7 +229,7 @@ test('an error that grows to the end is a divergence, shown where it begins', ()
   assert.equal(divergence(grows), 15, 'first step above five times the median of the first half');
   const result = finding({ ...run(11), error: () => grows }, 0, null);
   assert.equal(result.headline, 'The estimate diverges from step 15 on.');
-  assert.match(result.evidence, /^Largest error at step 19\. Fused estimate: error 5\.00 cm;/);
+  assert.match(result.evidence, /^Largest error at step 19\. Fused error 5\.00 cm,/);
   assert.deepEqual([result.tone, result.step], ['bad', 15]);
   const predicted = { ...run(11), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
   assert.match(finding({ ...predicted, error: () => grows }, 0, null).headline, /^Largest error/);

@@ -217,7 +217,7 @@ test('the summary of a step names error, deviation and dominant modality', () =>
   assert.equal(first.tone, 'warn');
   assert.equal(
     first.text,
-    'Fused estimate: error 5.00 cm; largest deviation 3.0σ in hinge x: larger than predicted. ' +
+    'Fused error 5.00 cm, 3.0σ in hinge x: larger than predicted. ' +
       'Dominated by image (70 % in hinge x).',
   );
   const second = stepSummary(trace, 1, 0);
@@ -225,7 +225,7 @@ test('the summary of a step names error, deviation and dominant modality', () =>
   const truth = { shape: [2, 3], values: [0.0001, 0, 0, 0, 0, 0] };
   const close = { shape: [2, 3], values: [0, 0, 0, 0, 0, 0] };
   const small = stepSummary(makeTrace({ ...FUSION, truth, estimate_mean: close }), 0, 0);
-  assert.match(small.text, /^Fused estimate: error 0\.01 cm/, 'not 0.0 cm');
+  assert.match(small.text, /^Fused error 0\.01 cm/, 'not 0.0 cm');
 });
 
 test('the summary of a step names the sources of most of its error, the largest first', () => {
@@ -249,7 +249,7 @@ test('the summary of a step names the sources of most of its error, the largest 
   assert.equal(errorSourcesText(curves, 0).replace('\u2212', '-'), text);
   assert.match(
     stepSummary(trace, 0, 0, text).text,
-    /larger than predicted\. By source: .* Dominated/,
+    /larger than predicted\. Dominated .*\. By source: /,
   );
   assert.equal(errorSourcesText([], 0), '');
 });
@@ -293,6 +293,20 @@ test('the summary explains an uninformative dominant modality', () => {
     tone: 'none',
     text: 'True state unknown.',
   });
+});
+
+test('the summary names a dominant modality whose update nearly keeps the prediction', () => {
+  /** @param {number[]} image sizes of the update of the image at each step, in hinge x */
+  const text = (image) => {
+    const values = image.flatMap((size) => [size, 9, 9, 2, 2, 2]);
+    const run = makeTrace({ ...FUSION, update_size: { shape: [2, 2, 3], values } });
+    return [0, 1].map((step) => stepSummary(run, step, 0).text);
+  };
+  const [small, accurate] = text([0.4, 0.4]);
+  assert.match(small, /Dominated by image \(70 % in hinge x\), which nearly keeps the prediction/);
+  assert.doesNotMatch(accurate, /keeps/, 'of an accurate estimate, which it may confirm');
+  assert.doesNotMatch(text([0.6, 0])[0], /keeps/);
+  assert.doesNotMatch(text([NaN, 0])[0], /keeps/);
 });
 
 test("a filter's own scalars are charts", () => {

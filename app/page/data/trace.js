@@ -304,6 +304,16 @@ export class Trace {
     return this.#slice(name, index, column.shape[2] > 1 ? component : 0);
   }
 
+  /**
+   * Returns how far the update of a modality moves the prediction, in predicted standard deviations; undefined if the
+   * prediction is unknown.
+   * @param {string} modality
+   * @param {number} component
+   */
+  updateSize(modality, component) {
+    return this.#slice('update_size', this.modalities.indexOf(modality), component);
+  }
+
   /** Effective sample size; undefined for a filter without particles. */
   get effectiveSampleSize() {
     return this.#slice('effective_sample_size');

@@ -45,7 +45,9 @@ export function finding(trace, component, diagnosis) {
   const worst = worstFinding(trace, component);
   const sources = diagnosis?.largest_error?.sources;
   const cause =
-    sources && diagnosis.largest_error?.step === worst.step ? `By source: ${sources}.` : '';
+    sources && diagnosis.largest_error?.step === worst.step
+      ? typeset(`By source: ${sources}.`)
+      : '';
   const summary = [worst.headline, cause, worst.evidence].filter(Boolean).join(' ');
   // As its record, which may be poor.
   const healthy = worst.tone === 'bad' || diagnosis?.miscalibrated ? 'warn' : 'good';
@@ -89,7 +91,7 @@ function failureFinding({ failure, restarts }) {
  */
 function healthyHeadline(trace, component, { headline, miscalibrated }, worst) {
   const errors = trace.error('fused', 'main')?.filter(Number.isFinite) ?? [];
-  if (miscalibrated || !errors.length) return sentence(headline);
+  if (miscalibrated || !errors.length) return typeset(sentence(headline));
   if (worst.tone === 'bad' && worst.step !== null)
     return `No fault found, but the filter is overconfident at ${trace.stepLabel(worst.step)}.`;
   const error = withUnit(fixed(mean(errors), 2), trace.mainUnit);
@@ -106,8 +108,8 @@ function healthyHeadline(trace, component, { headline, miscalibrated }, worst) {
 }
 
 /**
- * Describes a fault, with the share of the error that its undo removes. A fault without steps of its own shows where the
- * error is largest.
+ * Describes a fault: the error that it causes, the share of it that an undo removes, and the evidence. A fault without
+ * steps of its own shows where the error is largest.
  * @param {Trace} trace
  * @param {Diagnosis} diagnosis of a run that is not healthy
  * @returns {Finding}
@@ -119,13 +121,14 @@ function faultFinding(trace, { state, masked, headline, causes }) {
   const sentences = evidence.map(({ text }) => sentence(text));
   const recovered = cause?.recovered;
   if (recovered?.error && recovered.error >= MIN_RECOVERED)
-    sentences.push(
+    sentences.unshift(
       `Undoing it removes ${percent(recovered.error)} of the ${recovered.measure} error.`,
     );
+  if (sentences.length) sentences.unshift(effect(trace, cause?.steps));
   return {
     tone: state === 'fault' && !masked ? 'bad' : 'warn',
-    headline: sentence(headline.replaceAll('`', '')),
-    evidence: typeset(sentences.join(' ')),
+    headline: typeset(sentence(headline.replaceAll('`', ''))),
+    evidence: typeset(sentences.filter(Boolean).join(' ')),
     step: step ?? largest(trace.error('fused', 'main') ?? []),
     component: affectedComponent(trace.components, cause),
   };
@@ -153,18 +156,49 @@ function injectedFinding(trace, component) {
     const text = `${headline} ${evidence}`.trim();
     return { tone: 'warn', headline: `${label}, in all steps.`, evidence: text, step };
   }
-  const error = trace.error('fused', 'main');
-  const [before, during] = [error?.subarray(0, first), error?.subarray(first, last + 1)].map(
-    (values) => withUnit(fixed(mean(values?.filter(Number.isFinite) ?? []), 2), trace.mainUnit),
-  );
   const end = last + 1 < trace.steps ? ` to ${trace.stepLabel(last)}` : '';
-  const comparison = `Mean ${trace.task.main.name} error ${before} before, ${during} ${end ? 'in these steps' : 'from then on'}.`;
   return {
     tone: 'warn',
     headline: `${label}, from ${trace.stepLabel(first)}${end}.`,
-    evidence: error && first > 0 ? comparison : '',
+    evidence: errorChange(trace, first, last),
     step: first,
   };
+}
+
+/**
+ * Describes the effect of a fault: the mean errors before and with it, or the largest error if it has no steps before.
+ * Empty without truth.
+ * @param {Trace} trace
+ * @param {number[] | null | undefined} steps first one of the fault, and first one after it; null if it has none of its own
+ */
+function effect(trace, steps) {
+  const change = steps ? errorChange(trace, steps[0], steps[1] - 1) : '';
+  const error = trace.error('fused', 'main');
+  const step = largest(error ?? []);
+  if (change || !error || step === null) return change;
+  const size = withUnit(fixed(error[step], 2), trace.mainUnit);
+  const { sigmas = NaN, component = '' } = trace.largestDeviation(step) ?? {};
+  const deviation = Number.isFinite(sigmas)
+    ? `, ${fixed(sigmas, 1)}σ in ${displayName(component)}`
+    : '';
+  return `Largest ${trace.task.main.name} error ${size} at ${trace.stepLabel(step)}${deviation}.`;
+}
+
+/**
+ * Compares the mean error in some steps with that before; empty if one of them is unknown.
+ * @param {Trace} trace
+ * @param {number} first
+ * @param {number} last
+ */
+function errorChange(trace, first, last) {
+  const error = trace.error('fused', 'main');
+  const [before, during] = [error?.subarray(0, first), error?.subarray(first, last + 1)].map(
+    (values) => mean(values?.filter(Number.isFinite) ?? []),
+  );
+  if (!Number.isFinite(before) || !Number.isFinite(during)) return '';
+  const [low, high] = [before, during].map((value) => withUnit(fixed(value, 2), trace.mainUnit));
+  const when = last + 1 < trace.steps ? 'in these steps' : 'from then on';
+  return `Mean ${trace.task.main.name} error ${low} before, ${high} ${when}.`;
 }
 
 /**

@@ -1,4 +1,4 @@
-/** A sentence that summarises a step: error, consistency and the dominant modality. */
+/** Sentences that summarise a step: error, consistency and the dominant modality. */
 
 /** @import { Trace } from '../data/trace.js' */
 
@@ -8,6 +8,8 @@ import { updateLabel } from '../data/trace.js';
 
 const DOMINANT_SHARE = 0.6; // effective weight from which a modality is dominant
 const FEW_PARTICLES = 0.05; // share of the particles
+/** Predicted standard deviations: an update that moves the prediction by less in each component nearly keeps it. */
+const SMALL_UPDATE = 0.5;
 /** Another estimate counts as more accurate if its error is lower by this many units for display, and by this factor. */
 const MIN_GAIN = { consistent: 1, other: 0.2 };
 const MAX_RATIO = 0.8;
@@ -25,7 +27,7 @@ export function stepSummary(trace, step, component, sources = '') {
   const { tone, text } = trace.hasTruth(step)
     ? accuracy(trace, step)
     : { tone: /** @type {Tone} */ ('none'), text: 'True state unknown.' };
-  const sentences = [text, sources].filter(Boolean);
+  const sentences = [text];
   const dominant = dominantModality(trace, step, component);
   if (dominant) {
     const uninformative = uninformativeReason(dominant.name, trace, step);
@@ -33,8 +35,12 @@ export function stepSummary(trace, step, component, sources = '') {
     if (dominant.weight >= DOMINANT_SHARE || better) {
       const scope = weightScope(trace, component);
       const reasons = [uninformative, better].filter(Boolean).join(' and ');
+      // A small update of an accurate estimate may confirm it; that of an inaccurate one does not correct it.
+      const isSmall =
+        (tone !== 'good' || better) && keepsPrediction(dominant.name, trace, step, component);
+      const update = isSmall ? ', which nearly keeps the prediction' : '';
       sentences.push(
-        `Dominated by ${displayName(dominant.name)} (${percent(dominant.weight)}${scope})${reasons && `, although ${reasons}`}.`,
+        `Dominated by ${displayName(dominant.name)} (${percent(dominant.weight)}${scope})${update}${reasons && `, although ${reasons}`}.`,
       );
     }
   }
@@ -43,6 +49,7 @@ export function stepSummary(trace, step, component, sources = '') {
   const count = trace.header.settings?.particles;
   if (size && count && size < FEW_PARTICLES * count)
     sentences.push(`Effective sample size ${fixed(size, 0)} of ${count} particles.`);
+  if (sources) sentences.push(sources);
   return { tone, text: sentences.join(' ') };
 }
 
@@ -61,13 +68,15 @@ export const weightScope = (trace, component) =>
  * @returns {{tone: Tone, text: string}}
  */
 function accuracy(trace, step) {
-  const name = trace.fuses ? 'Fused estimate' : 'Estimate';
+  const [estimate, quantity] = trace.fuses
+    ? ['Fused estimate', 'Fused error']
+    : ['Estimate', 'Error'];
   const value = trace.error('fused', 'main')?.[step];
   if (value === undefined || !Number.isFinite(value))
-    return { tone: 'bad', text: `${name}: not a finite number.` };
-  const error = `${name}: error ${withUnit(fixed(value, 2), trace.mainUnit)}`;
+    return { tone: 'bad', text: `${estimate}: not a finite number.` };
+  const error = `${quantity} ${withUnit(fixed(value, 2), trace.mainUnit)}`;
   const deviation = trace.largestDeviation(step);
-  if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
+  if (!deviation) return { tone: 'none', text: `${error}, no predicted standard deviation.` };
   const { sigmas, component } = deviation;
   if (sigmas === Infinity)
     return {
@@ -83,7 +92,7 @@ function accuracy(trace, step) {
       : sigmas <= 2 * consistent
         ? ['warn', 'larger than predicted']
         : ['bad', 'overconfident'];
-  const text = `${error}; largest deviation ${fixed(sigmas, 1)}σ in ${displayName(component)}: ${verdict}.`;
+  const text = `${error}, ${fixed(sigmas, 1)}σ in ${displayName(component)}: ${verdict}.`;
   return { tone, text };
 }
 
@@ -99,6 +108,21 @@ function uninformativeReason(modality, trace, step) {
 }
 
 /**
+ * Returns whether the single-modality update of a modality nearly keeps the prediction: in the component whose weights
+ * are compared, or in all of them if they have one weight.
+ * @param {string} modality
+ * @param {Trace} trace
+ * @param {number} step
+ * @param {number} component
+ */
+function keepsPrediction(modality, trace, step, component) {
+  const components = trace.weightWidth > 1 ? [component] : trace.components.keys();
+  return [...components].every(
+    (i) => (trace.updateSize(modality, i)?.[step] ?? NaN) < SMALL_UPDATE,
+  );
+}
+
+/**
  * Describes the most accurate single-modality update if it is clearly more accurate than the fused estimate.
  * @param {string} dominant modality
  * @param {Trace} trace
@@ -111,7 +135,7 @@ function moreAccurateModality(dominant, trace, step, tone) {
   const gain = tone === 'good' ? MIN_GAIN.consistent : MIN_GAIN.other;
   if (!best || best.name === dominant) return '';
   if (!(best.error < Math.min(error - gain, MAX_RATIO * error))) return '';
-  return `the error of the ${updateLabel(best.name)} is ${withUnit(fixed(best.error, 2), trace.mainUnit)}`;
+  return `the ${updateLabel(best.name)} errs by ${withUnit(fixed(best.error, 2), trace.mainUnit)}`;
 }
 
 /**

@@ -133,8 +133,8 @@ function nextAction(text) {
 }
 
 /**
- * Parts of a text; those between backticks are code.
+ * Parts of a text; those between backticks are code, the others are typeset.
  * @param {string} text
  */
 export const withCode = (text) =>
-  text.split('`').map((part, i) => (i % 2 ? create('code', { textContent: part }) : part));
+  text.split('`').map((part, i) => (i % 2 ? create('code', { textContent: part }) : typeset(part)));

@@ -67,6 +67,21 @@ def test_innovation_is_measured_minus_predicted() -> None:
     np.testing.assert_allclose(values["innovation_sigma"] ** 2, variance, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
+def test_update_sizes_are_in_standard_deviations_of_the_prediction(name: str) -> None:
+    run, values, _ = pretrained_run(name)
+    if run.predicted_mean is not None and run.predicted_covariance is not None:
+        mean, variance = run.predicted_mean[:, 0, 0], run.predicted_covariance[:, 0, 0, 0]
+    else:
+        assert run.particles is not None
+        assert run.prior_log_weights is not None
+        weights, hinge_x = np.exp(run.prior_log_weights), run.particles[..., 0]
+        mean = (weights * hinge_x).sum(1)
+        variance = (weights * (hinge_x - mean[:, None]) ** 2).sum(1)
+    expected = np.abs(run.modality_mean[:, :, 0] - mean[:, None]) / np.sqrt(variance)[:, None]
+    np.testing.assert_allclose(values["update_size"][..., 0], expected, rtol=1e-2, atol=1e-3)
+
+
 def test_unavailable_columns_are_omitted() -> None:
     _, values, head = pretrained_run("crossmodal-pf")
     assert not {"innovation", "innovation_sigma"} & values.keys()
