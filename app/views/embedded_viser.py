@@ -46,7 +46,8 @@ body, div:has(> div > div > div > canvas) { background: none !important; }
 </style><script src="/static/scene/viser_frame_throttle.js"></script>"""
 """Hides viser's control panel, as the page has the controls of the scene, and its background, which is almost black in
 the dark theme: the page's is behind it. A frame whose colour scheme differs from the page's would be opaque: white
-until viser has its theme. The script precedes viser's own."""
+until viser has its theme. The script precedes viser's own, and sets the scheme of a page whose theme is not that of the
+system."""
 
 
 def client_page() -> bytes:

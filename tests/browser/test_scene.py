@@ -34,3 +34,14 @@ def test_layers_belong_to_a_view_and_its_permalink(open_page: Any) -> None:
     assert all(others.values())
     for page in (first, second):
         assert page.page.evaluate("() => document.querySelector('#messages').textContent") == ""
+
+
+SCHEME = "() => getComputedStyle(document.querySelector('#scene iframe').contentDocument.documentElement).colorScheme"
+
+
+def test_the_scene_has_the_theme_of_the_page_not_of_the_system(open_page: Any) -> None:
+    page = open_page("?filter=crossmodal-ekf&step=12", scene=True, theme="dark")
+    for theme in ("light", "dark"):
+        page.page.keyboard.press("d")
+        assert page.page.evaluate("() => document.documentElement.dataset.theme") == theme
+        page.until(f"() => ({SCHEME})() === '{theme}'")

@@ -1,5 +1,5 @@
 /**
- * Throttles viser's animation frames. A plain script that runs in the frame of the 3D scene before viser.
+ * Throttles viser's animation frames, and adapts viser to the page. A plain script that runs in the frame of the 3D scene before viser.
  *
  * The frame shares its thread with the page. Without a GPU each rendering can block both for 0.1 s, and viser renders
  * once a second even without changes. Renderings are therefore timed, and where they are slow the page can set a
@@ -100,6 +100,14 @@
   const { matchMedia } = window;
   window.matchMedia = (query) =>
     matchMedia.call(window, query.includes('max-width') ? 'not all' : query);
+  // A frame whose color scheme differs from that of the page would be opaque: black or white.
+  const page = window.parent.document.documentElement;
+  const copyColorScheme = () => {
+    const { colorScheme } = getComputedStyle(page);
+    document.documentElement.style.setProperty('color-scheme', colorScheme, 'important');
+  };
+  copyColorScheme();
+  new MutationObserver(copyColorScheme).observe(page, { attributeFilter: ['data-theme'] });
   // viser loads a module for Gaussian splats, which compiles code from text. The Content Security Policy of the frame
   // forbids that, and these scenes have no splats.
   window.addEventListener('unhandledrejection', (event) => {
