@@ -27,6 +27,11 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     keyboard.press("]")
     page.until("() => !document.querySelector('#compare').hidden")
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "to")] == ["45", "56"]
+    first, weight = form.locator("[name=from]"), form.locator(".sliders output").first
+    first.fill("60")  # after the end
+    assert weight.text_content() == "\N{EN DASH} mean in hinge x"
+    first.fill("45")
+    assert weight.text_content().startswith("0.")
     form.get_by_role("button", name="Compare").click()
     assert "The intervention is empty" in form.locator(".error").text_content()
     form.locator("[name=intervention_faults]").select_option("blackout=0.8")
@@ -69,7 +74,7 @@ def test_two_filters_are_compared(open_page: Any) -> None:
     assert [head for head in heads if head in filters] == filters
     assert page.page.locator("#compare [name=filter]").input_value() == "crossmodal-pf"
     page.page.locator("#compare .gain input").check()
-    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain over crossmodal-pf'")
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Change from crossmodal-pf'")
     overflow = page.page.evaluate(
         "() => ['#compare', '#compare form', '#timeline .bar'].map((e) => document.querySelector(e))"
         ".map((e) => e.scrollWidth - e.clientWidth)"
@@ -77,7 +82,7 @@ def test_two_filters_are_compared(open_page: Any) -> None:
     assert max(overflow) <= 1
     page.screenshot("compare-filters")
     page.page.locator("#filter").select_option("crossmodal-pf")  # exchanges the two filters
-    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain over crossmodal-ekf'")
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Change from crossmodal-ekf'")
     assert page.state["against"] == "filter=crossmodal-ekf"
     page.page.locator("#compare .clear").click()
     page.until("() => beliefscope.state().against === '' && !location.search.includes('against')")

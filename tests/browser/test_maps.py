@@ -175,13 +175,13 @@ def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
     assert all(text == "gain 0.00 nats" for text in values)  # relative to itself
     page.page.keyboard.press("Shift+ArrowRight")
     page.settle(STEP + 10)
-    assert page.page.locator("#maps-kind").text_content() == f"Gain over step {STEP}"
+    assert page.page.locator("#maps-kind").text_content() == f"Change from step {STEP}"
     values = page.page.locator("#heatmaps .shape").all_text_contents()
     assert not any(text == "gain 0.00 nats" for text in values)
     page.screenshot("maps-gain")
     page.until(f"() => location.search.includes('pin=') && location.search.includes('step={STEP + 10}')")
     again = open_page("?" + page.page.url.partition("?")[2])  # the pinned step is restored without a visit
-    again.until(f"() => document.querySelector('#maps-kind').textContent === 'Gain over step {STEP}'")
+    again.until(f"() => document.querySelector('#maps-kind').textContent === 'Change from step {STEP}'")
     assert (again.state["pin"], again.state["step"]) == (page.state["pin"], STEP + 10)
     again.page.locator("#heatmaps canvas").first.hover()
     assert again.page.locator("#heatmaps .shape").all_text_contents() == values

@@ -296,7 +296,7 @@ test('values of cells', () => {
   assert.deepEqual(valueAt(maps, 0, 4), { log: 0, relative: 1, clipped: false });
   assert.equal(valueAt(maps, 1, 0).clipped, true);
   assert.deepEqual(valuesAt(maps, 0, [0, 0], null), ['1.000 of peak', 'ln 0.00']);
-  assert.equal(valuesAt(maps, 1, [0.2, 0.2], new Float32Array(9))[2], 'gain 0.00 nats');
+  assert.equal(valuesAt(maps, 1, [0.2, 0.2], new Float32Array(9))[2], 'change 0.00 nats');
 });
 
 test('the border of a peak is a closed contour around it', () => {

@@ -256,7 +256,7 @@ export class MapPanel {
     const kind = html('#maps-kind', this.#panel);
     const quantity = this.#maps?.quantity ?? 'likelihood';
     kind.textContent = log ? `Log ${quantity}` : QUANTITY_NAMES[quantity];
-    if (reference) kind.textContent = `Gain over ${reference.name}`;
+    if (reference) kind.textContent = `Change from ${reference.name}`;
     html('h2', this.#panel).title = this.#title();
     const title = this.#maps ? mapTitle(this.#maps) : '';
     html('#maps-rule', this.#panel).textContent = reference

@@ -255,6 +255,6 @@ export function valuesAt(maps, layer, offset, ratios) {
   const cell = cellAt(maps, offset);
   const { log, relative, clipped } = valueAt(maps, layer, cell);
   const values = [`${fixed(relative, 3)} of peak`, `ln ${clipped ? '< ' : ''}${fixed(log, 2)}`];
-  if (ratios) values.push(`gain ${signed(ratios[cell], 2)} nats`);
+  if (ratios) values.push(`change ${signed(ratios[cell], 2)} nats`);
   return values;
 }

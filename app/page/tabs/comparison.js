@@ -153,7 +153,7 @@ export class ComparisonTab {
     this.#gainBox.checked = this.#store.state.beside === 'gain' && !reason;
     this.#gainBox.disabled = Boolean(reason);
     html('span', this.#gain).textContent =
-      reason ?? `In the maps, show the difference from ${this.name}`;
+      reason ?? `In the maps, show the change from ${this.name}`;
   }
 
   /** @param {Comparison | null} result */

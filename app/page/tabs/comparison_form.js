@@ -8,6 +8,7 @@ import { create, element, html } from '../core/dom.js';
 import { filtersOf, isRecordedOnly } from '../core/episodes.js';
 import { displayName, fixed } from '../core/units.js';
 import { sum } from '../data/arrays.js';
+import { weightScope } from '../step/step_summary.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
 
@@ -108,7 +109,7 @@ export class ComparisonForm {
       this.#showBetas();
     });
     for (const input of [this.#first, this.#to])
-      input.addEventListener('change', () => this.#showBetas());
+      input.addEventListener('input', () => this.#showBetas());
   }
 
   /**
@@ -332,26 +333,30 @@ export class ComparisonForm {
       const modality = input.dataset.modality ?? '';
       const manual = this.#manual.get(modality);
       const isManual = manual !== undefined;
-      const automatic = total > 0 ? (remainder * (means.get(modality) ?? 0)) / total : 0;
+      const automatic = total === 0 ? 0 : (remainder * (means.get(modality) ?? 0)) / total;
       const beta = manual ?? automatic;
-      if (document.activeElement !== input || isManual) input.value = String(beta);
+      if (document.activeElement !== input || isManual) input.value = String(beta || 0);
       const label = input.parentElement;
       if (!label) continue;
       label.classList.toggle('held', isManual);
-      const origin = isManual ? 'manual' : this.#manual.size ? 'remainder' : 'network';
-      html('output', label).textContent = `${fixed(beta, 2)} ${origin}`;
+      const scope = this.#trace ? weightScope(this.#trace, 0) : '';
+      const origin = `${this.#manual.size ? 'remainder' : 'mean'}${scope}`;
+      const output = html('output', label);
+      output.textContent = `${fixed(beta, 2)} ${isManual ? 'manual' : origin}`;
+      output.title = isManual ? '' : "Mean of the network's weights over these steps";
     }
     html('.release', this.#form).hidden = !this.#manual.size;
   }
 
   /**
-   * Returns a modality and the mean of its weight over the steps of the intervention, for the first component.
+   * Returns a modality and the mean of its weight over the steps of the intervention, for the first component; NaN
+   * without steps.
    * @param {string} modality
    * @returns {[string, number]}
    */
   #meanBeta(modality) {
     const [first, to] = this.#steps.map((step) => step || 0);
     const beta = this.#trace?.weight('raw', modality, 0)?.slice(first, to) ?? [];
-    return [modality, beta.length ? sum(beta) / beta.length : 0];
+    return [modality, sum(beta) / beta.length];
   }
 }
