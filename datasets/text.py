@@ -1,5 +1,7 @@
 """Numbers in sentences."""
 
+import re
+
 
 def plural(count: int, noun: str) -> str:
     """A number with its noun: ``1 episode``, ``3 episodes``."""
@@ -14,3 +16,14 @@ def capitalised(text: str) -> str:
 def percent(share: float, form: str = ".0f") -> str:
     """A share in percent: ``38 %``. form: format of the number."""
     return f"{100.0 * share:{form}} %"
+
+
+def typeset(text: str) -> str:
+    """The text set as on the page: minus signs, but not in names and ranges, arrows and degree signs."""
+    for pattern, character in (
+        (r"(?<![\w).:=-])-(?=\.?\d)", "\N{MINUS SIGN}"),
+        (r"(?<=\d) deg\b", "°"),
+        (r"\(deg\b", "(°"),
+    ):
+        text = re.sub(pattern, character, text)
+    return text.replace(" -> ", " → ")

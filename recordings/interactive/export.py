@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beliefscope import __version__
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.text import typeset
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.cause import probability_text
 from beliefscope.inspect.diagnosis.diagnose import preliminary
@@ -135,6 +136,7 @@ def write_index(files: Sequence[tuple[Path, Trace]], path: Path) -> None:
 
 def _template(name: str) -> Template:
     environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined)
+    environment.filters["typeset"] = typeset
     return environment.get_template(name)
 
 

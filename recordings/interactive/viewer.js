@@ -50,7 +50,8 @@ const BAND_COLOURS = ['#7d8fb3', '#b09a4a', '#6f9e7c'];
 /** @param {string} text base64 */
 const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 /** @param {number | null | undefined} value */
-const digits = (value) => (value == null ? '–' : Number(value.toPrecision(4)).toString());
+const digits = (value) =>
+  value == null ? '–' : Number(value.toPrecision(4)).toString().replaceAll('-', '−');
 
 /**
  * @param {string} tag

@@ -15,7 +15,7 @@ from markupsafe import Markup, escape
 
 from beliefscope import __version__
 from beliefscope.datasets.episode import durations_text
-from beliefscope.datasets.text import plural
+from beliefscope.datasets.text import plural, typeset
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.statistics import measures
@@ -45,6 +45,7 @@ def page(
         "math": mathml,
         "number": _number,
         "text_columns": _text_columns,
+        "typeset": typeset,
     }
     figures, tables = count(1), count(1)
     first = report.traces[0]
@@ -77,9 +78,10 @@ def _inline_math(text: str) -> Markup:
 
 
 def _code(text: str) -> Markup:
-    """Text with commands between backticks."""
+    """Typeset text with commands between backticks."""
     code = Markup("<code>{}</code>")
-    return Markup("").join(code.format(part) if i % 2 else escape(part) for i, part in enumerate(text.split("`")))
+    parts = enumerate(text.split("`"))
+    return Markup("").join(code.format(part) if i % 2 else escape(typeset(part)) for i, part in parts)
 
 
 def inline_svg(item: Item, prefix: str) -> Markup:
