@@ -9,10 +9,10 @@ import { GUTTER } from './chart.js';
 
 const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart
 const LINE_HEIGHT = scaled(12); // px of a line of a legend
-const STACKED_HEIGHT = scaled(84); // px of a chart of areas where the room is short, its axis included
+const STACKED_HEIGHT = scaled(52); // px of a chart of areas where the room is short, its axis included
 const COMPACT_HEIGHT = scaled(215); // px of a timeline below which legends have two columns and short names
 const CHANNEL_ROWS = 8; // of a legend of many channels, which has two columns then
-const STACKED_WEIGHT = 2; // share of the remaining height, relative to a chart of lines
+const BAND_WEIGHT = 2; // share of the remaining height of a chart with a ±2σ band, relative to others
 
 /**
  * Returns the properties of tracks that require new charts when they change.
@@ -51,8 +51,8 @@ export const isDense = ({ series }, height) =>
 const legendHeight = (rows) => 3 + LINE_HEIGHT * (1 + rows);
 
 /**
- * Returns the height of each track in px. Each has room for its legend, stacked ones get most of the rest, and in a low
- * timeline the stacked ones shrink first, then all. The lowest track always has a chart, because of the axis.
+ * Returns the height of each track in px. Each has room for its legend, those with a ±2σ band get most of the rest, so that
+ * the truth outside of it is visible, and in a low timeline the stacked ones shrink first, then all. The lowest track always has a chart, because of the axis.
  * @param {Track[]} tracks
  * @param {number} height px
  */
@@ -75,7 +75,9 @@ export function trackHeights(tracks, height) {
   const least = sum(minimum);
   if (least >= height) return minimum.map((value) => Math.floor((value / least) * height));
   /** @type {number[]} */
-  const weights = stacked.map((isStacked, i) => (noteOnly[i] ? 0 : isStacked ? STACKED_WEIGHT : 1));
+  const weights = tracks.map(({ series }, i) =>
+    noteOnly[i] ? 0 : series.some(({ sigma }) => sigma) ? BAND_WEIGHT : 1,
+  );
   const share = (height - least) / sum(weights);
   return minimum.map((value, i) => Math.floor(value + weights[i] * share));
 }

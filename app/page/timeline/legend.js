@@ -10,6 +10,7 @@ import { seriesStyle } from './chart.js';
 import { areaSample } from './stacked_weights.js';
 
 const CHARACTER = 0.61; // rem
+const STANDALONE = 'standalone'; // end of the name of the only standalone run, of the modality in its picker
 const SAMPLE_AND_VALUE = { full: 8, compact: 7.1, dense: 7.5 }; // rem
 
 /** @typedef {{text: Text, track: Track, index: number}} ValueCell index of the series in the track */
@@ -39,8 +40,8 @@ export function legend(track, trace, compared, compact) {
     const sample = first.stacked
       ? areaSample(name, index)
       : lineSample(colourOf(first), dash, width);
-    const short = displayName(name);
-    const label = track.ofModalities ? short : trace.label(name);
+    const label = track.ofModalities ? displayName(name) : trace.label(name);
+    const short = name.endsWith(STANDALONE) ? STANDALONE : displayName(name);
     const text = create('span', { textContent: compact && trace.fuses ? short : label });
     list.append(create('dt', { title: label }, sample, text));
     for (const comparison of compared ? [false, true] : [false]) {
