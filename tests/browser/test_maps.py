@@ -172,12 +172,12 @@ def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
     page.page.keyboard.press("m")
     page.page.locator("#heatmaps canvas").first.hover()
     values = page.page.locator("#heatmaps .shape").all_text_contents()
-    assert all(text == "gain 0.00 nats" for text in values)  # relative to itself
+    assert all(text == "change 0.00 nats" for text in values)  # relative to itself
     page.page.keyboard.press("Shift+ArrowRight")
     page.settle(STEP + 10)
     assert page.page.locator("#maps-kind").text_content() == f"Change from step {STEP}"
     values = page.page.locator("#heatmaps .shape").all_text_contents()
-    assert not any(text == "gain 0.00 nats" for text in values)
+    assert not any(text == "change 0.00 nats" for text in values)
     page.screenshot("maps-gain")
     page.until(f"() => location.search.includes('pin=') && location.search.includes('step={STEP + 10}')")
     again = open_page("?" + page.page.url.partition("?")[2])  # the pinned step is restored without a visit
