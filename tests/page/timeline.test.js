@@ -297,14 +297,17 @@ test('the summary explains an uninformative dominant modality', () => {
 
 test('the summary names a dominant modality whose update nearly keeps the prediction', () => {
   /** @param {number[]} image sizes of the update of the image at each step, in hinge x */
-  const text = (image) => {
+  const text = (image, more = {}) => {
     const values = image.flatMap((size) => [size, 9, 9, 2, 2, 2]);
-    const run = makeTrace({ ...FUSION, update_size: { shape: [2, 2, 3], values } });
+    const update_size = { shape: [2, 2, 3], values };
+    const run = makeTrace({ ...FUSION, update_size, ...more });
     return [0, 1].map((step) => stepSummary(run, step, 0).text);
   };
   const [small, accurate] = text([0.4, 0.4]);
   assert.match(small, /Dominated by image \(70 % in hinge x\), which nearly keeps the prediction/);
   assert.doesNotMatch(accurate, /keeps/, 'of an accurate estimate, which it may confirm');
+  const [dark] = text([0.4, 0.4], { blackout: { shape: [2], values: [1, 1] } });
+  assert.match(dark, /nearly keeps the prediction as the image is blacked out\.$/);
   assert.doesNotMatch(text([0.6, 0])[0], /keeps/);
   assert.doesNotMatch(text([NaN, 0])[0], /keeps/);
 });

@@ -34,11 +34,14 @@ export function stepSummary(trace, step, component, sources = '') {
     const better = moreAccurateModality(dominant.name, trace, step, tone);
     if (dominant.weight >= DOMINANT_SHARE || better) {
       const scope = weightScope(trace, component);
-      const reasons = [uninformative, better].filter(Boolean).join(' and ');
       // A small update of an accurate estimate may confirm it; that of an inaccurate one does not correct it.
       const isSmall =
-        (tone !== 'good' || better) && keepsPrediction(dominant.name, trace, step, component);
-      const update = isSmall ? ', which nearly keeps the prediction' : '';
+        (tone === 'warn' || tone === 'bad' || better) &&
+        keepsPrediction(dominant.name, trace, step, component);
+      const update = isSmall
+        ? `, which nearly keeps the prediction${uninformative && ` as ${uninformative}`}`
+        : '';
+      const reasons = [isSmall ? '' : uninformative, better].filter(Boolean).join(' and ');
       sentences.push(
         `Dominated by ${displayName(dominant.name)} (${percent(dominant.weight)}${scope})${update}${reasons && `, although ${reasons}`}.`,
       );
