@@ -45,7 +45,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         share = ProgressShares(tuning, data, simulated_episodes(data_name, data, is_sample))
 
         def on_simulation(done: int, count: int) -> None:
-            report(share("simulation", done / count), f"simulating training episode {done} of {count}")
+            report(share("simulation", done / count), f"simulation: training episode {done} of {count}")
 
         episodes, data_hash = training_episodes(data_name, data, is_sample, folder.parent, on_simulation)
         with log_curves(folder / "log") as write:
@@ -57,17 +57,20 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
             def on_step(step: int, steps: int, loss: float) -> None:
                 log.add_step(step, loss)
-                message = f"training step {step} of {steps}, loss {loss:.3g}; {log.errors}"
+                message = f"training: step {step} of {steps}, loss {loss:.3g}; {log.errors}"
                 report(share("training", step / steps), message)
 
-            report(share("training", 0.0), "encoding images and evaluating the base checkpoint")
+            def on_evaluation() -> None:
+                report(share("training", 1.0), "evaluation: fine-tuned checkpoint on the held-out episodes")
+
+            report(share("training", 0.0), "training: encoding images and evaluating the base checkpoint")
             result = finetune(
                 base,
                 episodes,
                 data_hash=data_hash,
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
-                callbacks=Callbacks(on_step, on_validation, log.resume),
+                callbacks=Callbacks(on_step, on_validation, log.resume, on_evaluation=on_evaluation),
                 partial=partial_path(path),
             )
             log.write()
@@ -80,7 +83,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             slices=tuning.compared_slices(base.filter),
             particles=settings.particles,
             seed=settings.seed,
-            progress=lambda done: report(share("comparison", done), "comparing the result with the base checkpoint"),
+            progress=lambda done: report(share("comparison", done), "evaluation: comparison with the base checkpoint"),
         )
         success = None if tuning.success is None else judge(tuning.success, comparison, base.task)
 
@@ -89,7 +92,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             write_atomically(result_path, json.dumps(as_json(document), allow_nan=False).encode())
 
         def on_profile(done: float) -> None:
-            report(share("profile", done), "measuring the healthy record")
+            report(share("profile", done), "healthy record: held-out episodes")
 
         write_result()
         on_profile(0.0)

@@ -109,6 +109,7 @@ def finetune_external(
     seconds = run_loop(loop, state, began, callbacks)
     if seconds is None:
         return None
+    callbacks.on_evaluation()
     loop.restore_best()
     after = loop.measure(loop.best_step, None, "test")
     assert digest(module, frozen) == frozen_digest, "a frozen parameter changed"

@@ -44,7 +44,8 @@ class Callbacks:
         report: after each step, with step, total steps and loss. on_validation: after each validation, the base
             checkpoint's first; again with the earlier ones when a run resumes. on_resume: with the step at which a run
             resumes. stop: before each step; the run pauses if it returns true. on_start: before the images are encoded
-            and the base checkpoint is evaluated; all arguments are valid by then.
+            and the base checkpoint is evaluated; all arguments are valid by then. on_evaluation: after training, before the
+            best weights are evaluated on the test episodes.
     """
 
     report: Callable[[int, int, float], None] = lambda step, steps, loss: None
@@ -52,6 +53,7 @@ class Callbacks:
     on_resume: Callable[[int], None] = lambda step: None
     stop: Callable[[], bool] = lambda: False
     on_start: Callable[[], None] = lambda: None
+    on_evaluation: Callable[[], None] = lambda: None
 
 
 NO_CALLBACKS = Callbacks()
@@ -107,6 +109,7 @@ def finetune(
         seconds = run_loop(loop, state, began, callbacks)
         if seconds is None:
             return None
+        callbacks.on_evaluation()
         loop.restore_best()
         noise_factor = (
             calibrate_noise(filter_, lambda: _nees(filter_, mixes["val"], settings)) if settings.calibrate else 1.0

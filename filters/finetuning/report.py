@@ -22,17 +22,17 @@ def curve_values(validation: Validation) -> dict[str, float]:
 
 
 def error_summary(main: MainError, first: Validation, last: Validation) -> str:
-    """Main error by slice: ``clean 0.34 cm, blackout 0.95 3.14 -> 1.20 cm``."""
+    """Main error by slice: ``validation windows: clean 0.34 cm, blackout 0.95 3.14 -> 1.20 cm``."""
     parts = []
     key, unit = main.key, f" {main.unit}".rstrip()
     for name, metrics in last.slices.items():
         before, after = first.slices[name]["rmse"][key], metrics["rmse"][key]
         parts.append(f"{name} {before:.2f}{unit}" if before == after else f"{name} {before:.2f} -> {after:.2f}{unit}")
-    return ", ".join(parts)
+    return f"validation windows: {', '.join(parts)}"
 
 
 def held_out_rows(record: Mapping[str, Any]) -> list[list[str | float | None]]:
-    """Errors on held-out episodes in a training record, one row per slice and measure.
+    """Errors on windows of held-out episodes in a training record, one row per slice and measure.
 
     Returns:
         ``[name, before, after, change]``: the change in percent for errors, as a difference for nll and nees.

@@ -314,12 +314,16 @@ def _title(d: Difference) -> str:
 
 
 def _change_texts(d: Difference) -> tuple[str, str, str]:
-    """Values, change and interval as text."""
+    """Values, change and interval as text: of coverage in points, of the NLL in nats, of others in percent."""
     before, after, unit = d.display
-    relative = d.measure not in ("coverage95", "miscalibration")
-    change, low, high = (_factor(x) if relative else f"{100 * x:+.1f}" for x in (d.effect, d.low, d.high))
-    change_unit = " %" if relative else " points"
-    return f"{before:.3g} -> {after:.3g} {unit}".rstrip(), f"{change}{change_unit}", f"{low} to {high}"
+    if d.measure in ("coverage95", "miscalibration"):
+        texts, change_unit = [f"{100 * x:+.1f}" for x in d.change], "points"
+    elif d.measure == "nll":
+        texts, change_unit = [f"{x:+.3g}" for x in d.change], unit
+    else:
+        texts, change_unit = [_factor(x) for x in (d.effect, d.low, d.high)], "%"
+    change, low, high = texts
+    return f"{before:.3g} -> {after:.3g} {unit}".rstrip(), f"{change} {change_unit}", f"{low} to {high}"
 
 
 def _factor(effect: float) -> str:

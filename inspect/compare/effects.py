@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -32,17 +32,15 @@ LEVEL = 0.02
 
 
 CHANGE_NOTE = (
-    "change: negative is better. Errors: relative change of the RMSE. NLL: e^(difference / number of state components) "
-    "- 1, the relative change of errors and standard deviations that has the same difference. NEES: relative change of "
-    "the factor by which standard deviations are wrong. Coverage and miscalibration: change of the distance from the "
-    "ideal, in percentage points."
+    "change: negative is better, except of coverage, which should be 95 %. Errors: relative change of the RMSE. NLL: "
+    "difference in nats. NEES/n: relative change of the factor by which standard deviations are wrong. Coverage and "
+    "miscalibration: difference in percentage points."
 )
-"""Explains changes in percent and in points."""
+"""Explains changes in percent, in nats and in points."""
 
 EFFECT_NOTE = (
-    "effect (95 % interval: low to high): negative is better. NLL: difference / number of state components. NEES: "
-    "difference of |ln NEES| / 2, the logarithm of the factor by which standard deviations are wrong. Both are changes "
-    "of e^effect - 1, as in Improvements and Regressions. Coverage and miscalibration: change of the distance from the "
+    "effect (95 % interval: low to high): negative is better. NLL: difference / number of state components. NEES/n: "
+    "difference of |ln(NEES/n)| / 2, the logarithm of the factor by which standard deviations are wrong. Coverage and miscalibration: change of the distance from the "
     "ideal, a share."
 )
 """Explains ``Difference.effect`` of measures of beliefs."""
@@ -60,6 +58,7 @@ class Difference:
             over n, equivalent to scaling all errors and standard deviations. NEES: factor by which standard deviations
             are wrong. Coverage and calibration: increase of the deviation from the ideal, a share.
         low, high: 95 % interval of the effect over episodes; NaN below ``MIN_TRAJECTORIES`` episodes.
+        change: ``after - before``, and its 95 % interval.
     """
 
     slice: str
@@ -71,6 +70,7 @@ class Difference:
     effect: float
     low: float
     high: float
+    change: tuple[float, float, float]
 
     @property
     def improved(self) -> bool:
@@ -140,15 +140,29 @@ def differences(sums: Array, slices: Sequence[str], measures: Sequence[Measure])
             before, after = (float(value) for value in measure.value(total[:, s]))
             if not (math.isfinite(before) and math.isfinite(after)):
                 continue
-            effect, low, high = map(float, jackknife(with_steps, partial(_effect, measure)))
-            rows.append(Difference(name, measure.name, measure.unit, measure.factor, before, after, effect, low, high))
+            effect, low, high = map(float, jackknife(with_steps, partial(_change, measure.loss_of)))
+            change, lowest, highest = map(float, jackknife(with_steps, partial(_change, measure.value)))
+            rows.append(
+                Difference(
+                    slice=name,
+                    measure=measure.name,
+                    unit=measure.unit,
+                    factor=measure.factor,
+                    before=before,
+                    after=after,
+                    effect=effect,
+                    low=low,
+                    high=high,
+                    change=(change, lowest, highest),
+                )
+            )
     return tuple(rows)
 
 
-def _effect(measure: Measure, sums: Array) -> Array:
-    """Sums (..., 2, Q) to (...): increase of the loss."""
-    loss = measure.loss(measure.value(sums))
-    difference: Array = loss[..., 1] - loss[..., 0]
+def _change(function: Callable[[Array], Array], sums: Array) -> Array:
+    """Sums (..., 2, Q) to (...): increase of a function of them."""
+    values = function(sums)
+    difference: Array = values[..., 1] - values[..., 0]
     return difference
 
 

@@ -44,6 +44,8 @@ class Success:
     Attributes:
         criterion: as text. statement: in words. outcome: of all slices. verdict: the outcome in words.
         slices: that of the criterion first.
+        not_excluded: names of the slices whose change is within the limit but whose interval extends beyond it, if the
+            criterion is met: the episodes do not exclude a larger change there.
     """
 
     criterion: str
@@ -51,6 +53,7 @@ class Success:
     outcome: Outcome
     verdict: str
     slices: tuple[SliceChange, ...]
+    not_excluded: tuple[str, ...]
 
 
 def judge(criterion: Criterion, comparison: CheckpointComparison, task: Task) -> Success:
@@ -71,7 +74,9 @@ def judge(criterion: Criterion, comparison: CheckpointComparison, task: Task) ->
         outcome = "not met"
     elif "inconclusive" in outcomes or target is None:
         outcome = "inconclusive"
-    return Success(str(criterion), criterion.sentence(task), outcome, _verdict(outcome, rows, target), tuple(rows))
+    not_excluded = tuple(row.slice for row in rows if row.high > row.limit) if outcome == "met" else ()
+    verdict = _verdict(outcome, rows, target, not_excluded)
+    return Success(str(criterion), criterion.sentence(task), outcome, verdict, tuple(rows), not_excluded)
 
 
 def _change(difference: Difference, limit: float, is_target: bool = False) -> SliceChange:
@@ -83,12 +88,17 @@ def _change(difference: Difference, limit: float, is_target: bool = False) -> Sl
     return SliceChange(difference.slice, before, after, unit, change, low, high, limit, outcome)
 
 
-def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference | None) -> str:
+def _verdict(
+    outcome: Outcome, rows: Sequence[SliceChange], target: Difference | None, not_excluded: Sequence[str]
+) -> str:
     """The outcome, the change in the criterion's slice, and those elsewhere."""
     head = {"met": "Met", "not met": "Not met", "inconclusive": "Inconclusive"}[outcome]
     if target is None:
         return f"{head}: the slice of the criterion has no step in the held-out episodes."
     first, *others = rows
+    if not_excluded:
+        limit = percent(others[0].limit, "+.6g")
+        head += f"; {limit} not excluded in {', '.join(map(_title, not_excluded))}"
     text = f"{head}: {_description(first)}"
     advice = _advice(rows) if outcome == "inconclusive" else ""
     return f"{text}{_elsewhere(others)}.{advice}"

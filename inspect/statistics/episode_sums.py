@@ -57,6 +57,10 @@ class Measure:
     value: Callable[[Array], Array]
     loss: Callable[[Array], Array]
 
+    def loss_of(self, sums: Array) -> Array:
+        """Sums (..., Q) to (...): loss of their value."""
+        return self.loss(self.value(sums))
+
     @property
     def is_error(self) -> bool:
         """Whether the measure is a root mean square error rather than a measure of the belief."""

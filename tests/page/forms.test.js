@@ -1,8 +1,11 @@
+/** @import { Success } from '../../app/page/types/server.js' */
+
 import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { spanProblem } from '../../app/page/tabs/comparison_form.js';
 import { promoteText } from '../../app/page/tabs/finetune_run.js';
+import { notExcluded, outcomeView } from '../../app/page/tabs/finetune_runs.js';
 import { inOrder, verdictStatus } from '../../app/page/tabs/diagnostics.js';
 import { episodeNote } from '../../app/page/tabs/failures.js';
 import { spanNote } from '../../app/page/widgets/fault_dialog.js';
@@ -30,6 +33,22 @@ test('the button that promotes a checkpoint names a criterion that is not met', 
   assert.equal(promoteText('met'), 'Promote to default');
   assert.equal(promoteText('not met'), 'Promote to default (criterion not met)');
   assert.equal(promoteText('inconclusive'), 'Promote to default (criterion inconclusive)');
+  assert.equal(promoteText('not excluded'), 'Promote to default (regression not excluded)');
+});
+
+test('a met criterion names the limit that the episodes do not exclude', () => {
+  const slices = /** @type {Success['slices']} */ ([
+    { slice: 'contact', limit: -0.1 },
+    { slice: 'clean', limit: 0.05 },
+  ]);
+  const success = /** @type {Success} */ ({ slices, not_excluded: ['clean'] });
+  assert.deepEqual(notExcluded(success), [slices[1]]);
+  assert.deepEqual(outcomeView('met', [slices[1]]), {
+    text: 'met; +5 % not excluded',
+    tone: 'not excluded',
+  });
+  assert.deepEqual(outcomeView('met', []), { text: 'met', tone: 'met' });
+  assert.deepEqual(notExcluded(/** @type {Success} */ ({ slices })), []); // an older result
 });
 
 test('slow diagnostics follow the others, before those that do not apply', () => {

@@ -198,7 +198,10 @@ def _progress(base: Checkpoint, partial: Path, log: Path | None, viewer: str) ->
         def on_start() -> None:
             console.note("Encoding images and evaluating the base checkpoint")
 
-        yield Callbacks(report, on_validation, on_resume, on_start=on_start)
+        def on_evaluation() -> None:
+            console.note("Evaluating the fine-tuned checkpoint")
+
+        yield Callbacks(report, on_validation, on_resume, on_start=on_start, on_evaluation=on_evaluation)
 
 
 def _external(

@@ -22,6 +22,8 @@ import {
   criterionText,
   limits,
   linePlot,
+  notExcluded,
+  outcomeView,
   plotViews,
   trainingData,
 } from './finetune_runs.js';
@@ -94,7 +96,9 @@ export class FinetuneRun {
     const { no_change: noChange = '' } = result?.finetuned ?? {};
     const verdict = [success?.verdict, noChange || (success ? '' : result?.comparison.verdict)];
     this.showVerdict(result ? verdict.filter(Boolean).join(' ') : stateText(job));
-    html('.verdict', this.#host).dataset.outcome = success?.outcome ?? '';
+    html('.verdict', this.#host).dataset.outcome = success
+      ? outcomeView(success.outcome, notExcluded(success)).tone
+      : '';
     this.#drawSlices(success);
     const isPaused = job?.state === 'cancelled';
     const isComplete = Boolean(result && run.finetuned);
@@ -123,13 +127,18 @@ export class FinetuneRun {
     table.hidden = !success;
     if (!success) return;
     const titles = ['slice of held-out episodes', 'before', 'after', 'change', 'limit', ''];
+    const beyond = notExcluded(success);
     const rows = success.slices.map((slice, i) => {
-      const { before, after, unit, limit, outcome } = slice;
+      const { before, after, unit, limit } = slice;
+      const { text, tone } = outcomeView(
+        slice.outcome,
+        beyond.filter((other) => other === slice),
+      );
       const values = [before, after].map((value) => withUnit(significant(value), unit));
       const bound = `${i ? '≤ +' : '≤ −'}${percent(Math.abs(Number(limit)))}`;
-      const texts = [displayName(slice.slice), ...values, changeText(slice), bound, outcome];
+      const texts = [displayName(slice.slice), ...values, changeText(slice), bound, text];
       const cells = texts.map((textContent) => create('td', { textContent }));
-      cells[5].dataset.outcome = outcome;
+      cells[5].dataset.outcome = tone;
       return create('tr', {}, ...cells);
     });
     const headings = titles.map((title) => columnHeading(title));
@@ -144,7 +153,8 @@ export class FinetuneRun {
   /** @param {FineTuneDetails} run */
   #drawDecision({ finetuned: name, saved_as: place, result, settings }) {
     const { success } = result ?? {};
-    const primary = success?.outcome === 'met' ? 'promote' : '';
+    const outcome = success && outcomeView(success.outcome, notExcluded(success)).tone;
+    const primary = outcome === 'met' ? 'promote' : '';
     const host = html('.decide', this.#host);
     host.hidden = !result;
     if (!result) return;
@@ -155,7 +165,7 @@ export class FinetuneRun {
     host.replaceChildren(
       this.#decisionButton(
         'promote',
-        promoteText(success?.outcome),
+        promoteText(outcome),
         'Use it as the default filter of this server',
         place === 'default' || Boolean(noChange),
         primary,
@@ -222,13 +232,17 @@ export class FinetuneRun {
 }
 
 /**
- * Returns the text of the button that promotes a checkpoint, with the outcome of a criterion that is not met.
- * @param {Success['outcome'] | undefined} outcome
+ * Returns the text of the button that promotes a checkpoint, with the outcome of a criterion that is not clearly met.
+ * @param {string | null | undefined} outcome
  */
 export function promoteText(outcome) {
-  const reasons = { 'not met': 'criterion not met', inconclusive: 'criterion inconclusive' };
-  const reason = outcome && outcome !== 'met' ? ` (${reasons[outcome]})` : '';
-  return `Promote to default${reason}`;
+  const reasons = new Map([
+    ['not met', 'criterion not met'],
+    ['inconclusive', 'criterion inconclusive'],
+    ['not excluded', 'regression not excluded'],
+  ]);
+  const reason = reasons.get(outcome ?? '');
+  return `Promote to default${reason ? ` (${reason})` : ''}`;
 }
 
 /** @param {Job | null} job */

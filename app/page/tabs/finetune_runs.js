@@ -1,7 +1,7 @@
 /** The fine-tuning runs of a task: their criterion and outcome in a table, their validations in one chart. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { FineTuneDetails, FineTuneProgress, FineTuneRunInfo, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews } from '../types/server.js' */
+/** @import { FineTuneDetails, FineTuneProgress, FineTuneRunInfo, FineTuneRunSummary, FineTuneSettings, Job, Plot, ResultViews, Success } from '../types/server.js' */
 
 import { columnHeading, create, createButton, fillTable } from '../core/dom.js';
 import { displayName, percent } from '../core/units.js';
@@ -79,6 +79,7 @@ export class FinetuneRuns {
       saved_as: place,
     } = run.run === current?.run ? { ...run, job: current.job } : run; // the list is older
     const link = createButton('title', name, () => this.#store.set({ run: run.run }));
+    const outcome = success && outcomeView(success.outcome, notExcluded(success));
     const [target, ...others] = success?.slices ?? [];
     const worst = others.sort((a, b) => Number(b.change) - Number(a.change))[0];
     const state = run.finetuned ? 'no criterion' : job ? stateOf(job) : 'removed';
@@ -87,13 +88,13 @@ export class FinetuneRuns {
       settings.train.map(presetName).join(', '),
       trainingData(run),
       settings.success ? criterionText(settings.success) : '–',
-      success?.outcome ?? state,
+      outcome?.text ?? state,
       target ? changeText(target) : '',
       worst ? `${displayName(worst.slice)} ${changeText(worst)}` : '',
       place ? PLACES[place] : '',
     ];
     const cells = texts.map((textContent) => create('td', { textContent, title: textContent }));
-    cells[4].dataset.outcome = success?.outcome ?? '';
+    cells[4].dataset.outcome = outcome?.tone ?? '';
     const row = create('tr', {}, create('td', {}, link), ...cells);
     row.classList.toggle('here', run.run === current?.run);
     return row;
@@ -200,6 +201,23 @@ export function changes(validations, slice, key) {
 function stateOf(job) {
   if (job.state === 'running') return `running, ${percent(job.progress)}`;
   return job.state === 'cancelled' ? 'paused' : jobSummary(job); // as in the run itself
+}
+
+/**
+ * Returns the slices in which the episodes do not exclude a change beyond the limit of a criterion that is met.
+ * @param {Success} success older results do not name them
+ */
+export const notExcluded = ({ slices, not_excluded: names }) =>
+  slices.filter(({ slice }) => names?.includes(slice));
+
+/**
+ * Returns the outcome of a criterion or of one slice as text, and its colour.
+ * @param {Success['outcome']} outcome
+ * @param {Success['slices']} slices of these whose limit is not excluded
+ */
+export function outcomeView(outcome, [slice]) {
+  if (!slice) return { text: outcome, tone: outcome };
+  return { text: `met; +${percent(slice.limit)} not excluded`, tone: 'not excluded' };
 }
 
 /** @param {number} value */

@@ -1951,6 +1951,8 @@ export interface components {
          *     Attributes:
          *         criterion: as text. statement: in words. outcome: of all slices. verdict: the outcome in words.
          *         slices: that of the criterion first.
+         *         not_excluded: names of the slices whose change is within the limit but whose interval extends beyond it, if the
+         *             criterion is met: the episodes do not exclude a larger change there.
          */
         Success: {
             /** Criterion */
@@ -1966,6 +1968,8 @@ export interface components {
             verdict: string;
             /** Slices */
             slices: components["schemas"]["SliceChange"][];
+            /** Not Excluded */
+            not_excluded: string[];
         };
         /**
          * SweepInfo

@@ -13,7 +13,7 @@ from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.filters.finetuning.success import Criterion
 from beliefscope.inspect.compare.effects import Difference
-from beliefscope.inspect.compare.success import judge
+from beliefscope.inspect.compare.success import Success, judge
 
 PUSH = find_task("push")
 MODELS = ("image", "haptics")
@@ -53,12 +53,17 @@ def test_slice_must_be_evaluated() -> None:
     assert [s.name for s in occluded.slices(PUSH, MODELS, [bias])] == ["bias", "image occluded"]
 
 
+def success_of(*effects: tuple[str, float, float, float]) -> Success:
+    """Outcome by changes (slice, effect, low, high)."""
+    name = PUSH.main_error.name
+    rows = tuple(Difference(slice_, name, "cm", 100.0, 0.02, 0.01, *values, (0.0, 0.0, 0.0)) for slice_, *values in effects)
+    comparison: Any = SimpleNamespace(differences=rows)
+    return judge(Criterion("contact"), comparison, PUSH)
+
+
 def verdict(*effects: tuple[str, float, float, float]) -> tuple[str, str]:
     """Outcome and verdict of changes (slice, effect, low, high)."""
-    name = PUSH.main_error.name
-    rows = tuple(Difference(slice_, name, "cm", 100.0, 0.02, 0.01, *values) for slice_, *values in effects)
-    comparison: Any = SimpleNamespace(differences=rows)
-    success = judge(Criterion("contact"), comparison, PUSH)
+    success = success_of(*effects)
     return success.outcome, success.verdict
 
 
@@ -83,3 +88,13 @@ def test_outcome_follows_from_the_intervals() -> None:
     assert "image noise +8.3 %" in text
     assert "too few to decide image noise" in text
     assert verdict(("clean", -0.3, -0.4, -0.2))[0] == "inconclusive"
+
+
+def test_regressions_that_are_not_excluded_are_named() -> None:
+    good, clean = ("contact", -0.3, -0.4, -0.2), ("clean", 0.0, -0.01, 0.01)
+    success = success_of(good, clean, ("haptics only", 0.037, -0.03, 0.11), ("image_noise", 0.01, -0.1, 0.06))
+    assert success.outcome == "met"
+    assert success.not_excluded == ("haptics only", "image_noise")
+    assert success.verdict.startswith("Met; +5 % not excluded in haptics only, image noise: contact -25.9 %")
+    assert success_of(good, clean).verdict.startswith("Met: contact")
+    assert success_of(good, ("clean", 0.08, 0.01, 0.15)).not_excluded == ()  # of an inconclusive criterion

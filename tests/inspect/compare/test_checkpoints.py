@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -137,9 +138,25 @@ def test_planted_regression_is_found() -> None:
     assert comparison(False).verdict.startswith("Improved: haptics only: hinge x ")
 
 
+def test_beliefs_change_in_nats_and_points() -> None:
+    result = comparison(True)
+    by_measure = {d.measure: d for d in result.differences if d.slice == "haptics only"}
+    n = len(find_task("door").components)
+    nll, coverage = by_measure["nll"], by_measure["coverage95"]
+    assert nll.change == pytest.approx([n * x for x in (nll.effect, nll.low, nll.high)])
+    assert coverage.change[0] == pytest.approx(coverage.after - coverage.before)
+    assert coverage.before > coverage.after  # the biased filter is overconfident
+    title, rows = "Regressions", {}
+    for table in result.tables():
+        if table.title == title:
+            rows = {(row[0], row[1]): row[3] for row in table.rows}
+    assert rows["haptics only", "NLL"] == f"{nll.after - nll.before:+.3g} nats"
+    assert rows["haptics only", "95 % coverage"] == f"{100 * (coverage.after - coverage.before):+.1f} points"
+
+
 def verdict_of(low: float, effect: float, high: float) -> str:
     """Verdict for a single changed error."""
-    difference = Difference("contact", "position", "cm", 100.0, 0.01, 0.01 * math.exp(effect), effect, low, high)
+    difference = Difference("contact", "position", "cm", 100.0, 0.01, 0.01 * math.exp(effect), effect, low, high, (0.0, 0.0, 0.0))
     return replace(comparison(True), differences=(difference,)).verdict
 
 
