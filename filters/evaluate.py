@@ -53,6 +53,9 @@ Member = TypeVar("Member", bound=tuple[Any, ...])
 Run = tuple[Tensor, Tensor]
 """Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU; of one episode without N."""
 
+CONSISTENCY = {"nll": "NLL", "nees": "NEES/n", "coverage95": "95 % coverage"}
+"""Measures of the belief in ``Metrics``: name -> label in tables and texts."""
+
 
 @dataclass(frozen=True)
 class Metrics:
@@ -88,7 +91,7 @@ class Metrics:
     squares: FloatArray64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def to_dict(self) -> dict[str, Any]:
-        consistency = {"nll": self.nll, "nees": self.nees, "coverage95": self.coverage95}
+        consistency = {name: getattr(self, name) for name in CONSISTENCY}
         document: dict[str, Any] = {"rmse": self.rmse}
         document |= {k: None if math.isnan(value) else value for k, value in consistency.items()}
         for key in ("rmse_from_step_0", "rmse_before_contact", "rmse_after_contact"):
@@ -101,14 +104,14 @@ class Metrics:
 
     def __str__(self) -> str:
         parts = [f"RMSE {key} {value:.3g}" for key, value in self.rmse.items()]
-        parts += [f"{name} {getattr(self, name):.3g}" for name in ("nll", "nees", "coverage95")]
+        parts += [f"{label} {getattr(self, name):.3g}" for name, label in CONSISTENCY.items()]
         return ", ".join(parts)
 
     def _repr_html_(self) -> str:
         """Errors beside those of the baselines, and the measures of consistency, in a notebook."""
         columns = {FILTER: self, **self.baselines}
         rows = [[f"RMSE {key}", *(m and m.rmse.get(key) for m in columns.values())] for key in self.rmse]
-        rows += [[name, getattr(self, name), *([None] * len(self.baselines))] for name in ("nll", "nees", "coverage95")]
+        rows += [[label, getattr(self, name), *([None] * len(self.baselines))] for name, label in CONSISTENCY.items()]
         return html_table("", ["measure", *columns], rows)
 
     def _errors(self) -> dict[str, Any]:

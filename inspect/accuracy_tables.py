@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from beliefscope.datasets.task import display_name
-from beliefscope.filters.evaluate import STANDALONE, STAY, UPDATE
+from beliefscope.filters.evaluate import CONSISTENCY, STANDALONE, STAY, UPDATE
 from beliefscope.inspect.diagnostics.views import Table
 
 LABELS = {
@@ -32,7 +32,7 @@ def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
         if key == "rmse" or metrics.get(key) != metrics["rmse"]
         for name in metrics.get(key, {})
     ]
-    rows += [(name, _number(metrics[name]), "", "") for name in ("nll", "nees", "coverage95")]
+    rows += [(label, _number(metrics[name]), "", "") for name, label in CONSISTENCY.items()]
     tables = [Table(title, ("measure", "filter", *metrics["baselines"]), rows, _start_note(metrics))]
     errors = {
         label.format(name): (metrics[key][name] or {}).get("rmse", {})

@@ -296,7 +296,7 @@ class Experiments:
 
     def _repr_html_(self) -> str:
         """That line and the first ``SHOWN`` rows of the overview, in a notebook."""
-        rows = self.overview().drop_columns([*DOCUMENTS, "checkpoint", "data"]).slice(0, SHOWN)
+        rows = labelled(self.overview()).drop_columns(["checkpoint", "data"]).slice(0, SHOWN)
         return html_paragraph(repr(self)[1:-1], strong=True) + html_table(
             f"Largest errors, at most {SHOWN} rows", rows.column_names, [row.values() for row in rows.to_pylist()]
         )
@@ -379,3 +379,9 @@ class Experiments:
         if not path.exists():
             raise BadInput(f"{column} {str(path)!r} was deleted or moved after the sweep; move it back")
         return path
+
+
+def labelled(overview: pa.Table) -> pa.Table:
+    """The overview as a table for reading: without JSON documents, and NEES over n labelled as such."""
+    rows = overview.drop_columns(DOCUMENTS)
+    return rows.rename_columns(["NEES/n" if name == "nees" else name for name in rows.column_names])

@@ -44,8 +44,8 @@ class Callbacks:
         report: after each step, with step, total steps and loss. on_validation: after each validation, the base
             checkpoint's first; again with the earlier ones when a run resumes. on_resume: with the step at which a run
             resumes. stop: before each step; the run pauses if it returns true. on_start: before the images are encoded
-            and the base checkpoint is evaluated; all arguments are valid by then. on_evaluation: after training, before the
-            best weights are evaluated on the test episodes.
+            and the base checkpoint is evaluated; all arguments are valid by then. on_evaluation: after training, before
+            the best weights are evaluated on the test episodes.
     """
 
     report: Callable[[int, int, float], None] = lambda step, steps, loss: None

@@ -10,6 +10,7 @@ from beliefscope.datasets.text import percent
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.module_selection import Node, module_change
 from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.success import BELIEF
 
 
 def curve_values(validation: Validation) -> dict[str, float]:
@@ -41,9 +42,14 @@ def held_out_rows(record: Mapping[str, Any]) -> list[list[str | float | None]]:
         {name: {**metrics["rmse"], **metrics} for name, metrics in record["held_out"][state].items()}
         for state in ("before", "after")
     )
-    keys = [*next(iter(before.values()))["rmse"], "nll", "nees"]
+    keys = [*next(iter(before.values()))["rmse"], *BELIEF]
     return [
-        [f"{name}: {key}", values[key], after[name][key], _difference(values[key], after[name][key], key)]
+        [
+            f"{name}: {BELIEF.get(key, key)}",
+            values[key],
+            after[name][key],
+            _difference(values[key], after[name][key], key),
+        ]
         for name, values in before.items()
         for key in keys
     ]
@@ -52,7 +58,7 @@ def held_out_rows(record: Mapping[str, Any]) -> list[list[str | float | None]]:
 def _difference(before: float | None, after: float | None, key: str) -> str | None:
     if before is None or after is None:
         return None
-    return f"{after - before:+.2f}" if key in ("nll", "nees") or not before else percent(after / before - 1, "+.0f")
+    return f"{after - before:+.2f}" if key in BELIEF or not before else percent(after / before - 1, "+.0f")
 
 
 def module_table(

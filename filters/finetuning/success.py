@@ -19,7 +19,7 @@ from beliefscope.filters.finetuning.slices import Slice, fault_slices, standard_
 ERROR = "error"
 """Measure of the task's main error."""
 
-BELIEF = {"nll": "NLL", "nees": "NEES"}
+BELIEF = {"nll": "NLL", "nees": "NEES/n"}
 """Measures of the belief besides errors."""
 
 

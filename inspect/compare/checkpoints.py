@@ -17,6 +17,7 @@ from beliefscope.datasets.task import with_unit
 from beliefscope.datasets.text import percent
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress
+from beliefscope.filters.evaluate import CONSISTENCY
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.finetuning.slices import Slice, standard_slices
 from beliefscope.inspect.compare.effects import (
@@ -282,10 +283,6 @@ def _standard(pair: Sequence[Checkpoint], without: set[str]) -> tuple[list[Slice
     return selected, tuple(left_out)
 
 
-MEASURES = {"nll": "NLL", "nees": "NEES/n", "coverage95": "95 % coverage"}
-"""Display names of measures."""
-
-
 def _summary(verb: str, changes: Sequence[Difference], errors: Sequence[Difference], sign: float) -> str:
     """The largest significant change and the number of others, or the most likely one if none is significant.
 
@@ -310,7 +307,7 @@ def _description(d: Difference) -> str:
 
 
 def _title(d: Difference) -> str:
-    return MEASURES.get(d.measure, d.measure.replace("_", " "))
+    return CONSISTENCY.get(d.measure, d.measure.replace("_", " "))
 
 
 def _change_texts(d: Difference) -> tuple[str, str, str]:

@@ -40,8 +40,8 @@ CHANGE_NOTE = (
 
 EFFECT_NOTE = (
     "effect (95 % interval: low to high): negative is better. NLL: difference / number of state components. NEES/n: "
-    "difference of |ln(NEES/n)| / 2, the logarithm of the factor by which standard deviations are wrong. Coverage and miscalibration: change of the distance from the "
-    "ideal, a share."
+    "difference of |ln(NEES/n)| / 2, the logarithm of the factor by which standard deviations are wrong. Coverage and "
+    "miscalibration: change of the distance from the ideal, a share."
 )
 """Explains ``Difference.effect`` of measures of beliefs."""
 

@@ -81,7 +81,7 @@ def healthy(case: Case) -> Diagnosis:
     nees = _nees(case.profile)
     headline = f"Healthy: {text}"
     if _is_miscalibrated(nees):
-        overconfident = f"{'over' if nees > 1 else 'under'}confident (median NEES {nees:.2g})"
+        overconfident = f"{'over' if nees > 1 else 'under'}confident (median NEES/n {nees:.2g})"
         headline = f"Healthy, though {overconfident}: {text}"
         if not 1 / WRONG_NEES <= nees <= WRONG_NEES:
             noise = too_small(case.profile, case.inputs.checkpoint) if nees > 1 else None

@@ -131,7 +131,7 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     # Charts are added, moved and resized; the permalink keeps them, and the browser their heights.
     titles = "() => [...document.querySelectorAll('#tracks h3')].map((title) => title.textContent.split(/[ ,(]/)[0])"
     page.page.locator("#charts").click()
-    page.page.get_by_label("NEES", exact=True).check()
+    page.page.get_by_label("NEES/n", exact=True).check()
     page.page.get_by_role("button", name="Move estimate up").click()
     assert page.page.evaluate("() => document.activeElement.ariaLabel") == "Move estimate down"
     assert not page.violations("#chart-menu")

@@ -18,7 +18,7 @@ test('updates that the filter does not report have no column', () => {
     );
     return columns.map(({ title }) => title);
   };
-  const [first, last] = [['episode', 'step', 'position error cm', 'phase'], ['NEES']];
+  const [first, last] = [['episode', 'step', 'position error cm', 'phase'], ['NEES/n']];
   assert.deepEqual(titles([null, null, 0.1]), [...first, ...last]);
   const update = 'haptics-only update cm';
   assert.deepEqual(titles([null, 0.2, 0.1]), [...first, update, ...last]);

@@ -230,6 +230,7 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
     code, out, _ = run("experiments --top 1 -o", tmp_path / "all.csv", sweep)
     assert code == 0
     assert "3 more rows: --top 4" in out
+    assert "NEES/n" in out  # stored as nees, over n
     assert "Not in this table: 2 entries of the provenance (lr, run)." in out
     query = out.rpartition("--sql ")[2]
     code, out, _ = run(f"experiments --sql {query.strip()} --json -", sweep)

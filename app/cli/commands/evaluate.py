@@ -21,9 +21,9 @@ def evaluate(
     tasks start at an offset from the truth. Warns if the data differ from the training data.
 
     Reports the RMSE without the first 30 steps (field tasks: of all steps; your own task: without Task.warmup steps),
-    from step 0, before and after the first contact; nll, the negative log-likelihood of the truth in nats; nees, the
-    normalised estimation error squared per dimension, 1 for a calibrated covariance; coverage95, the fraction of steps
-    with the truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its
+    from step 0, before and after the first contact; NLL, the negative log-likelihood of the truth in nats; NEES/n,
+    the normalised estimation error squared per dimension, 1 for a calibrated covariance; 95 % coverage, the fraction of
+    steps with the truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its
     estimate; dynamics is the filter with all observations masked.
 
     Each modality has two errors: of its update, the fused filter's prior of each step updated with this modality only;

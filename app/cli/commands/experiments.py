@@ -17,7 +17,7 @@ def experiments(
 ) -> console.Result:
     """Query the results of sweeps.
 
-    Without --sql, compares the checkpoints: pooled RMSE of the position, NEES, coverage and the worst step, by
+    Without --sql, compares the checkpoints: pooled RMSE of the position, NEES/n, coverage and the worst step, by
     checkpoint and faults, for the steps of one phase. docs/sweep.md lists the columns and ten queries.
 
     \b
@@ -27,7 +27,7 @@ def experiments(
       beliefscope experiments sweep --sql "SELECT phase, avg(coverage95) FROM results GROUP BY phase"
       beliefscope experiments sweep-a sweep-b -o all.csv
     """
-    from beliefscope.recordings.sweep_table import DOCUMENTS, Experiments, write_rows
+    from beliefscope.recordings.sweep_table import Experiments, labelled, write_rows
 
     tables = Experiments(sweeps)
     rows = tables.query(sql) if sql is not None else tables.overview(phase, sort)
@@ -38,7 +38,7 @@ def experiments(
     document = {"rows": rows.slice(0, top).to_pylist(), "count": len(rows)}
     if sql is not None:
         return console.Result(document, console.arrow("Results", rows, top), output)
-    text = console.arrow(f"Checkpoints, {phase} steps", rows.drop_columns(DOCUMENTS), top)
+    text = console.arrow(f"Checkpoints, {phase} steps", labelled(rows), top)
     return console.Result(document, text + _provenance_note(tables.provenance_keys()), output)
 
 

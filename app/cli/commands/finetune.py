@@ -57,7 +57,7 @@ class Learning:
     )
     l2_sp: float = opt.option("X", "L2-SP strength (decay towards the base weights).", 1.0)
     calibrate: bool = opt.flag(
-        "At the end, scale process and measurement noise such that NEES is 1 on the validation episodes."
+        "At the end, scale process and measurement noise such that NEES/n is 1 on the validation episodes."
     )
     patience: int = opt.option("N", "Stop after N validations without improvement.", 6, parser=opt.integer(1))
     seed: int = 0

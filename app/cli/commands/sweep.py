@@ -41,7 +41,7 @@ def sweep(
 ) -> console.Result:
     """Run many checkpoints over many episodes and store a table.
 
-    DIR/results.parquet has one row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES,
+    DIR/results.parquet has one row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES/n,
     coverage, fusion weights and the provenance of the episode. DIR/checkpoints.parquet has one row for each checkpoint,
     with the provenance from the JSON file beside it (runs/a.json for runs/a.safetensors). Finished cells are stored, so
     the same command resumes an interrupted sweep. The tables have the same bits with any engine and number of workers.
@@ -57,7 +57,7 @@ def sweep(
     """
     opt.prepare_workers(engine, workers, "beliefscope.recordings.sweep_table")
     from beliefscope.inspect.sweep import Inputs, find_checkpoints
-    from beliefscope.recordings.sweep_table import DOCUMENTS, SHOWN, Experiments, run_sweep
+    from beliefscope.recordings.sweep_table import SHOWN, Experiments, labelled, run_sweep
 
     opt.check_folder(output, "output")
     inputs = Inputs(
@@ -84,7 +84,7 @@ def sweep(
     overview = Experiments([output]).overview()
     sizes = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
     command = f"{shlex.join(['beliefscope', 'experiments', str(output)])} "
-    text = console.arrow("Checkpoints, largest errors first", overview.drop_columns(DOCUMENTS), SHOWN, command)
+    text = console.arrow("Checkpoints, largest errors first", labelled(overview), SHOWN, command)
     return console.Result(sizes | {"overview": overview.to_pylist()}, text, output / "results.parquet")
 
 

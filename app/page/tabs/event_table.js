@@ -188,10 +188,10 @@ export function eventColumns({ layers, scores }, score, events) {
   });
   if (score.name !== 'nees' && events[0]?.nees !== null)
     columns.push({
-      title: 'NEES',
+      title: 'NEES/n',
       content: ({ nees }) => fixed(nees),
       number,
-      help: 'Normalised estimation error squared: mean 1 if the covariance is consistent',
+      help: 'Normalised estimation error squared per component: mean 1 if the covariance is consistent',
     });
   if (fuses && events[0]?.effective_weights)
     columns.push({

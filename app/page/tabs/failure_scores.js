@@ -7,7 +7,7 @@
 import { significant } from '../core/units.js';
 
 /** @type {Record<string, string>} */
-const NAMES = { nees: 'NEES', ess: 'ESS' };
+const NAMES = { nees: 'NEES/n', ess: 'ESS' };
 /** @type {Record<string, {unit: string, scale: number}>} */
 const UNITS = {
   rad: { unit: '°', scale: 180 / Math.PI },

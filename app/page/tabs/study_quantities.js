@@ -15,14 +15,14 @@ import {
 /**
  * @typedef {object} Quantity
  * @property {string} key of the study's metrics
- * @property {string} component state component; empty for NEES
+ * @property {string} component state component; empty for NEES/n
  * @property {string} title
  * @property {string} unit
  * @property {string} description
  */
 
 /**
- * Returns the quantities of a study for a task: the RMSE of the main error and of the components, and NEES.
+ * Returns the quantities of a study for a task: the RMSE of the main error and of the components, and NEES/n.
  * @param {StudyRow[]} rows
  * @param {Task} task
  * @returns {Quantity[]}
@@ -42,7 +42,13 @@ export function studyQuantities(rows, task) {
     return { ...error, title: isMain ? mainName(task) : name, description: `RMSE of the ${name}` };
   });
   if (rows.some((row) => typeof row.mean.nees === 'number'))
-    quantities.push({ key: 'nees', component: '', title: 'NEES', unit: '', description: 'NEES/n' });
+    quantities.push({
+      key: 'nees',
+      component: '',
+      title: 'NEES/n',
+      unit: '',
+      description: 'NEES/n',
+    });
   return quantities;
 }
 

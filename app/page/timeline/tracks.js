@@ -15,7 +15,7 @@ import { areShares } from './stacked_weights.js';
 export const TRACKS = {
   error: ['error', errorTrack],
   signed: ['signed error', signedErrorTrack],
-  nees: ['NEES', neesTrack],
+  nees: ['NEES/n', neesTrack],
   innovation: ['innovation', innovationTrack],
   particles: ['particles', particleTrack],
 };
@@ -261,7 +261,7 @@ function neesTrack(trace) {
   const bounds = trace.header.nees_bounds;
   if (!series.length || !bounds) {
     const reason = 'None: this filter has no covariance.';
-    return emptyTrack('NEES', trace.has('nees') ? NO_TRUTH : reason);
+    return emptyTrack('NEES/n', trace.has('nees') ? NO_TRUTH : reason);
   }
   const [low, high] = [fixed(bounds[0], 2), fixed(bounds[1], 1)];
   return {

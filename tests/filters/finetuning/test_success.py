@@ -56,7 +56,9 @@ def test_slice_must_be_evaluated() -> None:
 def success_of(*effects: tuple[str, float, float, float]) -> Success:
     """Outcome by changes (slice, effect, low, high)."""
     name = PUSH.main_error.name
-    rows = tuple(Difference(slice_, name, "cm", 100.0, 0.02, 0.01, *values, (0.0, 0.0, 0.0)) for slice_, *values in effects)
+    rows = tuple(
+        Difference(slice_, name, "cm", 100.0, 0.02, 0.01, *values, (0.0, 0.0, 0.0)) for slice_, *values in effects
+    )
     comparison: Any = SimpleNamespace(differences=rows)
     return judge(Criterion("contact"), comparison, PUSH)
 

@@ -156,7 +156,9 @@ def test_beliefs_change_in_nats_and_points() -> None:
 
 def verdict_of(low: float, effect: float, high: float) -> str:
     """Verdict for a single changed error."""
-    difference = Difference("contact", "position", "cm", 100.0, 0.01, 0.01 * math.exp(effect), effect, low, high, (0.0, 0.0, 0.0))
+    difference = Difference(
+        "contact", "position", "cm", 100.0, 0.01, 0.01 * math.exp(effect), effect, low, high, (0.0, 0.0, 0.0)
+    )
     return replace(comparison(True), differences=(difference,)).verdict
 
 

@@ -80,9 +80,9 @@ def test_clean_episodes_are_healthy() -> None:
 @pytest.mark.parametrize(
     ("nees", "start"),
     [
-        (4.0, "Healthy, though overconfident (median NEES 4): no significant deviation from the record of 44"),
-        (0.2, "Healthy, though underconfident (median NEES 0.2): no"),
-        (1e9, "Always overconfident (median NEES 1e+09), even in its healthy record; no significant deviation from"),
+        (4.0, "Healthy, though overconfident (median NEES/n 4): no significant deviation from the record of 44"),
+        (0.2, "Healthy, though underconfident (median NEES/n 0.2): no"),
+        (1e9, "Always overconfident (median NEES/n 1e+09), even in its healthy record; no significant deviation from"),
         (1.3, "Healthy: no significant deviation from the record of 44 healthy episodes in 1 statistics."),
     ],
 )

@@ -235,7 +235,7 @@ def test_the_noise_of_a_filter_that_has_always_been_overconfident_is_named(
     checkpoint = loaded(filter_) if isinstance(filter_, Boat) else of_cart(filter_)
     record = profile_of(checkpoint, [episode(seed) for seed in range(12)], "clean")
     result = diagnose(checkpoint, {seed: episode(seed) for seed in range(40, 43)}, profile=record)
-    start = rf"Always overconfident \(median NEES .*\), even in its healthy record: its {finding}"
+    start = rf"Always overconfident \(median NEES/n .*\), even in its healthy record: its {finding}"
     assert re.match(start, result.headline), result.headline
 
 
