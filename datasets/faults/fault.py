@@ -20,6 +20,9 @@ Mask = NDArray[np.bool_]
 
 AXES = ("x", "y", "z")
 
+UNWRITTEN = ("factor", "fraction", "name", "steps", "s")
+"""Units that the name of a parameter implies, such as ``seconds``."""
+
 MAX_VALUE = 1e6
 """Upper bound of every parameter: larger values exceed the useful range of float32 filters."""
 
@@ -112,6 +115,19 @@ class Fault:
         """``{"fault": name, parameter: value, ...}``; ``from`` and ``to`` only if they differ from the defaults."""
         values = {key: getattr(self, parameter.name) for key, parameter in parameters(type(self)).items()}
         return {"fault": self.name} | {k: v for k, v in values.items() if v is not None and (k, v) != ("from", 0)}
+
+    def describe(self) -> str:
+        """The fault with all of its values and units, also those of defaults: ``image_noise (std 40 gray levels)``."""
+        texts = []
+        for key, parameter in parameters(type(self)).items():
+            value, unit = getattr(self, parameter.name), parameter.metadata["unit"]
+            if key == "to" and value is not None:
+                texts.append(f"to step {value - 1}")
+            elif key == "from" and value:
+                texts.append(f"from step {value}")
+            elif key not in ("from", "to") and value not in (None, "") and (value or parameter.default):
+                texts.append(f"{key} {_format(value)}" + ("" if unit in UNWRITTEN else f" {unit}"))
+        return self.name + (f" ({', '.join(texts)})" if texts else "")
 
     def __str__(self) -> str:
         texts = {}

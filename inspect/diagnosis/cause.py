@@ -117,6 +117,13 @@ def probability_text(probability: float) -> str:
     return f"{probability:.2f}" if round(probability, 2) <= LARGEST else f"above {LARGEST}"
 
 
+class Probability(float):
+    """A probability in a table: displayed by ``probability_text``, with all digits in files."""
+
+    def __format__(self, spec: str) -> str:
+        return probability_text(float(self))
+
+
 def removes_error(share: float) -> bool:
     """Whether an undo removes 1 % of the error or more, rounded."""
     return round(100.0 * share) > 0
@@ -257,13 +264,13 @@ class Diagnosis:
             worst = [Table("Largest error", heads, (tuple(error[name] for name in heads),))] if error else []
             return [*worst, *deviations, *missing]
         ranked = tuple(
-            (c.cause.name, probability_text(c.probability), _share(c.recovered), index_ranges(c.episodes))
+            (c.cause.title, c.cause.name, Probability(c.probability), _share(c.recovered), index_ranges(c.episodes))
             for c in causes
         )
-        actions = tuple((c.cause.name, c.next) for c in causes)
-        rows = [((c.cause.name,), e) for c in causes for e in c.evidence]
+        actions = tuple((c.cause.title, c.next) for c in causes)
+        rows = [((c.cause.title,), e) for c in causes for e in c.evidence]
         return [
-            Table("Causes", ("cause", "probability", "error removed by undoing it", "episodes"), ranked),
+            Table("Causes", ("cause", "name", "probability", "error removed by undoing it", "episodes"), ranked),
             _evidence_table("Evidence", ("cause",), rows),
             Table("Next", ("cause", "action"), actions),
             *missing,

@@ -251,7 +251,7 @@ def _moments(trace: Trace) -> list[dict[str, Any]]:
 
 
 def _diagnosis(trace: Trace, checkpoint: Checkpoint | None) -> dict[str, Any]:
-    """Headline, and causes with probability and evidence; a filter without a healthy record has neither."""
+    """Preliminary headline, and causes with probability and evidence; a filter without a healthy record has neither."""
     if checkpoint is None or trace.settings.get("edits") or trace.settings.get("standalone"):
         return {"headline": "", "causes": []}
     try:
@@ -260,6 +260,7 @@ def _diagnosis(trace: Trace, checkpoint: Checkpoint | None) -> dict[str, Any]:
         return {"headline": "", "causes": []}
     causes = [
         {
+            "title": candidate.cause.title,
             "name": candidate.cause.name,
             "probability": probability_text(candidate.probability),
             "evidence": [{"text": e.text, "step": e.step} for e in candidate.evidence],

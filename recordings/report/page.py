@@ -19,6 +19,7 @@ from beliefscope.datasets.text import plural, typeset
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.restarts import restarts_text
 from beliefscope.recordings.report.sections import Item, Report, Section
 from beliefscope.recordings.report.text import definitions, methods
@@ -105,7 +106,7 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
         "Task": first.task.name,
         "Modalities": ", ".join(first.modalities) or "not distinguished",
         "Episodes": f"{episodes}: {steps} in total, {durations}",
-        "Sensor faults": "; ".join(dict.fromkeys(str(trace.faults) or "none" for trace in report.traces)),
+        "Sensor faults": "; ".join(dict.fromkeys(_faults(trace) for trace in report.traces)),
     }
     if texts := list(filter(None, map(restarts_text, report.traces))):
         facts["Restarts"] = "; ".join(dict.fromkeys(texts))
@@ -117,6 +118,10 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     errors = "; ".join(f"{row[0]} {_number(row[column])} {main.unit}".rstrip() for row in reversed(table.rows))
     scored = sum(int(measures.counted(trace).sum()) for trace in report.traces)
     return facts | {f"{main.title} RMSE": f"{errors} over {plural(scored, 'counted step')}"}
+
+
+def _faults(trace: Trace) -> str:
+    return ", ".join(fault.describe() for fault in trace.faults) or "none"
 
 
 def _provenance(report: Report) -> dict[str, str]:
