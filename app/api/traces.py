@@ -75,6 +75,7 @@ class TraceHeader(Reply):
     """Metadata of a trace.
 
     Attributes:
+        first_counted: first step that metrics include, after the warm-up of the task.
         groups: names of the groups of covariates, in the order of the column ``groups`` (T, G).
         weight_width: 0 for a filter without weights. settings: of the run.
         nees_bounds: 95 % bounds of a consistent filter's NEES/n; None without a covariance.
@@ -87,6 +88,7 @@ class TraceHeader(Reply):
     """
 
     steps: int
+    first_counted: int
     dt: float
     kind: str
     filter: str

@@ -94,6 +94,7 @@ def header(
     components = [component.to_json() for component in task.components]
     return {
         "steps": len(trace),
+        "first_counted": task.first_counted(len(trace)),
         "dt": trace.episode.dt,
         "kind": trace.kind,
         "filter": trace.filter,

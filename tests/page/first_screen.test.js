@@ -23,7 +23,7 @@ const run = (last, contact = 5) =>
     steps: STEPS,
     modalities: ['image', 'haptics'],
     components: [{ name: 'x' }, { name: 'hinge_x' }],
-    header: {},
+    header: { first_counted: 0 },
     stepLabel: (/** @type {number} */ step) => `step ${step}`,
     weightWidth: 1,
     fuses: true,
@@ -180,13 +180,18 @@ test('a fault comes first, then the outage, then the largest error', () => {
   assert.equal(plain.headline, 'Largest error at step 10.');
   assert.match(plain.evidence, /error 1\.23 cm, 5\.0σ in x: overconfident/);
   assert.deepEqual([plain.tone, plain.step], ['bad', 10]);
-  const header = { no_diagnosis: 'this filter has no healthy record' };
+  const header = { first_counted: 0, no_diagnosis: 'this filter has no healthy record' };
   const { evidence } = finding({ ...run(11), header }, 0, null);
   assert.match(evidence, /\. This filter has no healthy record\.$/);
   const consistent = { ...run(11), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
   assert.match(
     finding(consistent, 0, HEALTHY).headline,
-    /^No fault found: mean position error 0\.54 cm; image has 38 % of/,
+    /^No fault found: position RMSE 0\.56 cm; image has 38 % of/,
+  );
+  assert.match(
+    finding({ ...consistent, header: { first_counted: 8 } }, 0, HEALTHY).headline,
+    /^No fault found: position RMSE 0\.60 cm from step 8 on; image has 47 % of/,
+    'without the warm-up',
   );
   const largest_error = {
     episode: 0,

@@ -90,21 +90,29 @@ function failureFinding({ failure, restarts }) {
  * @param {Finding} worst of the largest error
  */
 function healthyHeadline(trace, component, { headline, miscalibrated }, worst) {
-  const errors = trace.error('fused', 'main')?.filter(Number.isFinite) ?? [];
+  const first = trace.header.first_counted; // as in the weight audit and reports
+  const error = trace.error('fused', 'main');
+  const isCounted = (/** @type {number} */ value, /** @type {number} */ step) =>
+    step >= first && Number.isFinite(value) && Number.isFinite(error?.[step]);
+  const errors = error?.filter(isCounted) ?? [];
   if (miscalibrated || !errors.length) return typeset(sentence(headline));
   if (worst.tone === 'bad' && worst.step !== null)
     return `No fault found, but the filter is overconfident at ${trace.stepLabel(worst.step)}.`;
-  const error = withUnit(fixed(mean(errors), 2), trace.mainUnit);
+  const rmse = withUnit(
+    fixed(Math.sqrt(mean(errors.map((value) => value ** 2))), 2),
+    trace.mainUnit,
+  );
+  const scope = first ? ` from ${trace.stepLabel(first)} on` : '';
   const [most] = trace.modalities
     .flatMap((name) => {
-      const values = trace.weight('effective', name, component)?.filter(Number.isFinite);
+      const values = trace.weight('effective', name, component)?.filter(isCounted);
       return values?.length ? [{ name, share: mean(values) }] : [];
     })
     .sort((a, b) => b.share - a.share);
   const weight = most
     ? `; ${displayName(most.name)} has ${percent(most.share)} of the effective weight${weightScope(trace, component)}`
     : '';
-  return `No fault found: mean ${trace.task.main.name} error ${error}${weight}.`;
+  return `No fault found: ${trace.task.main.name} RMSE ${rmse}${scope}${weight}.`;
 }
 
 /**

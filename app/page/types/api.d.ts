@@ -2065,9 +2065,10 @@ export interface components {
          * @description Metadata of a trace.
          *
          *     Attributes:
+         *         first_counted: first step that metrics include, after the warm-up of the task.
          *         groups: names of the groups of covariates, in the order of the column ``groups`` (T, G).
          *         weight_width: 0 for a filter without weights. settings: of the run.
-         *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
+         *         nees_bounds: 95 % bounds of a consistent filter's NEES/n; None without a covariance.
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
          *             reasons. sensors: drawn ones.
          *         no_diagnosis: why the filter has no diagnosis, or None. defects: errors of such a filter that show without one.
@@ -2078,6 +2079,8 @@ export interface components {
         TraceHeader: {
             /** Steps */
             steps: number;
+            /** First Counted */
+            first_counted: number;
             /** Dt */
             dt: number;
             /** Kind */

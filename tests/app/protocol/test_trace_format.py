@@ -86,6 +86,7 @@ def test_unavailable_columns_are_omitted() -> None:
     _, values, head = pretrained_run("crossmodal-pf")
     assert not {"innovation", "innovation_sigma"} & values.keys()
     assert head["nees_bounds"] is not None
+    assert head["first_counted"] == 30  # after the warm-up
     with open_dataset(sample_path("door")) as episodes:
         lstm = Checkpoint(build(architecture("door", "lstm")).eval(), "lstm", "", {})
         _, values, head = read(trace(lstm, episodes[9]))
