@@ -22,7 +22,13 @@ from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.statistics.measures import Array, Mask, blackout, pooled_phases, trace_indices
 from beliefscope.inspect.trace import Trace
 
-NOUNS = {"flat": "flat", "round": "a round peak", "ridge": "a ridge", "ring": "a ring"}
+NOUNS = {
+    "flat": "flat",
+    "round": "a round peak",
+    "ridge": "a ridge",
+    "ring": "a ring",
+    "cut by border": "cut by the border",
+}
 """Shape -> description."""
 
 SHARES = tuple(f"{shape} (% of steps)" for shape in SHAPES)

@@ -36,7 +36,7 @@ class MapStatistics:
         expected: (B,) rad, direction of the ridge that the task expects (``Task.ridge_direction``) in the true state;
             NaN for a task without one, and where the truth is unknown.
         deviation: (B, L) rad in 0..pi/2, angle between axis and expected direction; 45 deg on average for random axes.
-        shape: (B, L) index in ``SHAPES``: flat, round, ridge or ring.
+        shape: (B, L) index in ``SHAPES``.
         ring_centre, ring_radius, ring_spread, ring_coverage: (B, L, 2) m, (B, L) m, (B, L), (B, L): circle fitted to
             the 50 % region (``shape.Rings``); of interest where the shape is a ring.
         divergence: (B, L, L) nats, ``KL(p_i || p_j)``.
@@ -86,7 +86,9 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
     plogp = np.einsum("blc,blc->bl", flat, flat_log)
     ordered = -np.sort(-flat, axis=-1)
     area50, lowest = _area(ordered, 0.5)
-    rings = fit_rings(share, share >= lowest[..., None, None], x, y)
+    lowest = lowest[..., None, None]
+    rings = fit_rings(share, share >= lowest, x, y)
+    core = (share > lowest) | (log == log_peak[..., None, None])  # without a background of cells equal to the lowest
     return MapStatistics(
         steps=np.array([m.step for m in maps]),
         layers=maps[0].layers,
@@ -101,7 +103,7 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
         elongation=elongation,
         expected=expected,
         deviation=deviation,
-        shape=classify(area50, size * len(y), elongation, rings, log_peak - log.min(axis=(2, 3))),
+        shape=classify(area50, size * len(y), elongation, rings, log_peak - log.min(axis=(2, 3)), core),
         ring_centre=rings.centre,
         ring_radius=rings.radius,
         ring_spread=rings.spread,

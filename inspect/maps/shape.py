@@ -1,4 +1,4 @@
-"""Shape of maps: circle fitted to the likely cells, and the classes flat, round, ridge and ring."""
+"""Shape of maps: circle fitted to the likely cells, and classes such as flat, round, ridge and ring."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from beliefscope.inspect.statistics.signals import Array
 
-SHAPES = ("flat", "round", "ridge", "ring")
+SHAPES = ("flat", "round", "ridge", "ring", "cut by border")
 """Shapes of a map, in the order of ``classify``."""
 
 ROUND = 1.3
@@ -84,14 +84,20 @@ def fit_rings(share: Array, region: NDArray[np.bool_], x: Array, y: Array) -> Ri
     return Rings(centre, radius, spread / np.maximum(radius, 1e-12), np.exp(entropy) / SECTORS)
 
 
-def classify(area50: Array, square: float, elongation: Array, rings: Rings, log_range: Array) -> NDArray[np.int64]:
+def classify(
+    area50: Array, square: float, elongation: Array, rings: Rings, log_range: Array, core: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """(B, L) index in ``SHAPES``.
+
+    A map without another shape is round only if its 50 % region is complete: what the border cuts off is unknown.
 
     Args:
         area50: (B, L) area of the 50 % region, in the units of ``square``, the area of the map.
         log_range: (B, L) nats, difference between the largest and the smallest value of the map.
+        core: (B, L, R, S) cells of the 50 % region, without those equal to its lowest value.
     """
     ring = (rings.spread <= MAX_SPREAD) & (rings.coverage >= MIN_COVERAGE)
-    conditions = [area50 >= FLAT * square, ring, elongation >= ROUND, log_range < FLAT_RANGE]
-    shapes = [SHAPES.index(name) for name in ("flat", "ring", "ridge", "flat")]
+    cut = core[..., [0, -1], :].any((2, 3)) | core[..., [0, -1]].any((2, 3))
+    conditions = [area50 >= FLAT * square, ring, elongation >= ROUND, log_range < FLAT_RANGE, cut]
+    shapes = [SHAPES.index(name) for name in ("flat", "ring", "ridge", "flat", "cut by border")]
     return np.select(conditions, shapes, SHAPES.index("round")).astype(np.int64)

@@ -33,7 +33,7 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
  * @property {string} rule of the fused layer
  * @property {number | null} angle SI, value of the only component off the map; null if there is none or it is integrated out
  * @property {number | null} expected rad, direction of the ridge that the task expects
- * @property {('flat' | 'round' | 'ridge' | 'ring' | null)[]} shape of each layer; null where the axes have different units
+ * @property {('flat' | 'round' | 'ridge' | 'ring' | 'cut by border' | null)[]} shape of each layer; null where the axes have different units
  * @property {string[]} layers L names
  * @property {MapAxis[]} axes x and y, or one of a curve
  * @property {'fixed' | 'marginal'} others treatment of the components off the map

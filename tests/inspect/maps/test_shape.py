@@ -71,6 +71,11 @@ def test_shapes(size: int) -> None:
             grid.arc(math.pi / 2.0),
             np.logaddexp(grid.peak((-0.06, 0.0)), grid.peak((0.06, 0.0))),  # two peaks on a circle
         ],
+        "cut by border": [
+            grid.peak((HALF, HALF), 0.06),  # into a corner
+            grid.peak((0.1, 0.0), 0.04),
+            grid.peak((HALF, 0.06), 0.1),
+        ],
         "ring": [
             grid.ring(),
             grid.ring((0.03, -0.05), 0.05),
