@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.maps.map_engine import MapEngine
@@ -69,6 +70,16 @@ def test_maps_equal_those_of_the_engine(run_: Trace, page: Path) -> None:
     for step in (0, 57):
         np.testing.assert_array_equal(data[step], engine.map(step, size=SIZE).normalised())
     assert maps["reach"] == pytest.approx([100.0 * run_.task.map_half_width] * 2)
+
+
+def test_causes_have_titles_and_are_preliminary(tmp_path: Path) -> None:
+    checkpoint, faults = load_checkpoint(pretrained_path("door", "crossmodal-ekf")), Faults.parse("image_noise")
+    with open_dataset(sample_path("door")) as data:
+        faulty = trace(checkpoint, data[9], 9, faults=faults)
+    write_interactive(faulty, path := tmp_path / "run.html", checkpoint, SIZE)
+    text = path.read_text()
+    assert "<h2>Probable causes, preliminary</h2>" in text
+    assert "<li>Image noisy (image.noise), probability " in text
 
 
 def test_the_page_loads_nothing(page: Path) -> None:

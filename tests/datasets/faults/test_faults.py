@@ -388,15 +388,12 @@ def test_faults_of_missing_sensors_are_rejected(episode: Episode) -> None:
         inject("force_axes=zyx", flat)
 
 
-@pytest.mark.parametrize(
-    ("text", "description"),
-    [
-        ("image_noise", "image_noise (std 40 gray levels)"),
-        ("image_noise=20:from=3:to=60", "image_noise (std 20 gray levels, from step 3, to step 59)"),
-        ("delay=image:steps=5", "delay (modality image, steps 5)"),
-        ("image_underexposed=0", "image_underexposed (factor 0)"),
-        ("image_frozen", "image_frozen"),
-    ],
-)
-def test_description_has_the_values_of_defaults(text: str, description: str) -> None:
-    assert [fault.describe() for fault in Faults.parse(text)] == [description]
+def test_description_has_the_values_of_defaults() -> None:
+    for text, description in {
+        "image_noise": "image_noise (std 40 gray levels)",
+        "image_noise=20:from=3:to=60": "image_noise (std 20 gray levels, from step 3, to step 59)",
+        "delay=image:steps=5": "delay (modality image, steps 5)",
+        "image_underexposed=0": "image_underexposed (factor 0)",
+        "image_frozen": "image_frozen",
+    }.items():
+        assert [fault.describe() for fault in Faults.parse(text)] == [description]
