@@ -29,6 +29,9 @@ UNITS = (
 )
 """Unit of a column -> internal unit, and its factor. Others are internal units."""
 
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Unit of a column of times -> s."""
+
 SPELLINGS = {
     **dict.fromkeys(("degree", "degrees", "°"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
@@ -47,6 +50,9 @@ ESTIMATE = ("filter", *VALUES, "weights")
 PLANAR_ELEMENTS = "[0,1,5,6,7,11,30,31,35]"
 """x, y and yaw in the covariance of x, y, z, roll, pitch and yaw of a ROS message."""
 
+MARKED_UNIT = re.compile(r"_(deg|rad|cm|mm)$|\s*[\[(]([^\W\dxyz][^\])]*|\u00b0)[\])]$")
+"""Unit at the end of a column's name: ``yaw_deg``, ``x [m]``."""
+
 References = str | list[str]
 
 MeanReferences = References | list[str | list[str]]
@@ -56,6 +62,14 @@ MeanReferences = References | list[str | list[str]]
 def base_name(reference: str) -> str:
     """Name of a column without the elements of its rows."""
     return match[1] if (match := ELEMENTS.fullmatch(reference)) else reference
+
+
+def marked(name: str) -> tuple[str, str]:
+    """A column's name without the unit at its end, and the symbol of the unit; the name and "" without one."""
+    if not (mark := MARKED_UNIT.search(name)):
+        return name, ""
+    unit = (mark[1] or mark[2]).strip()
+    return name[: mark.start()], SPELLINGS.get(unit.lower(), unit)
 
 
 def listed(references: MeanReferences) -> list[str]:
@@ -128,7 +142,7 @@ class ColumnMap:
         task: name of the new task.
         dt: seconds per row, or per step of logs of messages; None if ``time``, a column in s, or ``clock`` is given.
         clock: topic of logs of messages whose messages are the steps.
-        time: column in s, or timeline of a Rerun recording.
+        time: column, or timeline of a Rerun recording. time_unit: of the column, one of ``TIME_UNITS``.
         episode: column that numbers or names the episodes; empty for a single one.
         state: component -> its column. control: columns. contact: column that is not zero in contact.
         sensors: name -> columns, or one column of images. covariates: name -> column.
@@ -143,6 +157,7 @@ class ColumnMap:
     state: Mapping[str, StateColumn]
     dt: float | None = None
     time: str = ""
+    time_unit: str = "s"
     clock: str = ""
     episode: str = ""
     control: References = field(default_factory=list)
@@ -175,7 +190,10 @@ class ColumnMap:
         sizes: number of channels of vector sensors and of ``control``.
         """
         references = {**self.sensors, "control": self.control}
-        names = {key: _distinct(listed(references[key])) for key, size in sizes.items() if size > 1}
+        columns = {key: listed(references[key]) for key, size in sizes.items() if size > 1}
+        # Readings are converted, so the unit of a column is not part of the channel's name.
+        own = {key: [marked(n)[0] if key in self.units else n for n in each] for key, each in columns.items()}
+        names = {key: _distinct(each) for key, each in own.items()}
         names = {key: each for key, each in names.items() if len({*each} - {""}) == sizes[key]}
         for key in [key for key in self.units if key in sizes and key not in names]:
             names[key] = [axis_name("", i, sizes[key]).strip() or key for i in range(sizes[key])]
@@ -237,6 +255,7 @@ def read_map(path: Path) -> ColumnMap:
     if not state:
         raise BadInput(f'[state] of {path.name} has no components, expected one or more: name = "column"')
     names = {key: values.get(key, "") for key in NAMES}
+    names["time"], time_unit = _time(names["time"])
     control = values.get("control", [])
     estimated = {key: estimate[key] for key in VALUES if key in estimate} | {"mean": _mean(estimate.get("mean", []))}
     lists = [("control", control), *sensors.items(), *estimated.items()]
@@ -248,8 +267,18 @@ def read_map(path: Path) -> ColumnMap:
     modalities = _modalities(_table(values, "modalities", path), sensors, path)
     innovations = {n: _innovation(n, v, modalities) for n, v in _table(values, "innovations", path).items()}
     columns = {"control": control, "sensors": sensors, "valid": valid, "units": units, "modalities": modalities}
-    columns |= {"innovations": innovations}
+    columns |= {"innovations": innovations, "time_unit": time_unit}
     return ColumnMap(task, state, dt, covariates=covariates, estimate=estimate, **columns, **names)
+
+
+def _time(value: Any) -> tuple[Any, str]:
+    """Column of the times, and its unit."""
+    if not isinstance(value, dict):
+        return value, "s"
+    if not {"column"} <= value.keys() <= {"column", "unit"}:
+        raise BadInput(f"time is {value!r:.100}, expected a column or {{column = NAME, unit = UNIT}}")
+    check_name("unit of time", str(unit := value.get("unit", "s")), TIME_UNITS)
+    return value["column"], unit
 
 
 def _mean(value: Any) -> Any:

@@ -57,6 +57,8 @@ def _read(path: Path, mapping: ColumnMap | None) -> Preview:
     with _reading(path):
         reader = import_module(f"beliefscope.recordings.log_readers.{_reader(path)}")
         if hasattr(reader, "open_log"):
+            if mapping and mapping.time_unit != "s":
+                raise BadInput(f"time has the unit {mapping.time_unit!r}, which columns have, and the log has topics")
             with reader.open_log(path, None if mapping is None else mapping.time) as log:
                 result = preview(log) if mapping is None else Preview(on_clock(log, mapping))
         elif mapping and mapping.dt is not None and mapping.time:

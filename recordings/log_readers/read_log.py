@@ -20,7 +20,7 @@ from beliefscope.filters.external.derived_values import derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.recordings.log_readers.arrays import Columns
-from beliefscope.recordings.log_readers.column_map import ColumnMap, CovariateColumn, base_name, listed
+from beliefscope.recordings.log_readers.column_map import TIME_UNITS, ColumnMap, CovariateColumn, base_name, listed
 from beliefscope.recordings.log_readers.columns import column, joined
 from beliefscope.recordings.log_readers.estimate import estimate_values, scalar
 from beliefscope.recordings.log_readers.innovations import innovation_values
@@ -101,7 +101,10 @@ def check_complete(episodes: list[Episode]) -> None:
             if (unknown := np.isnan(array)).any():
                 row = int(np.argwhere(unknown)[0][0])
                 where = f"episode {index}, step {row}" if row else f"episode {index}"
-                raise BadInput(f"{name} is unknown in {where}: a data set needs all states, controls and readings")
+                raise BadInput(
+                    f"{name} is unknown in {where}: a data set needs all states, controls and readings; "
+                    "interpolate short gaps, or write a trace, in which true states may be missing"
+                )
 
 
 def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode], index: int, source: str) -> Trace:
@@ -118,7 +121,8 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
         if len(array) != rows:
             raise BadInput(f"{display_name(name)} has {plural(len(array), 'row')} and the state {rows}")
         if len(unknown := at[~np.isfinite(array[at]).reshape(len(at), -1).all(axis=1)]):
-            raise BadInput(f"{display_name(name)} has no finite value in row {unknown[0]}, episode {index}")
+            where = f"row {unknown[0]}, episode {index}"
+            raise BadInput(f"{display_name(name)} has no finite value in {where}: interpolate or remove such rows")
     modalities = tuple(mapping.estimate.get("weights", {}) or mapping.innovations)
     estimate |= innovation_values(columns, mapping, modalities)
     values = {name: torch.from_numpy(array[at]) for name, array in estimate.items()}
@@ -230,12 +234,13 @@ def _times(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp
     if mapping.dt is not None:
         return float(mapping.dt), [None] * len(rows)
     name = CLOCK if mapping.clock else mapping.time
-    column_times = column(columns, name, "time")
+    column_times = column(columns, name, "time") * TIME_UNITS[mapping.time_unit]
     _check_rows(column_times, f"time {name!r}", sum(map(len, rows.values())))
     times = [column_times[at] - column_times[at[0]] for at in rows.values()]
     for episode, time in zip(rows, times, strict=True):
         if error := time_error(time):
-            raise BadInput(f"time {name!r} of episode {episode} {error}, counted from its first row")
+            hint = "; remove rows with repeated times, or give dt in its place" if (np.diff(time) == 0.0).any() else ""
+            raise BadInput(f"time {name!r} of episode {episode} {error}, counted from its first row{hint}")
     dt = float(f"{np.median(np.concatenate([np.diff(time) for time in times])):.9g}")  # rounding errors
     resolution = np.spacing(np.abs(column_times).max())  # of times since 1970: 0.2 us
     dt = round(dt, int(-np.log10(resolution))) if resolution < IRREGULAR * dt else dt

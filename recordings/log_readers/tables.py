@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
@@ -13,10 +14,10 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.log_readers.arrays import Wanted
 
 MAX_HEADER = 1 << 20
-"""Bytes of the first line of a CSV file that are checked."""
+"""Bytes of the first line of a CSV file that are checked, and of the rows after it."""
 
 SEPARATORS = (";", "\t")
-"""Separators of CSV files that are recognised, to name them in the error."""
+"""Separators of CSV files in place of commas; decimal commas are then read as well."""
 
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 """First bytes of files in UTF-16."""
@@ -25,7 +26,7 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     """All columns (T, ...) of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays.
 
-    Raises BadInput for a file that is no archive of NumPy, as ``check_csv``, and for names that occur twice.
+    Raises BadInput for a file that is no archive of NumPy, as ``csv_format``, and for names that occur twice.
     """
     if path.suffix.lower() == ".npz":
         if not is_zipfile(path):  # NumPy would suggest to load the file as a pickle
@@ -35,8 +36,9 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     from pyarrow import csv, parquet
 
     if path.suffix.lower() == ".csv":
-        check_csv(path)
-        table = csv.read_csv(path)
+        separator, point = csv_format(path)
+        convert = csv.ConvertOptions(decimal_point=point)
+        table = csv.read_csv(path, None, csv.ParseOptions(delimiter=separator), convert)
         table = table.rename_columns([name.strip() for name in table.column_names])
     else:
         table = parquet.read_table(path)
@@ -46,18 +48,20 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     return {name: from_arrow(table.column(name)) for name in table.column_names}
 
 
-def check_csv(path: Path) -> None:
-    """Raise BadInput for another encoding than UTF-8, and for separators other than commas in the first line."""
+def csv_format(path: Path) -> tuple[str, str]:
+    """Separator of the columns and decimal point. Raises BadInput for another encoding than UTF-8."""
     with path.open("rb") as file:
-        first = file.readline(MAX_HEADER)
+        first, rows = file.readline(MAX_HEADER), file.read(MAX_HEADER)
     try:
         header = first.decode("utf-8-sig", "strict" if len(first) < MAX_HEADER else "ignore")
     except UnicodeDecodeError as error:
         code = "UTF-16" if first[:2] in UTF_16 else f"no UTF-8, with the byte 0x{first[error.start]:02x} in line 1"
         raise BadInput(f"{path.name} is {code}: expected a CSV file in UTF-8") from None
     separator = max(SEPARATORS, key=header.count)
-    if "," not in header and separator in header:
-        raise BadInput(f"{path.name} has columns separated by {separator!r}, expected ',' and decimal points")
+    if "," in header or separator not in header:
+        return ",", "."
+    commas, points = (len(re.findall(pattern, rows)) for pattern in (rb"\d,\d", rb"\d\.\d"))
+    return separator, "," if commas > points else "."
 
 
 def from_arrow(column: Any) -> NDArray[Any]:

@@ -64,7 +64,7 @@ def test_units_of_sensors_are_those_of_their_columns_and_values_of_the_filter_ar
     names = ["t", "true_x", "cam_x_mm", "tilt_deg", "speed", "pf.x_mm", "pf.P00", "pf.innov.x", "pf.n_eff"]
     text = guess_map(Preview({name: np.ones(3) for name in names}), "drive")
     values = tomllib.loads(text)
-    sensors = {"cam_x_mm": {"column": "cam_x_mm", "unit": "mm"}, "tilt_deg": {"column": "tilt_deg", "unit": "deg"}}
+    sensors = {"cam_x": {"column": "cam_x_mm", "unit": "mm"}, "tilt": {"column": "tilt_deg", "unit": "deg"}}
     assert values["sensors"] == sensors | {"speed": "speed"}
     assert values["estimate"] == {"mean": "pf.x_mm", "covariance": "pf.P00"}
     assert '# of the filter, neither sensors nor estimates: ["pf.innov.x", "pf.n_eff"]' in text
@@ -75,3 +75,53 @@ def test_units_of_sensors_are_those_of_their_columns_and_values_of_the_filter_ar
     assert values["control"] == ["/cmd_vel.linear", "/cmd_vel.angular"]
     assert values["sensors"]["compass"] == {"column": "/compass", "unit": "deg"}
     assert values["sensors"]["lidar"] == {"column": "/lidar", "unit": ["", "deg"]}
+
+
+def test_standard_deviations_belong_to_the_components_of_the_estimate() -> None:
+    names = ["t", "true_x", "true_y", "est_y", "est_x"]
+    for deviations in (["sx", "sy"], ["sd_x", "sd_y"], ["x_sigma", "y_sigma"], ["est_s_x", "est_s_y"]):
+        values = tomllib.loads(guess_map(Preview({n: np.ones(3) for n in [*names, *deviations[::-1]]}), "drive"))
+        assert values["estimate"] == {"mean": ["est_x", "est_y"], "std": deviations}
+        assert values["sensors"] == {}
+    text = guess_map(Preview({n: np.ones(3) for n in [*names, "sx"]}), "drive")
+    assert '# std needs 2 columns, one for each of mean; the log has ["sx"]' in text
+    assert tomllib.loads(text)["estimate"] == {"mean": ["est_x", "est_y"]}
+    sensors = tomllib.loads(guess_map(Preview({n: np.ones(3) for n in ["t", "true_x", "sx"]}), "drive"))["sensors"]
+    assert sensors == {"sx": "sx"}  # without an estimate
+
+
+def test_angles_beyond_a_turn_are_proposed_in_degrees() -> None:
+    t = np.arange(5.0)
+    columns = {
+        "t": t,
+        "true_yaw": t,
+        "true_roll": np.where(t > 3.0, np.nan, 90.0 * t),
+        "compass_heading": 90.0 - 90.0 * t,
+    }
+    text = guess_map(Preview(columns), "drive")
+    values = tomllib.loads(text)
+    assert [values["state"][name]["unit"] for name in ("yaw", "roll")] == ["rad", "deg"]
+    assert values["sensors"]["compass_heading"]["unit"] == "deg"
+    assert 'unit = "deg"}  # 0 to 270: check the unit\n' in text
+    assert 'unit = "deg"}  # -270 to 90: check the unit\n' in text
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "unit"),
+    [("time_ms", 0.0, "ms"), ("Time [us]", 0.0, "us"), ("stamp", 1.7e18, "ns"), ("timestamp", 1.7e12, "ms")],
+)
+def test_units_of_times_follow_from_their_name_or_size(name: str, start: float, unit: str) -> None:
+    columns = {name: start + np.arange(3.0), "true_x": np.ones(3)}
+    assert tomllib.loads(guess_map(Preview(columns), "drive"))["time"] == {"column": name, "unit": unit}
+
+
+def test_names_beside_those_of_an_estimate_are_true_states() -> None:
+    names = ["Time [s]", "x [m]", "heading [deg]", "x_hat", "heading_hat", "v_hat", "P_xx", "wheel (m/s)"]
+    text = guess_map(Preview({name: np.ones(3) for name in names}), "drive")
+    values = tomllib.loads(text)
+    assert values["time"] == "Time [s]"
+    v = {"column": "", "unit": "m/s"}
+    assert values["state"] == {"x": "x [m]", "heading": {"column": "heading [deg]", "unit": "deg"}, "v": v}
+    assert values["estimate"] == {"mean": ["x_hat", "heading_hat", "v_hat"]}
+    assert values["sensors"] == {"wheel": {"column": "wheel (m/s)", "unit": "m/s"}}
+    assert '# of the filter, neither sensors nor estimates: ["P_xx"]' in text

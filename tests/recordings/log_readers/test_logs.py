@@ -156,7 +156,7 @@ def test_a_guessed_map_has_names_units_and_sensors(tmp_path: Path) -> None:
         "x": "true_x",
         "y": "true_y",
         "vx": {"column": "true_vx", "unit": "m/s"},
-        "yaw": {"column": "true_yaw", "unit": "rad"},
+        "yaw": {"column": "true_yaw", "unit": "deg"},
     }
     assert values["sensors"] == {"gps": ["gps_x", "gps_y"], "wheel": "wheel"}
     task = read_log(columns, read_map(map_file(tmp_path, text)), "drive")[0].task

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from beliefscope.inspect.trace import load_trace
+from beliefscope.recordings.log_readers import tables
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -67,19 +68,46 @@ def refused(run: Run, log: Path, mapping: str) -> str:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (text(separator=";").encode(), "columns separated by ';', expected ',' and decimal points"),
-        (text(separator=";").replace(".", ",").encode(), "expected ',' and decimal points"),
-        (text(separator="\t").encode(), r"columns separated by '\t'"),
         (text().encode("utf-16"), "is UTF-16: expected a CSV file in UTF-8"),
         (text().replace("gx", "größe").encode("latin1"), "is no UTF-8, with the byte 0xf6 in line 1"),
         (text().replace("gy", "gx").encode(), "has 2 columns 'gx', expected unique names"),
         ("\n".join(text().splitlines()[:2]).encode(), "has one step per episode, expected two or more"),
     ],
-    ids=["semicolons", "decimal commas", "tabs", "UTF-16", "Latin 1", "names", "row"],
+    ids=["UTF-16", "Latin 1", "names", "row"],
 )
 def test_csv(run: Run, tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "log.csv").write_bytes(content)
     assert message in refused(run, tmp_path / "log.csv", MAP)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        text(separator=";"),
+        text(separator=";").replace(".", ","),
+        text(separator="\t").replace(".", ","),
+        "\ufeff" + text(separator=";").replace(".", ",").replace("\n", "\r\n"),
+    ],
+    ids=["semicolons", "decimal commas", "tabs", "byte order mark"],
+)
+def test_separators_of_csv_files(tmp_path: Path, content: str) -> None:
+    (tmp_path / "log.csv").write_text(content, newline="")
+    values = tables.read(tmp_path / "log.csv", lambda _: True)
+    for name, expected in columns().items():
+        np.testing.assert_allclose(values[name], expected)
+
+
+def test_units_of_times_are_converted_and_repeated_times_have_a_remedy(run: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "log.npz", **columns() | {"t": 1_700_000_000_000_000_000 + np.arange(STEPS) * 50_000_000})
+    mapping = MAP.replace('time = "t"', 'time = {column = "t", unit = "ns"}')
+    (tmp_path / "map.toml").write_text(mapping)
+    code, out, _ = run("import", tmp_path / "log.npz", "--map", tmp_path / "map.toml", "-o", tmp_path / "ns.h5")
+    assert (code, "30 steps, 0.05 s each" in out) == (0, True)
+    np.savez(tmp_path / "log.npz", **columns() | {"t": np.arange(STEPS) // 2})
+    error = refused(run, tmp_path / "log.npz", MAP)
+    assert "is 0 s at step 1, after 0 s; expected ascending times, counted from its first row; remove rows" in error
+    error = refused(run, tmp_path / "log.npz", mapping.replace('"ns"', '"min"'))
+    assert "unit 'min' of time does not exist. Available: s, ms, us, ns" in error
 
 
 def test_spaces_around_the_names_of_columns_are_ignored(run: Run, tmp_path: Path) -> None:
