@@ -54,10 +54,16 @@ def prepare_workers(engine: Engine, workers: int, module: str) -> None:
         prepare_processes(module)
 
 
+MAX_NAME = 255
+"""Bytes of the name of a file in the file systems of Linux, macOS and Windows."""
+
+
 def check_output(path: Path | None, *suffixes: str) -> Path | None:
     """The path of an output file. Raises BadInput if it cannot be written, or has not one of the suffixes."""
     if path is None:
         return None
+    if (size := len(os.fsencode(path.name))) > MAX_NAME:
+        raise BadInput(f"output {path.name[:40]!r}... has a name of {size} bytes, expected {MAX_NAME} at most")
     if path.is_dir():
         raise BadInput(f"output {str(path)!r} is a folder; give the name of a file in it")
     if suffixes and path.suffix.lower() not in suffixes:

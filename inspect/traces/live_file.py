@@ -376,7 +376,7 @@ def _split(content: bytes, shapes: Shapes, rows: int | None) -> Arrays:
 
 def write_live(trace: Trace, path: Path) -> None:
     """Write a trace as the file of a live run that has ended, atomically."""
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name[:60]}.part")  # names have 255 bytes at most
     part.unlink(missing_ok=True)
     writer = LiveFileWriter(part, trace, len(trace))
     try:

@@ -103,10 +103,17 @@ def _folder(
     sources: list[Path], folder: Path, import_file: Callable[[Path, Path], list[console.Result]]
 ) -> console.Result:
     """Write a trace, or a run into a folder ``live``, for each file or episode; report files with errors."""
+    from beliefscope.recordings.log_readers.table_folder import table_files
+
     suffix = ".live" if folder.absolute().name == "live" else ".trace"  # the runs of a workspace
     names = [f"{source.stem}{suffix}" for source in sources]
-    if len(set(names)) < len(names):
-        raise BadInput("files need different names, without their suffixes, to become traces of one folder")
+    tables = [table_files(source) if source.is_dir() else [] for source in sources]
+    stems = [stem for s, files in zip(sources, tables, strict=True) for stem in {s.stem, *(f.stem for f in files)}]
+    if twice := next((stem for stem in stems if stems.count(stem) > 1), ""):
+        raise BadInput(
+            f"several files have the name {twice!r}: files need different names, without their suffixes, to become "
+            "traces of one folder"
+        )
     opt.check_folder(folder, "output")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -150,6 +157,7 @@ def _log(
     from beliefscope.recordings.log_readers.columns import read_columns
     from beliefscope.recordings.log_readers.messages import late_estimates
     from beliefscope.recordings.log_readers.read_log import read_log, recorded_trace
+    from beliefscope.recordings.log_readers.table_folder import FILE
 
     if mapping is None:
         raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
@@ -163,8 +171,11 @@ def _log(
         console.note(f"Warning: {source.name}: {warning}")
     results = []
     for index in range(len(episodes)) if episode is None else [episode]:
-        is_one_of_several = episode is None and len(episodes) > 1
-        path = output.with_stem(f"{output.stem}-{index}") if is_one_of_several else output
+        path = output
+        if episode is None and FILE in columns and not mapping.episode:
+            path = output.with_name(f"{episodes[index].provenance['episode']}{output.suffix}")
+        elif episode is None and len(episodes) > 1:
+            path = output.with_stem(f"{output.stem}-{index}")
         result = _written(recorded_trace(columns, mapping, episodes, index, source.name), path)
         values, text = _values([episodes[index]])
         others = "" if episode is None or len(episodes) == 1 else f"; one of {len(episodes)} episodes (-o DIR: all)"
@@ -203,5 +214,6 @@ def _written(trace: Trace, output: Path) -> console.Result:
     from beliefscope.inspect.trace import save_trace
     from beliefscope.inspect.traces.live_file import write_live
 
+    opt.check_output(output)
     (write_live if output.suffix == ".live" else save_trace)(trace, output)
     return opt.trace_result(trace, output)

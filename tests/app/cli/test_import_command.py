@@ -61,6 +61,28 @@ def test_a_folder_gets_a_trace_of_each_episode(run: Run, log: Path) -> None:
     assert "one of 3 episodes (-o DIR: all)" in run("import", *inputs, log.with_name("run.trace"))[1]
 
 
+@pytest.mark.parametrize(("output", "suffix"), [("traces", ".trace"), ("live", ".live")])
+def test_the_traces_of_a_folder_of_tables_have_the_names_of_its_files(
+    run: Run, log: Path, output: str, suffix: str
+) -> None:
+    names = ["run_2", "mon 2024 (first)", "n" * 240]
+    log.with_name("map.toml").write_text(MAP.replace('episode = "run"\n', ""))
+    for day, files in (("days", names), ("others", ["run_2"])):
+        log.with_name(day).mkdir()
+        for name in files:
+            np.savez(log.with_name(day) / f"{name}.npz", **{c: v[:STEPS] for c, v in np.load(log).items()})
+    rest = ("--map", log.with_name("map.toml"), "-o", log.with_name(output))
+    code, _, error = run("import", log.with_name("days"), *rest)
+    assert code == 0, error
+    assert {path.name for path in log.with_name(output).iterdir()} == {f"{name}{suffix}" for name in names}
+    code, _, error = run("import", log.with_name("days"), log.with_name("others"), *rest)
+    assert (code, error.startswith("error: several files have the name 'run_2'")) == (2, True)
+    log.with_name("days").joinpath("run_2.npz").rename(log.with_name("days") / f"{'n' * 251}.npz")
+    code, _, error = run("import", log.with_name("days"), *rest)
+    assert code == 2
+    assert "has a name of 25" in error
+
+
 def test_a_data_set_is_converted_by_the_name_of_its_own_task(run: Run, log: Path) -> None:
     data, copy = log.with_name("data.h5"), log.with_name("copy.h5")
     assert run("import", log, "--map", log.with_name("map.toml"), "-o", data)[0] == 0
@@ -132,7 +154,11 @@ def test_several_logs_become_a_folder_of_traces_and_a_damaged_one_is_reported(ru
     ("output", "message"),
     [
         ("run.trace", "2 files need a folder as output, not '{}/run.trace'"),
-        ("traces", "files need different names, without their suffixes, to become traces of one folder"),
+        (
+            "traces",
+            "several files have the name 'log': files need different names, without their suffixes, to become traces "
+            "of one folder",
+        ),
     ],
 )
 def test_several_files_need_a_folder_and_different_names(run: Run, log: Path, output: str, message: str) -> None:
