@@ -15,7 +15,13 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry, drawn_steps
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import TAIL, are_extreme, nis_of, squared_innovations
+from beliefscope.inspect.statistics.innovations import (
+    TAIL,
+    are_extreme,
+    nis_of,
+    squared_innovations,
+    virtual_innovations,
+)
 from beliefscope.inspect.statistics.intervals import mean_interval, too_few
 from beliefscope.inspect.trace import Trace
 
@@ -153,7 +159,14 @@ class Innovations(Diagnostic):
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
-    return f"filter {trace.filter} reports no innovations of its measurements" if trace.innovation is None else None
+    if trace.innovation is not None:
+        return None
+    if virtual_innovations(trace) is not None:
+        return (
+            f"the virtual sensors of filter {trace.filter} measure the state; their innovations, NIS/n, are in the "
+            "diagnostic Consistency"
+        )
+    return f"filter {trace.filter} reports no innovations of its measurements"
 
 
 def innovations_of(traces: Sequence[Trace]) -> Innovations:

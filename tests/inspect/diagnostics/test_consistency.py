@@ -299,3 +299,13 @@ def test_few_correlated_trajectories_of_a_healthy_filter_are_white_enough() -> N
 def test_large_numbers_are_in_scientific_notation() -> None:
     """NEES of an imported estimate whose covariance is zero."""
     assert [number(value) for value in (0.00667, 3.14, 123.4, 3.33e25)] == ["0.0067", "3.1", "123", "3.3e+25"]
+
+
+def test_innovations_and_gates_refers_to_the_innovations_of_virtual_sensors() -> None:
+    refusal = DIAGNOSTICS["innovations"].refusal(plant.real("crossmodal-ekf"), None)
+    assert refusal == (
+        "the virtual sensors of filter crossmodal-ekf measure the state; their innovations, NIS/n, are in the "
+        "diagnostic Consistency"
+    )
+    refusal = DIAGNOSTICS["innovations"].refusal(plant.real("crossmodal-pf"), None)
+    assert refusal == "filter crossmodal-pf reports no innovations of its measurements"
