@@ -11,7 +11,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.channels import innovation_channels, reading_channels
+from beliefscope.inspect.statistics.channels import innovation_channels, reading_channels, residual_channels
 from beliefscope.inspect.statistics.innovations import update_sizes, virtual_innovations
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.sensors import camera_images, displayed_sensors
@@ -48,7 +48,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "faulty": faulty if faulty.any() else None,
     }
     arrays |= {f"extra/{name}": values for name, values in trace.extra.items()}
-    of_channels = reading_channels(trace) | reported
+    of_channels = reading_channels(trace) | residual_channels(trace) | reported
     arrays |= {name: values for name, (values, _) in of_channels.items()}
     descriptions: list[dict[str, Any]] = []
     buffers: list[bytes] = []

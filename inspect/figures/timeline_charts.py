@@ -14,7 +14,7 @@ from beliefscope.datasets.text import capitalised
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.channels import innovation_channels, reading_channels
+from beliefscope.inspect.statistics.channels import innovation_channels, reading_channels, residual_channels
 from beliefscope.inspect.statistics.innovations import virtual_innovations
 from beliefscope.inspect.trace import Trace
 
@@ -67,7 +67,7 @@ class Chart:
 def chart_names(trace: Trace) -> list[str]:
     """Names of the charts: those of every run, the filter's own scalars, and the channels of its sensors."""
     extra = [f"extra/{name}" for name in trace.extra]
-    return [*CHARTS, *extra, *reading_channels(trace), *_innovation_columns(trace)]
+    return [*CHARTS, *extra, *reading_channels(trace), *residual_channels(trace), *_innovation_columns(trace)]
 
 
 def value_range(chart: Chart, first: int, last: int) -> tuple[float, float]:
@@ -115,9 +115,10 @@ def chart_of(name: str, trace: Trace, component: int, beta: bool = False) -> Cha
         return Chart(title, "", _lines([("fused", trace.extra[name.removeprefix("extra/")], None)], trace))
     if name.startswith("innovation/"):
         return _reported_innovation(trace, [name])
-    sensor = name.removeprefix("readings/")
-    values, channels = reading_channels(trace)[name]
-    title = "Controls" if sensor == "control" else f"{capitalised(display_name(sensor))} readings"
+    kind, _, sensor = name.partition("/")
+    values, channels = (residual_channels if kind == "residual" else reading_channels)(trace)[name]
+    quantity = "minus truth" if kind == "residual" else "readings"
+    title = "Controls" if sensor == "control" else f"{capitalised(display_name(sensor))} {quantity}"
     own_names = [channel.name.removeprefix(f"{sensor} ") for channel in channels]
     return _channel_chart(title, list(zip(own_names, channels, values.T, [None] * len(channels), strict=True)))
 

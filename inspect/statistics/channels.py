@@ -1,7 +1,8 @@
-"""Channels of a trace over time, with their names and units: readings, controls and reported innovations."""
+"""Channels of a trace over time, with their names and units: readings, residuals, controls and innovations."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,30 @@ def reading_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Component
             present = episode.present(key)[:, None]
             channels = [task.channel(key, i) for i in range(values.shape[1])]
             result[f"readings/{key}"] = (np.where(present, values, np.nan).astype(np.float32), channels)
+    return result
+
+
+def residual_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Component]]]:
+    """Column -> readings (T, d) of a sensor minus the true state, of channels that measure a component.
+
+    Channels of the task's own sensors have the name and the unit of that component: ``gps x`` in m of ``x``. NaN
+    without a reading or truth; angles are wrapped. Components of rotations have no residuals.
+    """
+    task, states = trace.task, trace.episode.states
+    measured = {c.name: (i, c) for i, c in enumerate(task.components) if not c.rotation}
+    result = {}
+    for column, (values, channels) in reading_channels(trace).items():
+        key = column.removeprefix("readings/")
+        residuals, own = [], []
+        for channel, readings in zip(channels if key in task.channels else [], values.T, strict=False):
+            index, component = measured.get(channel.name.removeprefix(f"{key} "), (-1, None))
+            if component is not None and component.unit == channel.unit and key != "control":
+                other = np.array(states)
+                other[:, index] = readings
+                residuals.append(task.difference(other, states)[:, index])
+                own.append(replace(component, name=channel.name))
+        if own:
+            result[f"residual/{key}"] = (np.stack(residuals, axis=1).astype(np.float32), own)
     return result
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,9 @@ CHANNEL = re.compile(r"(.+?)[_.]?(x|y|z|lat|lon|alt|east|north|up|\d+)$", re.I)
 
 ANGLES = ("deg", "rad")
 
+CLOSE = 0.5
+"""Largest root mean square difference of readings and true state, in standard deviations of the latter."""
+
 DT = 0.1
 """s per step, if the log has no times."""
 
@@ -109,7 +113,8 @@ def _table(every: Columns) -> list[str]:
     lines += [f"contact = {_text(flags[0])}"] if flags else []
     examples = dict(zip(state, mean, strict=False))  # the unit of a component without truth is that of its estimate
     values = {c: _value(c, reference, columns, examples.get(c, "")) for c, reference in state.items()}
-    lines += _sections(values, {key: _reading(columns, references) for key, references in sensors.items()})
+    truth = {c: (n, _unit(c, n, columns)[0] or "m") for c, n in state.items() if n in flat}
+    lines += _sections(values, {key: _reading(columns, references, truth) for key, references in sensors.items()})
     if mean or ensemble:
         lines.append("[estimate]")
         columns_of = {"mean": mean, "std": deviations, "covariance": covariance, "particles": ensemble}
@@ -266,17 +271,35 @@ def _sensors(names: Sequence[str], flat: Sequence[str]) -> dict[str, str | list[
     }
 
 
-def _reading(columns: Columns, references: str | list[str]) -> str:
-    """Columns of a sensor, or fields of a message, with the units at the ends of their names and those of angles."""
+def _reading(
+    columns: Columns, references: str | list[str], truth: Mapping[str, tuple[str, str]] = MappingProxyType({})
+) -> str:
+    """Columns of a sensor, or fields of a message, with units: those at the ends of their names, and of angles.
+
+    Channels with the names of true states, and values close to them, have their unit. truth: name -> column and unit.
+    """
     value = _text(references) if isinstance(references, str) else _texts(references)
     listed = [references] if isinstance(references, str) else references
     names = [n for ref in listed for n in ([ref] if ref in columns else columns) if n == ref or n.startswith(f"{ref}.")]
     marks = [(n, *_unit(n, n, columns)) for n in names if columns[n].ndim == 1 and columns[n].dtype.kind in "fiub"]
-    units = [unit if unit in ANGLES or marked(n)[1] else "" for n, unit, _ in marks]
+    units = [unit if unit in ANGLES or marked(n)[1] else _unit_of_truth(n, columns, truth) for n, unit, _ in marks]
     comment = next((comment for *_, comment in marks if comment), "")
     if not any(units):
         return value
     return f"{{column = {value}, unit = {_text(units[0]) if len({*units}) == 1 else _texts(units)}}}{comment}"
+
+
+def _unit_of_truth(name: str, columns: Columns, truth: Mapping[str, tuple[str, str]]) -> str:
+    """Unit of the true state that a channel such as gps_x measures; empty for readings that are not close to it."""
+    channel = CHANNEL.fullmatch(name)
+    state, unit = truth.get(channel[2] if channel else "", ("", ""))
+    if not state:
+        return ""
+    values, expected = columns[name].astype(np.float64), columns[state].astype(np.float64)
+    if not (known := np.isfinite(values) & np.isfinite(expected)).any():
+        return ""
+    values, expected = values[known], expected[known]
+    return unit if np.sqrt(np.mean((values - expected) ** 2)) < CLOSE * expected.std() else ""
 
 
 def _unused(internal: Sequence[str]) -> list[str]:

@@ -43,6 +43,22 @@ const state = { component: 'hinge_x', weights: 'effective', track: 'error', char
 /** @param {typeof trace} run @param {string} key @param {typeof trace} [other] */
 const chartOf = (run, key, other) => tracks(run, { ...state, charts: key }, other)[0];
 
+test('residuals of channels that measure a component are a chart', () => {
+  const gps = [channel('gps x', 'm', 'cm', 100)];
+  const run = makeTrace({
+    ...FUSION,
+    'residual/gps': { shape: [2, 1], values: [0.5, NaN], channels: gps },
+  });
+  assert.deepEqual(channelOptions(run), [['residual/gps', 'residual of gps']]);
+  const chart = chartOf(run, 'residual/gps');
+  assert.equal(chart.title, 'Gps minus truth');
+  assert.equal(chart.unit, 'cm');
+  assert.deepEqual(
+    chart.series.map(({ name, values }) => [name, [...values]]),
+    [['x', [50, NaN]]],
+  );
+});
+
 test('readings and controls are charts that are off by default', () => {
   assert.deepEqual(channelOptions(trace), [
     ['readings/radar', 'readings of radar'],

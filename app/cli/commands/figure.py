@@ -17,8 +17,8 @@ class TimelineOptions:
         opt.option(
             "NAME",
             "Chart of a timeline, from top to bottom: weights, estimate, error, signed, nees, innovation, particles, "
-            "readings/SENSOR, readings/control, innovation/MODALITY or extra/NAME. Repeatable. Default: weights, "
-            "estimate and error.",
+            "readings/SENSOR, readings/control, residual/SENSOR, innovation/MODALITY or extra/NAME. Repeatable. "
+            "Default: weights, estimate and error.",
             ...,
             "--chart",
         ),

@@ -1,4 +1,4 @@
-/** Columns of channels, with names and units: readings of sensors and controls, and innovations of modalities. */
+/** Columns of channels, with names and units: readings of sensors, residuals, controls, and innovations. */
 
 /** @import { Column, Series } from './arrays.js' */
 
@@ -7,6 +7,8 @@ import { slice } from './arrays.js';
 
 /** Start of the names of columns with the readings of a vector sensor, or with the controls. */
 export const READINGS = 'readings/';
+/** Start of the names of columns with the readings of a vector sensor minus the true state. */
+export const RESIDUAL = 'residual/';
 /** Start of the names of columns with the innovation of a modality, in the space of its measurements. */
 export const INNOVATION = 'innovation/';
 /** Start of the names of columns with its predicted standard deviation. */
@@ -44,7 +46,7 @@ export class Channels {
   }
 
   /**
-   * Returns the channels of a column of readings or innovations, in their units for display; none without it.
+   * Returns the channels of a column of readings, residuals or innovations, in their units for display; none without it.
    * @param {string} column
    */
   of(column) {

@@ -1,17 +1,17 @@
-/** Charts of channels: readings of vector sensors, controls, and innovations in the space of the measurements. */
+/** Charts of channels: readings of vector sensors, residuals, controls, and innovations of the measurements. */
 
 /** @import { Channel } from '../data/channels.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Series, Track } from './chart.js' */
 
 import { displayName } from '../core/units.js';
-import { INNOVATION, READINGS } from '../data/channels.js';
+import { INNOVATION, READINGS, RESIDUAL } from '../data/channels.js';
 import { digitsOf } from './digits.js';
 
 const CONTROL = 'control';
 
 /**
- * Returns the keys and labels of the charts of readings and controls, and of the innovation of each of several
+ * Returns the keys and labels of the charts of readings, residuals and controls, and of the innovation of each of several
  * modalities.
  * @param {Trace} trace
  * @returns {[key: string, label: string][]}
@@ -21,6 +21,7 @@ export function channelOptions(trace) {
   return [
     ...optionsOf(measured.length > 1 ? measured : [], INNOVATION, 'innovation of'),
     ...optionsOf(trace.channels.columns(READINGS), READINGS, 'readings of'),
+    ...optionsOf(trace.channels.columns(RESIDUAL), RESIDUAL, 'residual of'),
   ];
 }
 
@@ -37,13 +38,14 @@ const optionsOf = (columns, start, noun) =>
   });
 
 /**
- * Returns whether a chart is one of channels: of readings, or of the innovation of one modality.
+ * Returns whether a chart is one of channels: of readings, of residuals, or of the innovation of one modality.
  * @param {string} key
  */
-export const isOfChannels = (key) => key.startsWith(READINGS) || key.startsWith(INNOVATION);
+export const isOfChannels = (key) =>
+  [READINGS, RESIDUAL, INNOVATION].some((start) => key.startsWith(start));
 
 /**
- * Returns the chart of the readings of a sensor, of the controls, or of the innovation of a modality; null if the trace
+ * Returns the chart of the readings or residuals of a sensor, of the controls, or of the innovation of a modality; null if the trace
  * has none.
  * @param {Trace} trace
  * @param {string} key column
@@ -53,16 +55,29 @@ export function channelTrack(trace, key) {
   if (key.startsWith(INNOVATION)) return innovationsTrack(trace, [key]);
   const channels = trace.channels.of(key);
   if (!channels.length) return null;
-  const sensor = key.slice(READINGS.length);
-  const isControl = sensor === CONTROL;
-  const title = isControl ? 'Controls' : `${displayName(sensor)} readings`;
+  const sensor = key.slice(key.indexOf('/') + 1);
+  const [quantity, help] = quantityOf(key, displayName(sensor));
   return {
-    title: title[0].toUpperCase() + title.slice(1),
-    help: isControl
-      ? 'Controls, as the filter received them'
-      : `Readings of ${displayName(sensor)}, as the filter received them; gaps: steps without a reading`,
+    title: quantity[0].toUpperCase() + quantity.slice(1),
+    help,
     ...linesOf(channels.map((channel) => ({ ...channel, name: ownName(channel.name, sensor) }))),
   };
+}
+
+/**
+ * Returns the title and the explanation of the chart of a column.
+ * @param {string} key
+ * @param {string} sensor
+ * @returns {[title: string, help: string]}
+ */
+function quantityOf(key, sensor) {
+  if (key === READINGS + CONTROL) return ['Controls', 'Controls, as the filter received them'];
+  return key.startsWith(RESIDUAL)
+    ? [`${sensor} minus truth`, `Readings of ${sensor} minus the true state: bias, noise, outliers`]
+    : [
+        `${sensor} readings`,
+        `Readings of ${sensor}, as the filter received them; gaps: steps without a reading`,
+      ];
 }
 
 /**

@@ -125,3 +125,12 @@ def test_names_beside_those_of_an_estimate_are_true_states() -> None:
     assert values["estimate"] == {"mean": ["x_hat", "heading_hat", "v_hat"]}
     assert values["sensors"] == {"wheel": {"column": "wheel (m/s)", "unit": "m/s"}}
     assert '# of the filter, neither sensors nor estimates: ["P_xx"]' in text
+
+
+def test_readings_close_to_the_truth_have_its_unit() -> None:
+    x = 100.0 * np.sin(np.arange(40.0))
+    columns = {"t": np.arange(40.0), "true_x_cm": x, "true_y": 0.01 * x, "est_x": x}
+    columns |= {"gps_x": x + 10.0, "gps_y": 0.01 * x, "force_x": 0.1 * x, "force_y": x}
+    sensors = tomllib.loads(guess_map(Preview(columns), "drive"))["sensors"]
+    assert sensors["gps"] == {"column": ["gps_x", "gps_y"], "unit": ["cm", "m"]}
+    assert sensors["force"] == ["force_x", "force_y"]
