@@ -38,7 +38,8 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
     if path.suffix.lower() == ".csv":
         separator, point = csv_format(path)
         convert = csv.ConvertOptions(decimal_point=point)
-        table = csv.read_csv(path, None, csv.ParseOptions(delimiter=separator), convert)
+        numbered = csv.ReadOptions(use_threads=False)  # errors then state the row
+        table = csv.read_csv(path, numbered, csv.ParseOptions(delimiter=separator), convert)
         table = table.rename_columns([name.strip() for name in table.column_names])
     else:
         table = parquet.read_table(path)
