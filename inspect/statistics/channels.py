@@ -38,7 +38,7 @@ def residual_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Componen
     """Column -> readings (T, d) of a sensor minus the true state, of channels that measure a component.
 
     Channels of the task's own sensors have the name and the unit of that component: ``gps x`` in m of ``x``. NaN
-    without a reading or truth; angles are wrapped. Components of rotations have no residuals.
+    without a reading or truth; none without any truth; angles are wrapped. Components of rotations have no residuals.
     """
     task, states = trace.task, trace.episode.states
     measured = {c.name: (i, c) for i, c in enumerate(task.components) if not c.rotation}
@@ -53,7 +53,7 @@ def residual_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Componen
                 other[:, index] = readings
                 residuals.append(task.difference(other, states)[:, index])
                 own.append(replace(component, name=channel.name))
-        if own:
+        if own and np.isfinite(residuals).any():
             result[f"residual/{key}"] = (np.stack(residuals, axis=1).astype(np.float32), own)
     return result
 
