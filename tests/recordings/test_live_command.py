@@ -60,7 +60,10 @@ def test_ctrl_c_leaves_complete_files(tmp_path: Path) -> None:
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed) as process:
         start = time.monotonic()
-        while not (paths := list(tmp_path.glob("live/*.live"))) or LiveFileReader(paths[0]).poll() < 3:
+        while True:
+            paths = [path for path in tmp_path.glob("live/*.live") if path.stat().st_size]  # with a header
+            if paths and LiveFileReader(paths[0]).poll() >= 3:
+                break
             assert time.monotonic() - start < 180
             time.sleep(0.01)
         (path,) = paths

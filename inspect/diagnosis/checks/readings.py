@@ -110,7 +110,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
 def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingModel]) -> tuple[int, int] | None:
     """First and last step of the interval in which a channel has most of its error against the expected readings.
 
-    None if the other steps have it as well, or if no model expects readings of the channel.
+    None if the other steps have it as well, if the interval is short, or if no model expects readings of the channel.
     """
     for model in models:
         count = 0 if model.key not in (*episode.observations, CONTROL) else readings_of(episode, model.key).shape[1]
@@ -124,8 +124,8 @@ def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingMode
             return None
         error *= np.sign(error.mean())
         first, last = deviating_interval(error)
-        others = np.delete(error, np.s_[first : last + 1])
-        if len(others) and others.mean() < CLEARLY * error[first : last + 1].mean():
+        inside, others = error[first : last + 1], np.delete(error, np.s_[first : last + 1])
+        if len(inside) >= MIN_STEPS and len(others) and others.mean() < CLEARLY * inside.mean():
             return int(steps[first]), int(steps[last])
     return None
 
