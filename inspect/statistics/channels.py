@@ -41,20 +41,20 @@ def residual_channels(trace: Trace) -> dict[str, tuple[FloatArray, list[Componen
     without a reading or truth; none without any truth; angles are wrapped. Components of rotations have no residuals.
     """
     task, states = trace.task, trace.episode.states
-    measured = {c.name: (i, c) for i, c in enumerate(task.components) if not c.rotation}
+    indices = {(c.name, c.unit): i for i, c in enumerate(task.components) if not c.rotation}
     result = {}
     for column, (values, channels) in reading_channels(trace).items():
         key = column.removeprefix("readings/")
-        residuals, own = [], []
-        for channel, readings in zip(channels if key in task.channels else [], values.T, strict=False):
-            index, component = measured.get(channel.name.removeprefix(f"{key} "), (-1, None))
-            if component is not None and component.unit == channel.unit and key != "control":
-                other = np.array(states)
-                other[:, index] = readings
-                residuals.append(task.difference(other, states)[:, index])
-                own.append(replace(component, name=channel.name))
-        if own and np.isfinite(residuals).any():
-            result[f"residual/{key}"] = (np.stack(residuals, axis=1).astype(np.float32), own)
+        if key not in task.channels or key == "control":
+            continue
+        components = [indices.get((channel.name.removeprefix(f"{key} "), channel.unit), -1) for channel in channels]
+        measured, at = np.array(states), [i for i in components if i >= 0]
+        measured[:, at] = values[:, [i >= 0 for i in components]]
+        residuals = task.difference(measured, states)[:, at].astype(np.float32)
+        if np.isfinite(residuals).any():
+            names = [channel.name for channel, i in zip(channels, components, strict=True) if i >= 0]
+            own = [replace(task.components[i], name=name) for i, name in zip(at, names, strict=True)]
+            result[f"residual/{key}"] = residuals, own
     return result
 
 
