@@ -34,6 +34,9 @@ test('an address without a task opens the first example', () => {
     completeLink('?step=3&weights=raw', catalog),
     `${link.replace('effective', 'raw')}&step=3`,
   );
+  const moment = { ...catalog, examples: [{ title: '', help: '', link: `${link}&step=4` }] };
+  assert.equal(completeLink('?speed=2', moment), `${link}&step=4&speed=2`);
+  assert.equal(completeLink('?episode=8', moment), `${link}&episode=8`);
   const others = ['?task=door', '?filter=crossmodal-pf', '?data=mine'];
   for (const search of others) assert.equal(completeLink(search, catalog), search);
   assert.equal(completeLink('?step=3', { ...CATALOG, examples: [] }), '?step=3');
@@ -73,10 +76,17 @@ test('live runs of one filter are all in the catalog', () => {
   assert.equal(completeLink('?task=door', { ...catalog, examples }, listed), '?task=door');
 });
 
-test('an episode opens at its start, unless it is the first of its data set', () => {
-  assert.equal(stateOf('').step, 2);
-  assert.equal(stateOf('?episode=8').step, 0);
-  assert.equal(stateOf('?step=3').step, 3);
+test('an episode opens at its finding, unless it is the first of its data set', () => {
+  const openings = ['', '?episode=8', '?step=3', '?episode=8&step=3'].map((search) => {
+    const { step, atFinding } = stateOf(search);
+    return [step, atFinding];
+  });
+  assert.deepEqual(openings, [
+    [2, false],
+    [0, true],
+    [3, false],
+    [3, false],
+  ]);
 });
 
 test('a permalink restores every key', () => {

@@ -121,6 +121,8 @@ export class DisplayedRun {
     page.angleSlider.show(trace);
     page.report.show(trace);
     page.finding.show(trace);
+    if (this.#store.state.atFinding)
+      this.#store.set({ step: page.finding.step ?? 0, atFinding: false });
     showProperties(trace);
     page.adaptMapMenu(trace);
     page.sceneMenu.show(trace);

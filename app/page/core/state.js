@@ -68,6 +68,7 @@ import { displayName } from './units.js';
  * @property {boolean} playing
  * @property {number} speed
  * @property {boolean} follow whether the cursor stays at the newest step of a live run
+ * @property {boolean} atFinding whether the run opens at the step of its finding, as the link names none
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
@@ -293,6 +294,7 @@ export function parsePermalink(search, catalog) {
   const data = link.named('data', task.data, firstData(task).name);
   const filters = filtersOf(task, data.name);
   const angle = Number(link.query.get('angle') ?? NaN);
+  const [hasStep, isRunning] = [link.query.has('step'), data.live?.state === 'running'];
   /** @type {Partial<State>} */
   const state = {
     task: task.name,
@@ -308,7 +310,8 @@ export function parsePermalink(search, catalog) {
     ),
     playing: false,
     speed: 1,
-    follow: data.live?.state === 'running' && !link.query.has('step'),
+    follow: isRunning && !hasStep,
+    atFinding: !isRunning && !hasStep && link.query.has('episode'),
   };
   const texts = Object.entries(TEXTS).map(([key, fallback]) => [
     key,
@@ -353,6 +356,7 @@ export function completeLink(search, { examples, tasks }, runs = []) {
   const fits = (key, items) =>
     !query.has(key) || items?.some(({ name }) => name === query.get(key));
   if (!fits('filter', task?.filters) || !fits('data', task?.data)) return search;
+  if (query.has('episode')) link.delete('step');
   for (const [key, value] of query) link.set(key, value);
   return `?${link}`;
 }

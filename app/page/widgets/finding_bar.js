@@ -14,8 +14,8 @@ export class FindingBar {
   #host;
   #store;
   #loading = new AbortController();
-  /** @type {number | null} */
-  #step = null;
+  /** That shows the finding best. @type {number | null} */
+  step = null;
   /** @type {string | undefined} */
   #component;
   /** Loads the run again, if that failed. @type {(() => void) | null} */
@@ -90,9 +90,9 @@ export class FindingBar {
 
   /** @param {number} inputTime */
   goToMoment(inputTime) {
-    if (this.#step === null) return;
+    if (this.step === null) return;
     const component = this.#component ?? this.#store.state.component;
-    this.#store.set({ step: this.#step, component, playing: false }, { inputTime });
+    this.#store.set({ step: this.step, component, playing: false }, { inputTime });
   }
 
   /**
@@ -118,7 +118,7 @@ export class FindingBar {
     html('strong', line).textContent = headline;
     html('span', line).textContent = evidence;
     line.title = `${headline} ${evidence}`;
-    [this.#step, this.#component, this.#retry] = [step, component, retry];
+    [this.step, this.#component, this.#retry] = [step, component, retry];
     const button = html('.go-to-step', this.#host);
     button.classList.toggle('none', step === null && !retry);
     button.textContent = retry ? 'Try again' : `Go to step ${step ?? ''}`;
