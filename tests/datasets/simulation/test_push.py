@@ -267,6 +267,9 @@ def test_simulation_reproduces_the_samples(samples: list[Episode]) -> None:
         )
 
 
-@pytest.mark.long  # rounding is amplified from contact to contact, and may differ on other processors
-def test_a_long_episode_keeps_its_bits() -> None:
-    assert simulate_push(1, 149, 100).digest().startswith("5e4c4c302427")
+@pytest.mark.slow
+def test_an_episode_has_the_same_bits_whatever_was_simulated_before() -> None:
+    """Contacts amplify any difference. Other processors round differently."""
+    first = simulate_push(1, 149, 100)
+    simulate_push(1, 148, 20)
+    assert simulate_push(1, 149, 100).digest() == first.digest()
