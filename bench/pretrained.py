@@ -58,7 +58,7 @@ def rows(name: str, metrics: dict[str, dict[str, dict]]) -> list[str]:
 
 def head(task: str) -> list[str]:
     angles = [f" {c.name}, deg |" for c in TASKS[task].components if c.unit == "rad"]
-    line = "| filter | image blackout | estimate | position, cm |" + "".join(angles) + " NEES / n | coverage of 95 % |"
+    line = "| filter | image blackout | estimate | position, cm |" + "".join(angles) + " NEES/n | coverage of 95 % |"
     return [line, "| --- " * (line.count("|") - 1) + "|"]
 
 

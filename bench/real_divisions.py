@@ -5,7 +5,7 @@
 Division k tests every fourth file in alphabetical order, from the k-th, and trains on the others, every fifth of which
 calibrates. MIT_PUSH is a folder with JSON files of one shape (docs/data.md). The task is push-real-field; names of
 filters and the training plan are those of ``bench/field_tasks.py``. DIR keeps data, checkpoints and results. Errors are
-RMSE in cm from step 0, and NEES by step; brackets are 95 % intervals over trajectories.
+RMSE in cm from step 0, and NEES/n by step; brackets are 95 % intervals over trajectories.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def main(source: Path, folder: Path, names: Sequence[str]) -> None:
     for name, parts in consistency.items():
         nees = np.concatenate([values for values, _ in parts], 1)
         for phase in parts[0][1]:
-            print(f"  NEES of {name}, {phase}: {mean_of_steps(nees, np.concatenate([m[phase] for _, m in parts], 1))}")
+            print(f"  NEES/n of {name}, {phase}: {mean_of_steps(nees, np.concatenate([m[phase] for _, m in parts], 1))}")
 
 
 if __name__ == "__main__":

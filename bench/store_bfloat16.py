@@ -3,7 +3,7 @@
     python bench/store_bfloat16.py filters/pretrained/push-field-image-ekf.safetensors
 
 Tensors with at least 1024 values and two axes are rounded to 8 significant bits; filters compute in 32 bits as before.
-Prints the errors and the NEES before and after, of 10 held-out episodes. Then run
+Prints the errors and NEES/n before and after, of 10 held-out episodes. Then run
 ``bench/healthy_profiles.py`` and ``bench/pretrained.py``: profiles and README contain the hash of the file.
 """
 
@@ -54,7 +54,7 @@ def main() -> None:
         halve(path)
         after = errors(path, episodes)
         changes = ", ".join(f"{key} {value:.4f} -> {after.rmse[key]:.4f}" for key, value in before.rmse.items())
-        print(f"{path.stem}: {changes}; NEES {before.nees:.3f} -> {after.nees:.3f}", flush=True)
+        print(f"{path.stem}: {changes}; NEES/n {before.nees:.3f} -> {after.nees:.3f}", flush=True)
 
 
 if __name__ == "__main__":
