@@ -109,7 +109,9 @@ def main(source: Path, folder: Path, names: Sequence[str]) -> None:
     for name, parts in consistency.items():
         nees = np.concatenate([values for values, _ in parts], 1)
         for phase in parts[0][1]:
-            print(f"  NEES/n of {name}, {phase}: {mean_of_steps(nees, np.concatenate([m[phase] for _, m in parts], 1))}")
+            print(
+                f"  NEES/n of {name}, {phase}: {mean_of_steps(nees, np.concatenate([m[phase] for _, m in parts], 1))}"
+            )
 
 
 if __name__ == "__main__":

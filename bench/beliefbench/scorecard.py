@@ -29,19 +29,19 @@ Z = 1.959964
 
 @dataclass(frozen=True)
 class Score:
-    """A share of ``count`` cases with its 95 % interval, and the bar of the project; NaN without cases."""
+    """A share of ``count`` cases with its 95 % interval, and the value that the project requires; NaN without cases."""
 
     name: str
     value: float
     low: float
     high: float
     count: int
-    bar: str
+    required: str
 
     def to_json(self) -> dict[str, Any]:
         numbers = {"value": self.value, "low": self.low, "high": self.high}
         rounded = {name: None if math.isnan(value) else round(value, 4) for name, value in numbers.items()}
-        return {"name": self.name, **rounded, "count": self.count, "bar": self.bar}
+        return {"name": self.name, **rounded, "count": self.count, "required": self.required}
 
 
 def component(cause: str) -> str:
@@ -55,7 +55,7 @@ def score_card(truths: Sequence[Truth], answers: Sequence[Answer]) -> list[Score
     - exact cause first, component first, exact cause in the first three: of visible single faults. The first also by
       the place of the fault: in data (sensors, controls, labels, physics) or in the model.
     - precision: the first cause was planted, of all answers ``fault``.
-    - clean accused: controls that were not answered ``healthy``.
+    - false alarms on clean controls: controls that were not answered ``healthy``.
     - calibration: expected calibration error of the first cause's probability, of all answers that name a cause.
     - masked recognised: masked single faults answered with ``masked``.
     - pairs: visible pairs with both causes in the first three.
@@ -71,8 +71,8 @@ def score_card(truths: Sequence[Truth], answers: Sequence[Answer]) -> list[Score
     clean = [i for i in index if not planted[i]]
     accusing = [i for i in index if answers[i]["state"] == "fault" and names[i]]
 
-    def share(name: str, bar: str, cases: Sequence[int], correct: Callable[[int], bool]) -> Score:
-        return proportion(name, [correct(i) for i in cases], bar)
+    def share(name: str, required: str, cases: Sequence[int], correct: Callable[[int], bool]) -> Score:
+        return proportion(name, [correct(i) for i in cases], required)
 
     in_model = {i for i in singles if planted[i][0].split(".")[0] in MODEL_COMPONENTS}
     in_data = [i for i in singles if i not in in_model]
@@ -84,7 +84,7 @@ def score_card(truths: Sequence[Truth], answers: Sequence[Answer]) -> list[Score
         share("component first", ">= 0.92", singles, lambda i: components[i][:1] == [component(planted[i][0])]),
         share("exact cause in first three", ">= 0.95", singles, lambda i: planted[i][0] in names[i][:3]),
         share("precision", "", accusing, lambda i: names[i][0] in planted[i]),
-        share("clean accused", "<= 0.05", clean, lambda i: answers[i]["state"] != "healthy"),
+        share("false alarms on clean controls", "<= 0.05", clean, lambda i: answers[i]["state"] != "healthy"),
         calibration([(causes[0][1], causes[0][0] in planted[i]) for i, causes in enumerate(ranked) if causes]),
         share("masked recognised", ">= 0.80", masked, lambda i: bool(answers[i].get("masked"))),
         share("pairs with both in first three", ">= 0.70", pairs, lambda i: set(planted[i]) <= set(names[i][:3])),
@@ -98,26 +98,26 @@ def causes_of(answer: Answer) -> list[tuple[str, float]]:
     return [(str(cause["cause"]), float(cause.get("probability", 1.0))) for cause in answer["causes"]]
 
 
-def proportion(name: str, correct: Sequence[bool], bar: str) -> Score:
+def proportion(name: str, correct: Sequence[bool], required: str) -> Score:
     """Share of true values with Wilson's interval."""
     n = len(correct)
     if not n:
-        return Score(name, math.nan, math.nan, math.nan, 0, bar)
+        return Score(name, math.nan, math.nan, math.nan, 0, required)
     p = sum(correct) / n
     centre = (p + Z**2 / (2 * n)) / (1 + Z**2 / n)
     half = Z / (1 + Z**2 / n) * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
-    return Score(name, p, max(0.0, centre - half), min(1.0, centre + half), n, bar)
+    return Score(name, p, max(0.0, centre - half), min(1.0, centre + half), n, required)
 
 
 def calibration(pairs: Sequence[tuple[float, bool]]) -> Score:
     """Expected calibration error of (probability, correct), with a percentile bootstrap interval over cases."""
-    name, bar, n = "expected calibration error", "<= 0.07", len(pairs)
+    name, required, n = "expected calibration error", "<= 0.07", len(pairs)
     if not n:
-        return Score(name, math.nan, math.nan, math.nan, 0, bar)
+        return Score(name, math.nan, math.nan, math.nan, 0, required)
     values = np.array(pairs, dtype=float)
     draws = np.random.default_rng(0).integers(n, size=(RESAMPLES, n))
     low, high = np.percentile([calibration_error(values[draw]) for draw in draws], [2.5, 97.5])
-    return Score(name, calibration_error(values), float(low), float(high), n, bar)
+    return Score(name, calibration_error(values), float(low), float(high), n, required)
 
 
 def calibration_error(values: np.ndarray) -> float:
@@ -140,8 +140,8 @@ def confusion(truths: Sequence[Truth], answers: Sequence[Answer]) -> dict[str, d
 
 def table(scores: Mapping[str, Sequence[Score]]) -> str:
     """Markdown: one row per score, one column per tool."""
-    rows = ["| score | bar | " + " | ".join(scores) + " |", "| --- | --- |" + " --- |" * len(scores)]
+    rows = ["| score | required | " + " | ".join(scores) + " |", "| --- | --- |" + " --- |" * len(scores)]
     for line in zip(*scores.values(), strict=True):
         cells = ["" if not s.count else f"{s.value:.2f} [{s.low:.2f}, {s.high:.2f}] ({s.count})" for s in line]
-        rows.append(f"| {line[0].name} | {line[0].bar} | " + " | ".join(cells) + " |")
+        rows.append(f"| {line[0].name} | {line[0].required} | " + " | ".join(cells) + " |")
     return "\n".join(rows)

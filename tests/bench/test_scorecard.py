@@ -44,12 +44,14 @@ def perfect(number: int) -> dict[str, Any]:
 def test_perfect_tool() -> None:
     result = scores([perfect(i) for i in range(len(TRUTHS))])
     for name, score in result.items():
-        assert score.value == (0.0 if name in ("clean accused", "expected calibration error") else 1.0), name
+        assert score.value == (
+            0.0 if name in ("false alarms on clean controls", "expected calibration error") else 1.0
+        ), name
     counts = {name: score.count for name, score in result.items()}
     assert counts["exact cause first"] == 4
     assert counts["exact cause first, data"] == counts["exact cause first, model"] == 2
     assert counts["precision"] == 7
-    assert counts["masked recognised"] == counts["clean accused"] == 2
+    assert counts["masked recognised"] == counts["false alarms on clean controls"] == 2
     assert counts["pairs with both in first three"] == 1
 
 
@@ -57,7 +59,7 @@ def test_silent_tool() -> None:
     result = scores([answer()] * len(TRUTHS))
     for name in ("exact cause first", "component first", "exact cause in first three", "masked recognised"):
         assert result[name].value == 0.0
-    assert result["clean accused"].value == 0.0
+    assert result["false alarms on clean controls"].value == 0.0
     assert result["precision"].count == result["expected calibration error"].count == 0
     assert math.isnan(result["precision"].value)
 
@@ -67,7 +69,7 @@ def test_tool_with_a_constant_answer() -> None:
     result = scores([answer("image.shift", probability=0.7)] * len(TRUTHS))
     assert result["exact cause first"].value == 0.0
     assert result["component first"].value == 0.25  # image.frozen
-    assert result["clean accused"].value == 1.0
+    assert result["false alarms on clean controls"].value == 1.0
     assert result["precision"].value == pytest.approx(2 / 9)
     assert result["expected calibration error"].value == pytest.approx(0.7 - 2 / 9)
     assert result["pairs with both in first three"].value == 0.0
@@ -86,7 +88,7 @@ def test_ranks_follow_the_order_of_the_answer() -> None:
 def test_unsure_accuses_a_clean_filter() -> None:
     unsure = answer("image.shift") | {"state": "unsure"}
     result = scores([unsure] * len(TRUTHS))
-    assert result["clean accused"].value == 1.0
+    assert result["false alarms on clean controls"].value == 1.0
     assert result["precision"].count == 0
 
 
