@@ -89,7 +89,7 @@ class Adapter:
         inputs: observations by key and controls, SI units -> arguments of the module.
         modalities: names of its K measurement models, in order.
         task: its task, by name, ``FILE.py:NAME`` or definition; needed by a server if not given elsewhere.
-        batched: whether it filters N trajectories at once. Otherwise it runs once per trajectory, without the axis N.
+        batched: whether it filters N episodes at once. Otherwise it runs once per episode, without the axis N.
         log_likelihood: states (C, n) in its units and the inputs of one step, with N = 1 -> (K, C) log-likelihoods of
             its measurement models, or (K + 1, C) with the fused one last; enables likelihood maps.
         absent: reading of a sensor that an ablation removes: ``mean`` over the episode, or ``nan`` for a filter that

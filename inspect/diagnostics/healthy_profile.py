@@ -55,9 +55,9 @@ class HealthyProfile:
         particles: number of particles, or None.
         statistics: ``KIND/SUBJECT/PHASE`` -> (E,) values by episode, SI units; NaN where there is none, such as
             in a phase of too few steps.
-        reference: healthy images; None in profiles of format 1 and for tasks without images.
-        readings: models of the vector sensors of unknown physics; none in profiles of earlier versions.
-        steps: smallest and largest number of steps of the trajectories; None in profiles of earlier versions.
+        reference: healthy images; None in records of format 1 and for tasks without images.
+        readings: models of the vector sensors of unknown physics; none in records of earlier versions.
+        steps: smallest and largest number of steps of the episodes; None in records of earlier versions.
         task: name of the task of a profile that has just been measured; files belong to a filter.
     """
 

@@ -47,15 +47,15 @@ Data = Dataset | Episode | Sequence[Episode] | str | Path
 
 
 def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkpoint:
-    """A filter.
+    """Load a filter.
 
     Args:
         source: ``TASK/NAME`` of a pretrained filter, such as ``door/crossmodal-pf``; the path of a ``.safetensors``
             checkpoint; a build function, ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION``, each also with
             ``@weights.safetensors``; or your own filter: a ``torch.nn.Module``, any other object, a function, or an
             ``Adapter`` of one (docs/own_filter.md).
-        task: of a filter of your own: its definition, name or ``FILE.py:NAME``.
-        name: of a filter of your own, for display; default: its class or function.
+        task: definition, name or ``FILE.py:NAME`` of the task, for a filter of your own.
+        name: name for display, for a filter of your own; default: its class or function.
 
     Raises BadInput if there is no such filter, or if it does not fit the task.
     """
@@ -76,7 +76,7 @@ def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkp
 
 
 def open_dataset(source: str | Path | Episode | Sequence[Episode], task: Task | None = None) -> Dataset:
-    """Episodes of a file or folder (docs/data.md), of the sample data set of a task, such as ``door``, or given ones.
+    """Open a file or folder (docs/data.md), the sample data set of a task, such as ``door``, or a list of episodes.
 
     Raises BadInput if there is none, or if it is damaged.
     """
@@ -132,7 +132,7 @@ def maps(
     quantity: Quantity | None = None,
     components: tuple[str, ...] = (),
 ) -> list[LikelihoodMap]:
-    """Maps of a trace at one or several steps: by modality and fused, over two state components.
+    """Compute maps of a trace at one or several steps: by modality and fused, over two state components.
 
     Args:
         filter_: that of the trace. size: cells per side. quantity: ``likelihood`` or ``posterior``.
@@ -146,7 +146,7 @@ def maps(
 
 
 def inspect_run(run: Trace, filter_: Filter | None = None) -> Mapping[str, Diagnostic]:
-    """All diagnostics that apply to a trace and take less than two seconds, by name (docs/diagnostics.md).
+    """Compute all diagnostics that apply to a trace and take less than two seconds, by name (docs/diagnostics.md).
 
     Args:
         filter_: that of the trace; some diagnostics need it.
@@ -155,7 +155,7 @@ def inspect_run(run: Trace, filter_: Filter | None = None) -> Mapping[str, Diagn
 
 
 def healthy_record(filter_: Filter, data: Data, episodes: Sequence[int] | None = None) -> HealthyProfile:
-    """Statistics of a filter over clean episodes, with which ``diagnose`` compares others.
+    """Measure the statistics of a filter over clean episodes, with which ``diagnose`` compares others.
 
     Args:
         episodes: indices; default: the held-out ones.
@@ -213,7 +213,7 @@ def evaluate(
     particles: int = 300,
     start_offset: str = "",
 ) -> Metrics:
-    """Accuracy and consistency of a filter, its baselines and its modalities, as ``beliefscope evaluate``.
+    """Measure accuracy and consistency of a filter, its baselines and its modalities, as ``beliefscope evaluate``.
 
     Args:
         episodes: indices; default: the held-out ones.
@@ -305,7 +305,7 @@ def compare(
     seed: int = 0,
     particles: int = 300,
 ) -> CheckpointComparison:
-    """What improved and what regressed between two filters of one task, with intervals over episodes.
+    """Report what improved and what regressed between two filters of one task, with intervals over episodes.
 
     Args:
         episodes: indices; default: the held-out ones. slices: to evaluate in addition to the standard ones.
@@ -364,7 +364,7 @@ def export_page(run: Trace, path: str | Path, filter_: Filter | None = None) -> 
 
 
 def experiments(*sweeps: str | Path) -> Experiments:
-    """The results of sweeps as tables for SQL, Arrow and pandas (docs/sweep.md)."""
+    """Open the results of sweeps as tables for SQL, Arrow and pandas (docs/sweep.md)."""
     return Experiments(map(Path, sweeps))
 
 

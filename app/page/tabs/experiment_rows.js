@@ -19,7 +19,7 @@ export const NUMBERS = {
   },
   nees: {
     title: 'NEES/n',
-    help: 'Mean normalised squared error: 1 if the covariance is consistent',
+    help: 'Mean normalised estimation error squared per component: 1 if the covariance is consistent',
     hasUnit: false,
     format: (value) => fixed(value, 2),
   },
