@@ -23,7 +23,7 @@ def counterfactual(
     Injects sensor faults or replaces fusion weights between two steps, starting from the belief before the first of
     them. Both runs use the same random numbers, so every difference results from the intervention. Reports how far
     the estimate moved, in its units and in standard deviations of the original run, when it recovered, and the dominant
-    modality in between. The faults must not have steps of their own (:from, :to).
+    modality during the intervention. The faults must not have steps of their own (:from, :to).
 
     \b
     Examples:
