@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from beliefscope.app.cli.main import COMMANDS, command_group
+from beliefscope.app.cli.main import COMMANDS, GROUPS, command_group
 
 FILE = Path(__file__).resolve().parent.parent / "docs" / "cli.md"
 
@@ -44,7 +44,8 @@ def reference() -> str:
     numbers = Counter(row for own in rows.values() for row in own)
     shared = [row for row, number in numbers.most_common() if number >= SHARED]
     shared.sort(key=lambda row: row[0].startswith("-"))  # arguments before options
-    parts = [INTRODUCTION, ", ".join(f"[{name}](#{name})" for name in COMMANDS) + "\n"]
+    groups = (f"- {title}: {', '.join(f'[{name}](#{name})' for name in names)}" for title, names in GROUPS.items())
+    parts = [INTRODUCTION, "\n".join(groups) + "\n"]
     parts.append(
         "## Shared arguments\n\nEach command lists its own arguments, then the names of shared ones.\n\n"
         + table(shared)

@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+import typer.core
 import typer.main
 
 from beliefscope import __version__
@@ -22,12 +23,19 @@ from beliefscope.app.cli import console
 from beliefscope.app.cli.options import with_options
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (
-    *("demo", "serve", "collect", "convert", "train", "finetune", "modules", "change", "lineage"),
-    *("evaluate", "calibrate", "study", "sweep", "experiments", "trace", "record", "live", "import", "export"),
-    *("inspect", "diagnose", "report", "counterfactual", "figure", "failures", "slices", "faults", "mcp", "doctor"),
-)
-"""In the order of the help text. Each is a function of a module in ``commands`` with the same name."""
+GROUPS = {
+    "Start": ("demo", "serve", "doctor"),
+    "Causes of errors": ("diagnose", "inspect", "failures", "slices", "counterfactual"),
+    "Data": ("collect", "convert", "import", "faults"),
+    "Filters": ("train", "finetune", "modules", "evaluate", "calibrate"),
+    "Comparisons": ("change", "lineage", "study", "sweep", "experiments"),
+    "Runs": ("trace", "record", "live", "export"),
+    "Publication": ("figure", "report"),
+    "Assistants": ("mcp",),
+}
+"""Commands in the order of the help text. Each is a function of a module in ``commands`` with the same name."""
+
+COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, of the shell; typer returns it instead of raising the interrupt."""
@@ -46,12 +54,26 @@ RESUMED = {"collect", "train", "finetune", "study", "sweep"}
 _formatwarning = warnings.formatwarning
 
 
+class CommandGroup(typer.core.TyperGroup):
+    """The commands, which the help text lists by ``GROUPS``."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        width = max(map(len, COMMANDS))
+        limit = formatter.width - width - 6
+        for title, names in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(name.ljust(width), self.commands[name].get_short_help_str(limit)) for name in names]
+                )
+
+
 class Terminated(BaseException):
     """SIGTERM: commands end as after Ctrl-C and remove their unfinished files."""
 
 
 cli = typer.Typer(
     name="beliefscope",
+    cls=CommandGroup,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

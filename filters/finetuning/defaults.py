@@ -79,7 +79,7 @@ def reason(filter_: Filter) -> str:
     ((slice_, _),) = settings.mix
     modules = settings.train[0].replace("-", " ")
     return (
-        f"The pretrained filters were not trained with the sensor fault \u201c{slice_.name}\u201d, which increases "
-        f"their error. The default trains the modules of \u201c{modules}\u201d on data with this fault. "
+        f"The sensor fault \u201c{slice_.name}\u201d increases the error of the pretrained filters. The default trains "
+        f"the modules of \u201c{modules}\u201d on data with this fault. "
         "If the run ends without a change, try other modules or faults."
     )

@@ -83,6 +83,6 @@ def test_a_task_without_a_study_says_how_to_make_one(open_page: Any) -> None:
     assert command in note.locator("pre").text_content()
     assert not page.violations()
     page.screenshot("no-study")
-    note.get_by_role("button", name="Show push", exact=True).click()
+    note.get_by_role("button", name="push", exact=True).click()
     page.until("() => document.querySelector('#study').dataset.state === 'ready'")
     assert page.state["task"] == "push"

@@ -83,10 +83,14 @@ def diagnose(options: Options) -> console.Result:
     """Name the probable cause of a filter's fault.
 
     Compares statistics of sensors, labels, modules and the filter with the filter's healthy record (the same statistics
-    on clean episodes), ranks the causes that explain all deviations, and confirms them by undoing them. --repair finds
-    the shortest interval in which to drop sensors, or with --faults to restore them, so that the episode's largest
-    failure disappears. In place of the task, a recorded run, or a folder of them, is diagnosed as it is; without its
-    filter, no cause is undone. Details: docs/diagnose.md.
+    on clean episodes), ranks the causes that explain all deviations, and confirms them by undoing them. Details:
+    docs/diagnose.md.
+
+    In place of the task, a recorded run, or a folder of them, is diagnosed as it is; without its filter, no cause is
+    undone.
+
+    --repair finds the shortest interval in which to drop sensors, or with --faults to restore them, so that the
+    episode's largest failure disappears.
 
     \b
     Examples:

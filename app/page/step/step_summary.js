@@ -91,7 +91,7 @@ function accuracy(trace, step) {
   /** @type {[Tone, string]} */
   const [tone, verdict] =
     sigmas <= consistent
-      ? ['good', 'consistent']
+      ? ['good', 'as predicted']
       : sigmas <= 2 * consistent
         ? ['warn', 'larger than predicted']
         : ['bad', 'overconfident'];

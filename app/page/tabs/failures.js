@@ -21,7 +21,7 @@ const LISTS = { events: 'Events', episodes: 'Episodes', slices: 'Slices' };
 const AMONG = { 'held-out': 'held-out', all: 'all' };
 const STATES = {
   live: 'The live run is in progress. Its failures are listed when it has ended.',
-  absent: 'No search yet. A search runs the filter over all these episodes.',
+  absent: 'No search yet. A search runs the filter over the episodes selected above.',
 };
 const SLICES_NOTE =
   'A slice is one condition, or two, under which the score is larger, tested over episodes. A click opens its worst step.';

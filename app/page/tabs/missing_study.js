@@ -21,9 +21,7 @@ export function missingStudy(study, store) {
   const selected = store.task(name);
   const buttons = store.catalog.tasks
     .filter((task) => study.tasks.some((other) => other.name === task.name))
-    .map((task) =>
-      createButton('text', `Show ${task.name}`, () => store.set(firstRun(task, store.state))),
-    );
+    .map((task) => createButton('text', task.name, () => store.set(firstRun(task, store.state))));
   const source = study.name === 'shipped' ? 'built-in study' : `study ${study.name}`;
   return emptyNote({
     title: `No study of ${name} yet`,

@@ -25,7 +25,7 @@ export function standalonePicker(store) {
   store.when(['against'], update);
   return ({ inputs }) => {
     const options = inputs.map((name) => [name, `${displayName(name)} standalone`]);
-    setOptions(select, [['', 'no standalone'], ...options]);
+    setOptions(select, [['', 'standalone: none'], ...options]);
     select.hidden = !inputs.length;
     update();
   };
