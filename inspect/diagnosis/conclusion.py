@@ -215,7 +215,8 @@ def conclude(
         where = error_condition(affected.traces, case.inputs.checkpoint, candidates[0].cause)
         candidates = (replace(candidates[0], next=f"{candidates[0].next} {where}".strip()), *candidates[1:])
     deviations = tuple(_evidence(affected, alarm) for alarm in affected.alarms[:EVIDENCE])
-    return Diagnosis(state, masked, headline, candidates, deviations, _provenance(case, turned_text(case)))
+    causes = tuple(candidate for candidate in candidates if candidate.evidence)
+    return Diagnosis(state, masked, headline, causes, deviations, _provenance(case, turned_text(case)))
 
 
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:

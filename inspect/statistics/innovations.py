@@ -152,7 +152,8 @@ def least_certain(covariance: Array) -> NDArray[np.intp]:
     the sample covariance of an ensemble by less than chance does.
     """
     sizes = np.linalg.slogdet(covariance)[1]
-    smaller = sizes.max(-1, keepdims=True) - sizes
+    with np.errstate(invalid="ignore"):  # of particles that are all equal
+        smaller = np.nan_to_num(sizes.max(-1, keepdims=True) - sizes)
     usual = int(np.median(smaller, axis=0).argmin())
     return np.where(smaller[:, usual] < SAME_SIZE, usual, sizes.argmax(-1))
 

@@ -32,8 +32,8 @@ OF_TRUE_STATES = (
 UNCHANGED_BY_DRIFT = ("dynamics spread/", "measurement function/", "process noise/")
 """Statistics that a bias of the dynamics does not change."""
 
-OF_DYNAMICS = ("dynamics", "process_noise", "control", "labels", "data")
-"""Components of causes that change them as well."""
+OF_DYNAMICS = ("dynamics.", "process_noise.", "control.", "labels.", "data.", "particles.few")
+"""Starts of the names of causes that change them as well: moments of few particles are not exact."""
 
 DRIFT = Cause(
     "dynamics.drift",
@@ -172,7 +172,7 @@ def _with_true_starts(cause: Cause) -> Cause:
     if cause.name == "control.bias":  # not the expected controls alone, which are extrapolated to other motions
         symptom = Symptom("dynamics bias/*|dynamics offset/*", 0, optional=True)
         return replace(cause, symptoms=(*cause.symptoms, symptom))
-    if cause.component in OF_DYNAMICS and cause.name not in (DRIFT.name, JACOBIAN.name):
+    if cause.name.startswith(OF_DYNAMICS) and cause.name not in (DRIFT.name, JACOBIAN.name):
         return cause
     unchanged = UNCHANGED_BY_DRIFT if cause.name == DRIFT.name else OF_TRUE_STATES
     patterns = cause.consequences.replace(DYNAMICS, f"{_dynamics('offset', 'scatter')}|{FILTER}").split("|")
@@ -295,7 +295,7 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"updates.{modality}.missing",
             f"Updates with {name} missing",
             (Symptom(f"updates/{modality}/*", -1),),
-            f"covariance update/*|measurement noise//*|{FILTER}",
+            f"covariance update/*|measurement noise//*|measurement noise/{modality}/*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
             prior=GATED,
         ),

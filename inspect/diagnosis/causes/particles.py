@@ -10,7 +10,7 @@ CAUSES = (
         "particles.few",
         "Too few particles",
         (Symptom("particles/*", -1),),
-        FILTER,
+        f"measurement noise/*|process noise/*|dynamics nis/*|dynamics error/*|dynamics bias/*|{FILTER}",
         "Use more particles",
         "healthy particles",
         command=Command("evaluate", "--particles 1000"),

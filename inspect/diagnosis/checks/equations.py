@@ -145,10 +145,12 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     ``lost weights``: share of the steps without resampling after which the weights are not kept.
     ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
     to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it. ``estimate mean`` and
-    ``reported variance``: as ``_estimate_statistics``.
+    ``reported variance``: as ``_estimate_statistics``. Of an ensemble without weights, ``particles`` alone.
     """
-    if trace.all_particles_ess is not None or trace.log_weights is None or trace.prior_log_weights is None:
+    if trace.all_particles_ess is not None or trace.particles is None:
         return {}
+    if trace.log_weights is None or trace.prior_log_weights is None:
+        return {"particles//all": float(trace.particles.shape[1])}
     log_weights, prior = _tensor(trace.log_weights), _tensor(trace.prior_log_weights)
     count = log_weights.shape[1]
     values = {"particles//all": float(count), "prior ess//all": _ess_after_resampling(log_weights, prior)}

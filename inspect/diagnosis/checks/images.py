@@ -21,6 +21,9 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, 
 BLACK = 8
 """Gray level up to which a pixel carries no information about the exposure."""
 
+UNLIT = 0.1
+"""Largest exposure of an image without light."""
+
 SATURATED = 254.5
 """Gray level from which a pixel is saturated; levels of colours are rounded."""
 
@@ -44,20 +47,26 @@ def image_statistics(
 ) -> dict[str, float]:
     """Statistics of one image sensor in an episode or a window; some only with a reference of the same sensor and size.
 
-    Steps without an image do not count.
+    Steps without an image do not count. Dark images, which have noise but no light, count as black; a reference shows
+    them.
 
     Args:
-        gain: by which the noise of brighter images is divided. Default: their exposure.
+        gain: of a window, by which the noise of brighter images is divided. Default: their exposure.
     """
     images, present = episode.observations[key], episode.present(key)
     if not present.any():
         return {}
     lost, frozen = lost_images(images), frozen_images(images, episode.task.held_steps(key))
-    usable, dark = present & ~lost, lost[present]
-    middle = median_image(images[present])
+    lit = usable = present & ~lost
     comparable = reference if usable.any() and _is_comparable(reference, key, images) else None
+    if comparable is not None:
+        lit = usable & (brightness_of(images, comparable) >= UNLIT)
+        if gain is None and not lit.any():  # the images of an episode without light are underexposed
+            lit = usable
+    dark, middle = ~lit[present], median_image(images[lit])
+    comparable = comparable if lit.any() else None
     brightness = 1.0 if comparable is None else float(brightness_of(middle, comparable))
-    noise = _noise(images[usable & ~frozen_images(images)], brightness)
+    noise = _noise(images[lit & ~frozen_images(images)], brightness)
     values = {
         f"black/{key}/all": float(dark.mean()),
         f"losses/{key}/all": float((np.diff(dark, prepend=False) & dark).mean()),
@@ -72,7 +81,7 @@ def image_statistics(
         f"brightness/{key}/all": brightness,
         f"occlusion/{key}/all": float(occluded_pixels(middle, brightness, comparable).mean()),
     }
-    if comparable.has_hand and HAND in episode.observations and (both := usable & episode.present(HAND)).any():
+    if comparable.has_hand and HAND in episode.observations and (both := lit & episode.present(HAND)).any():
         hand, seen = episode.observations[HAND].astype(np.float64)[both], normalised(images[both])
         shift = registration(comparable, hand, seen)
         values |= {f"shift/{key} {axis}/all": pixels for axis, pixels in zip("xy", shift, strict=True)}

@@ -15,12 +15,15 @@ from beliefscope.inspect.statistics.innovations import (
     prediction,
     squared_innovations,
 )
-from beliefscope.inspect.statistics.measures import Array, Mask, absent, counted
+from beliefscope.inspect.statistics.measures import Array, Mask, absent, counted, deviations
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN
 from beliefscope.inspect.trace import Trace
 
 MIN_STEPS = 10
 """Minimum number of steps of a statistic."""
+
+SAME = 1e-5
+"""Largest change of a belief by no update, relative to its size: beliefs have single precision."""
 
 LARGEST_LOGARITHM = 30.0
 """Largest absolute logarithm of a standard deviation; larger ones are those of a covariance without full rank."""
@@ -31,9 +34,9 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
 
     ``innovation bias``, by channel: mean of nu, in standard deviations. ``innovation std``: geometric mean of the
     standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a channel
-    of angles. ``updates``: share of steps with an accepted innovation, or with one that a correct gate rejects
-    because the filter has lost the state. ``absent updates``: share of the steps without a reading of the modality that
-    have an accepted one. ``measurement noise``: geometric mean of the
+    of angles. ``updates``: share of steps with an accepted innovation that changes the belief, or with one that a
+    correct gate rejects because the filter has lost the state. ``absent updates``: share of the steps without a
+    reading of the modality that have an accepted one. ``measurement noise``: geometric mean of the
     standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of all
     modalities, where the measurement noise of some is unknown.
     """
@@ -43,7 +46,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     nu, variance = pair[0][keep], np.diagonal(pair[1][keep], axis1=-2, axis2=-1)
     used = np.isfinite(nu) & (variance > 0.0)
     deviation = np.sqrt(np.where(used, variance, np.nan))
-    accepted = accepted_channels(trace, np.isfinite(nu), keep)
+    accepted = used_channels(trace, np.isfinite(nu), keep)
     squared = None if trace.accepted is None else squared_innovations(trace)
     extreme = np.zeros(used.shape[:2], bool) if squared is None else are_extreme(*squared)[keep]
     values: dict[str, float] = {}
@@ -60,7 +63,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
             at = used[:, k, i]
             values[f"innovation bias/{modality} {names[k][i]}/all"] = float((nu[at, k, i] / deviation[at, k, i]).mean())
         values[f"innovation std/{modality}/all"] = float(np.exp(np.nanmean(np.log(deviation[:, k, channels]))))
-        angles = [i for i in _angles(trace, modality) if i in channels]
+        angles = [i for i in angle_columns(trace, modality) if i in channels]
         turns = np.any(np.abs(np.abs(nu[:, k, angles]) - TURN) < NEAR_TURN, axis=-1)
         values[f"innovation turns/{modality}/all"] = float(turns[used[:, k].any(-1)].mean())
     noise = measurement_noise(trace, *pair)
@@ -71,7 +74,7 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     return values | noise
 
 
-def _angles(trace: Trace, modality: str) -> list[int]:
+def angle_columns(trace: Trace, modality: str) -> list[int]:
     """Channels of a modality, that of all its sensors, which are angles and wrap around in the episode."""
     angles, count = [], 0
     for key in trace.task.modalities.get(modality, ()):
@@ -97,7 +100,7 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     predicted = prediction(trace)
     if predicted is None or predicted.covariance is None or not trace.has_covariance:
         return {}
-    used = accepted_channels(trace, np.isfinite(nu))
+    used = used_channels(trace, np.isfinite(nu))
     s = np.where(used[..., :, None] & used[..., None, :], s, np.eye(nu.shape[-1]))
     before, after = predicted.covariance, trace.estimate_covariance.astype(np.float64)
     (sign_s, of_s), (sign, of_before), (sign_after, of_after) = map(np.linalg.slogdet, (s, before, after))
@@ -109,7 +112,8 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
         known = {m: each[at, k] for k, (m, at) in enumerate(zip(trace.modalities, valid.T, strict=True))}
         return _deviations({m: float(v.mean()) for m, v in known.items() if len(v) >= MIN_STEPS})
     keep = counted(trace) & (sign_s > 0).all(-1) & (sign > 0) & (sign_after > 0) & (channels.sum(-1) > 0)
-    total = 0.5 * (of_s.sum(-1) - of_before + of_after)  # sum of the channels' log standard deviations
+    with np.errstate(invalid="ignore"):  # a belief may have no volume
+        total = 0.5 * (of_s.sum(-1) - of_before + of_after)  # sum of the channels' log standard deviations
     if keep.sum() < MIN_STEPS:
         return {}
     values = _by_modality(trace.modalities, channels[keep].astype(np.float64), total[keep])
@@ -133,9 +137,27 @@ def _deviations(logarithms: Mapping[str, float]) -> dict[str, float]:
     return {f"measurement noise/{m}/all": math.exp(v) for m, v in logarithms.items() if abs(v) < LARGEST_LOGARITHM}
 
 
-def accepted_channels(trace: Trace, used: Mask, keep: Mask | slice = slice(None)) -> Mask:
-    """The used channels (T, K, m) without rejected measurements."""
-    return used if trace.accepted is None else used & (trace.accepted[keep] != 0.0)[..., None]
+def used_channels(trace: Trace, known: Mask, keep: Mask | slice = slice(None)) -> Mask:
+    """The known channels (T, K, m) without those of measurements that are rejected or do not change the belief."""
+    used = known if trace.accepted is None else known & (trace.accepted[keep] != 0.0)[..., None]
+    return used & ~_without_effect(trace)[keep, :, None]
+
+
+def _without_effect(trace: Trace) -> Mask:
+    """(T, K) whether the belief after the update with a modality is that before it; False where it is unknown.
+
+    Of updates in turn, those in the order of the modalities have their own effects; of others, it is that of all.
+    """
+    means, covariances = trace.predicted_mean, trace.predicted_covariance
+    if means is None or covariances is None or not trace.has_covariance:
+        return np.zeros((len(trace), 1), dtype=bool)
+    after, after_covariance = trace.estimate_mean[:, None], trace.estimate_covariance[:, None]
+    if not np.allclose(covariances, covariances[:, :1], rtol=1e-4, equal_nan=True):
+        after = np.concatenate([means[:, 1:], after], axis=1)
+        after_covariance = np.concatenate([covariances[:, 1:], after_covariance], axis=1)
+    moved = np.abs(trace.task.difference(after.astype(np.float64), means)) <= SAME * deviations(covariances)
+    largest = np.abs(covariances).max((-2, -1), keepdims=True)
+    return np.asarray(moved.all(-1) & (np.abs(after_covariance - covariances) <= SAME * largest).all((-2, -1)))
 
 
 def _by_modality(modalities: tuple[str, ...], channels: Array, total: Array) -> dict[str, float]:

@@ -23,6 +23,7 @@ from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
 from beliefscope.inspect.diagnosis.checks.dynamics import dynamics_statistics
 from beliefscope.inspect.diagnosis.checks.equations import equation_statistics, reported_particle_statistics
+from beliefscope.inspect.diagnosis.checks.innovation_lags import innovation_lags
 from beliefscope.inspect.diagnosis.checks.innovations import innovation_statistics
 from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_statistics
 from beliefscope.inspect.diagnosis.checks.true_starts import with_innovations_near_truth, with_particles_near_truth
@@ -65,6 +66,7 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
         near_truth = trace
         if has_truth:
             near_truth = with_innovations_near_truth(with_particles_near_truth(trace, checkpoint), checkpoint)
+            values |= innovation_lags(trace, checkpoint)
         values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
         if isinstance(checkpoint, UnavailableFilter) or reports_estimates_only(trace):  # of others, its causes
             variance = np.diagonal(trace.estimate_covariance[measures.counted(trace)], axis1=-2, axis2=-1)

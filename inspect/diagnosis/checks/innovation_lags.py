@@ -1,0 +1,75 @@
+"""Lags of the labels behind the modalities of an external filter, from its innovations at true states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.diagnosis.checks.innovations import angle_columns
+from beliefscope.inspect.diagnosis.checks.labels import common_part
+from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.trace import Trace
+
+MIN_STEPS = 10
+"""Minimum number of steps with a reading."""
+
+UNCERTAIN = 0.5
+"""Largest standard error of a lag in steps, for readings with the noise R."""
+
+
+def innovation_lags(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
+    """``lag/labels MODALITY/all``: steps by which the labels follow a modality, less what all have in common.
+
+    Of filters that report innovations nu, but no measured states. The reading of step t is compared with the true
+    states of t and of the step before, ``d = nu(t - 1) - nu(t)`` being the change of h(x). A reading that is late by L
+    has ``nu(t) = -L d``: the lag is the slope of nu on d, weighted by 1 / S, around their means, since a bias is no
+    delay. What is common is an error of the dynamics, by which both steps begin. None if fewer than two are known.
+    """
+    is_known = trace.observation_mean is not None or len(trace.modalities_with_posterior) > 0
+    if trace.innovation is None or is_known or not has_true_starts(checkpoint):
+        return {}
+    steps = some_steps(trace, checkpoint)
+    steps, std = steps[steps > 1], smallest_std(trace)
+    episode = trace.episode
+    later = {key: np.roll(values, -1, axis=0) for key, values in episode.observations.items()}
+    masks = {key: np.roll(values, -1, axis=0) for key, values in episode.covariates.items()}
+    before = replace(trace, episode=replace(episode, observations=later, covariates=masks))
+    at, earlier = run_from_truth(trace, checkpoint, steps, std), run_from_truth(before, checkpoint, steps - 1, std)
+    if at is None or earlier is None or "innovation" not in at or "innovation" not in earlier:
+        return {}
+    nu, change = at["innovation"].astype(np.float64), earlier["innovation"].astype(np.float64) - at["innovation"]
+    variance = np.diagonal(at["innovation_covariance"], axis1=-2, axis2=-1).astype(np.float64)
+    lags: dict[str, float] = {}
+    for k, modality in enumerate(trace.modalities):
+        keep = ~measures.absent(trace, modality)[steps]
+        angles = angle_columns(trace, modality)
+        own_nu, own_change = (_wrapped(values[keep, k], angles) for values in (nu, change))
+        lags[modality] = _slope(own_nu, own_change, variance[keep, k])
+    known = np.array([value for value in lags.values() if np.isfinite(value)])
+    if len(known) < 2:
+        return {}
+    common = float(common_part(known[:, None])[0])
+    return {f"lag/labels {modality}/all": value - common for modality, value in lags.items() if np.isfinite(value)}
+
+
+def _wrapped(values: Array, angles: list[int]) -> Array:
+    """Values (S, m) with angles from -pi to pi."""
+    result = values.copy()
+    result[:, angles] = (result[:, angles] + np.pi) % (2.0 * np.pi) - np.pi
+    return result
+
+
+def _slope(nu: Array, change: Array, variance: Array) -> float:
+    """Slope of innovations (S, m) on changes, around their means; NaN if it is uncertain."""
+    known = np.isfinite(nu) & np.isfinite(change) & (variance > 0.0)
+    if known.any(-1).sum() < MIN_STEPS:
+        return np.nan
+    weight = np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
+    total = np.maximum(weight.sum(0), 1e-300)
+    nu, change = (x - (weight * x).sum(0) / total for x in (np.where(known, nu, 0.0), np.where(known, change, 0.0)))
+    power = float((weight * np.square(change)).sum())
+    return float((weight * nu * change).sum()) / power if power * UNCERTAIN**2 > 1.0 else np.nan
