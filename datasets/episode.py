@@ -225,4 +225,4 @@ def is_image(readings: NDArray[Any]) -> bool:
 
 def lost_images(images: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(T,): whether all pixels of an image (T, H, W) or (T, H, W, 3) are equal."""
-    return np.asarray((images == images[:, :1, :1]).reshape(len(images), -1).all(axis=1))
+    return np.asarray((images == images[:, :1, :1]).all(axis=tuple(range(1, images.ndim))))

@@ -138,6 +138,12 @@ def test_statistics_of_particles_that_a_filter_reports() -> None:
     assert shares[2] == pytest.approx({"near": 1.0, "far": 1.0}, abs=1e-3)
 
 
+def test_an_ensemble_without_weights_has_its_number_of_members() -> None:
+    run = bs.trace(filter_of(Particles(50)), [ride(3)])
+    ensemble = replace(run, log_weights=None, prior_log_weights=None, log_likelihood=None, ancestors=None)
+    assert reported_particle_statistics(ensemble) == {"particles//all": 50.0}
+
+
 def test_estimates_are_compared_with_the_moments_of_the_particles() -> None:
     healthy, mean, quarter = (
         reported_particle_statistics(bs.trace(filter_of(module), [ride(0)], 0))

@@ -78,3 +78,18 @@ def test_a_gain_of_the_camera_is_no_noise() -> None:
     assert noisy["brightness/image/all"] == pytest.approx(1.0, rel=0.02)
     assert healthy["clipped/image/all"] == 0.0
     assert of(film(9, gain=2.0))["clipped/image/all"] == pytest.approx(0.3, abs=0.1)  # of levels from 128
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_dark_images_with_noise_are_black_and_change_no_exposure(share: float) -> None:
+    reference = sensor_record([film(seed) for seed in range(5)]).reference
+    dark, rng = film(9), np.random.default_rng(1)
+    count = round(share * len(dark))
+    dark.observations["image"][:count] = rng.normal(0.0, 6.0, (count, 12, 12)).clip(0, 255).round()
+    values = image_statistics(dark, "image", reference) | window_statistics(dark, reference)
+    assert values["black/image/all"] == pytest.approx(share, abs=0.01)
+    assert values["brightness/image/all"] == pytest.approx(1.0, rel=0.02)
+    assert values["brightness/image/range"] == pytest.approx(1.0, rel=0.05)
+    underexposed = image_statistics(film(9, gain=0.05), "image", reference)
+    assert underexposed["brightness/image/all"] == pytest.approx(0.05, rel=0.2)
+    assert underexposed["black/image/all"] == 0.0

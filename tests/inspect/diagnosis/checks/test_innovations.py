@@ -206,6 +206,23 @@ def test_rejected_measurements_change_no_covariance() -> None:
     assert innovation_statistics(lost)["updates/compass/all"] == 1.0, "a correct gate rejects them as well"
 
 
+@pytest.mark.parametrize("separate", [False, True])
+def test_updates_that_do_not_change_the_belief_are_missing(separate: bool) -> None:
+    whole = run(Boat(separate=separate))
+    assert whole.predicted_mean is not None
+    assert whole.predicted_covariance is not None
+    alone = ~np.isfinite(whole.innovation[:, 0]).all(-1)  # the compass, at three of four steps
+    assert 0.7 < alone.mean() < 0.8
+    estimates = whole.estimate_mean.copy(), whole.estimate_covariance.copy()
+    for estimate, predicted in zip(estimates, (whole.predicted_mean, whole.predicted_covariance), strict=True):
+        estimate[alone] = predicted[alone, 1]
+    without = replace(whole, estimate_mean=estimates[0], estimate_covariance=estimates[1])
+    before, after = innovation_statistics(whole), innovation_statistics(without)
+    assert (before["updates/compass/all"], before["updates/radar/all"]) == (1.0, after["updates/radar/all"])
+    assert after["updates/compass/all"] == pytest.approx(1.0 - alone[1:].mean(), abs=0.02)
+    assert "measurement noise/compass/all" not in after, "no equation of the compass alone is left"
+
+
 @pytest.mark.parametrize("readings", [0, 1, 2])
 def test_repeated_readings_of_a_masked_sensor_are_those_of_its_readings(readings: int) -> None:
     """What stands in the steps without a reading does not matter."""
