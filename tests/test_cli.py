@@ -105,6 +105,27 @@ def test_examples_are_accepted(line: str) -> None:
     command.make_context(name, arguments)
 
 
+@pytest.mark.parametrize("line", examples())
+def test_options_have_the_values_of_the_examples(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of ``Path`` and text, for which a callback may check the value but must return it."""
+    monkeypatch.chdir(tmp_path)
+    name, *words = shlex.split(line)[1:]
+    if name.startswith("-"):
+        return
+    values = command_group().commands[name].make_context(name, words).params.values()
+    texts = {str(v) for value in values for v in (value if isinstance(value, list | tuple) else [value])}
+    options = [
+        i for i, word in enumerate(words) if re.fullmatch(r"-o|--(log|data|filter|output|figures|workspace)", word)
+    ]
+    assert {words[i + 1] for i in options} <= texts
+
+
+@pytest.mark.parametrize("name", ["train", "finetune"])
+def test_the_folder_of_logs_is_passed_to_the_command(name: str, tmp_path: Path) -> None:
+    words = ["door", "--filter", "crossmodal-ekf", "--log", str(tmp_path), "-o", str(tmp_path / "new.safetensors")]
+    assert command_group().commands[name].make_context(name, words).params["log"] == tmp_path
+
+
 def test_version(run: Run) -> None:
     assert re.fullmatch(r"beliefscope \d+\.\d+\.\d+\S*\n", run("--version")[1])
 

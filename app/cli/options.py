@@ -350,10 +350,11 @@ def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:
     return values
 
 
-def check_folder(path: Path | None, option: str) -> None:
-    """Raise BadInput if the path of a folder is a file."""
+def check_folder(path: Path | None, option: str) -> Path | None:
+    """The path of a folder. Raises BadInput if it is a file."""
     if path is not None and path.exists() and not path.is_dir():
         raise BadInput(f"{option} {str(path)!r} is a file; give the name of a folder")
+    return path
 
 
 def check_workspace(workspace: Path) -> None:
