@@ -68,7 +68,8 @@ def causes_in(checkpoint: Checkpoint, estimates_only: bool = False) -> tuple[Cau
         groups = [*task.modalities.items(), *((key, (key,)) for key in task.observations)]
         # Labels differ from a moved camera by the models of the other modalities.
         inputs = {name for name, keys in groups if not {*keys} & {*task.images}} | {"labels"}
-        return tuple(in_predictions(cause, starts, inputs) for cause in (*causes, *external_causes(task)))
+        images = {key: name for name, keys in task.modalities.items() for key in keys if key in task.images}
+        return tuple(in_predictions(cause, starts, inputs, images) for cause in (*causes, *external_causes(task)))
     return causes
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -144,7 +144,7 @@ def _wrong_sign(modalities: Sequence[str]) -> Cause:
     )
 
 
-def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str]) -> Cause:
+def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str], images: Mapping[str, str]) -> Cause:
     """A cause with its consequences in the predictions of an external filter, which start at its estimates.
 
     Whether the offspring agrees with the weights depends on the resampling alone.
@@ -154,12 +154,16 @@ def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str])
             of the filter, and the sensors, do not change.
         inputs: components of causes in vector sensors and labels. Their symptoms are in the readings, which no equation
             changes, and a wrong update moves the state before that by the next sensor, also in steps from true states.
+        images: modality by the component of causes in image sensors, whose networks have another R for other images.
     """
     cause = _in_predictions_of_run(cause)
     if has_true_starts:
         cause = _with_true_starts(cause)
     if cause.component in inputs:
         cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|innovation offset/*|innovation spread/*")
+    if (modality := images.get(cause.component)) is not None:
+        noise = f"measurement noise//*|measurement noise/{modality}/*"
+        cause = replace(cause, consequences=f"{cause.consequences}|{noise}")
     return replace(cause, consequences=cause.consequences.replace("|offspring/*", ""))
 
 

@@ -21,8 +21,11 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, 
 BLACK = 8
 """Gray level up to which a pixel carries no information about the exposure."""
 
-UNLIT = 0.1
-"""Largest exposure of an image without light."""
+UNLIT = 0.2
+"""Largest exposure of an image without light: noise that is cut off at black looks like some."""
+
+SEEN = 0.5
+"""Smallest share of the images of a window that must be seen."""
 
 SATURATED = 254.5
 """Gray level from which a pixel is saturated; levels of colours are rounded."""
@@ -64,7 +67,7 @@ def image_statistics(
         if gain is None and not lit.any():  # the images of an episode without light are underexposed
             lit = usable
     dark, middle = ~lit[present], median_image(images[lit])
-    comparable = comparable if lit.any() else None
+    comparable = comparable if lit.any() and (gain is None or lit[present].mean() >= SEEN) else None
     brightness = 1.0 if comparable is None else float(brightness_of(middle, comparable))
     noise = _noise(images[lit & ~frozen_images(images)], brightness)
     values = {
@@ -121,7 +124,7 @@ def _landmark(
 
 def is_usable(images: Gray, present: Mask, held: int = 0) -> bool:
     """Whether at least half of the images of a window are present, seen and not frozen. held: as in ``repeats``."""
-    return bool((present & ~lost_images(images) & ~frozen_images(images, held)).mean() >= 0.5)
+    return bool((present & ~lost_images(images) & ~frozen_images(images, held)).mean() >= SEEN)
 
 
 def occluded_share(images: Gray, key: str, reference: Reference | None) -> dict[str, float]:
