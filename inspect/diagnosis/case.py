@@ -18,6 +18,7 @@ from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Cause
 from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnosis.checks.modules import reports_estimates_only
+from beliefscope.inspect.diagnosis.checks.readings import without_explained
 from beliefscope.inspect.diagnosis.checks.sensors import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.checks.windows import RANGE
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
@@ -71,8 +72,9 @@ class Case:
     """Episodes of a filter and their deviations from the healthy profile.
 
     Attributes:
-        rows: statistics by episode. sensors: those of sensors only. grouped: all of them, statistics adjusted for
-            the readings (``with_adjusted``), and statistics relative to the other episodes (``with_scatter``).
+        rows: statistics by episode. sensors: those of sensors only. grouped: all that are compared
+            (``without_explained``), statistics adjusted for the readings (``with_adjusted``), and statistics relative
+            to the other episodes (``with_scatter``).
         deviations: with t-values relative to their critical values, largest first.
         p_value: probability of deviations of this size in a healthy filter.
     """
@@ -128,6 +130,7 @@ def compared(
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
     scattered, grouped = with_scatter(*with_adjusted(profile, rows, sensors))
+    grouped = [without_explained(row) for row in grouped]
     comparison = compare(scattered, grouped, task=inputs.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
     certain = _repeats_readings(profile, rows) or _most_deviate(scattered, grouped, deviations)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
 
 from beliefscope.datasets.task import display_name
+from beliefscope.datasets.text import percent
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import (
     ALARM_RATE,
@@ -30,7 +32,7 @@ from beliefscope.inspect.diagnosis.cause import (
     probability_text,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
-from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
+from beliefscope.inspect.diagnosis.checks.readings import is_expected, modelled_sensors, without_explained
 from beliefscope.inspect.diagnosis.checks.sensors import covers_episode
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.largest_error import largest_error
@@ -69,6 +71,9 @@ BY_MODALITY = (LATE.name, "weights.ignores_likelihood", "weights.repeats_likelih
 
 LENGTHS = 1.5
 """Largest ratio of the number of steps of an episode to those of the record that is not mentioned."""
+
+EXTRAPOLATED = 0.05
+"""Largest share of a sensor's steps with states that the record does not have that is not mentioned."""
 
 
 def healthy(case: Case) -> Diagnosis:
@@ -125,7 +130,8 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
 def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
     """What the diagnosis cannot judge: sensors without statistics, and statistics that the episodes or the record lack.
 
-    Also whether the length of the episodes causes deviations, if it is not that of the record (``LENGTHS``).
+    Also whether the length of the episodes causes deviations, if it is not that of the record (``LENGTHS``), and
+    sensors at states that the record does not have.
 
     Episodes of contact only lack those of free motion, for example, and records of earlier versions those of new kinds.
 
@@ -141,7 +147,22 @@ def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
     outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
-    return _other_lengths(case) + sensors + _unexpected(case) + _likelihoods(case) + absent + (outdated if new else [])
+    parts = _other_lengths(case), _extrapolated(case), sensors, _unexpected(case)
+    return [*chain.from_iterable(parts)] + _likelihoods(case) + absent + (outdated if new else [])
+
+
+def _extrapolated(case: Case) -> list[str]:
+    """Sensors with a considerable share of steps (``EXTRAPOLATED``) whose states the record does not have."""
+    result = []
+    for model in (model for model in case.profile.readings if model.channels):
+        counts = [model.unknown_steps(trace.episode) for trace in case.traces if is_expected(model, trace.episode)]
+        unknown, total = (sum(values) for values in zip((0, 0), *counts, strict=True))
+        if unknown > EXTRAPOLATED * total:
+            share = percent(unknown / total)
+            result.append(
+                f"{display_name(model.key)} at {share} of its steps, with states that the record does not have"
+            )
+    return result
 
 
 def _unexpected(case: Case) -> list[str]:
@@ -186,8 +207,8 @@ def missing_statistics(case: Case) -> int:
 
 
 def _of_sensors(case: Case) -> set[str]:
-    """Statistics that are about sensors and controls only."""
-    return {name for row in case.sensors for name in row}
+    """Compared statistics that are about sensors and controls only."""
+    return {name for row in case.sensors for name in without_explained(row)}
 
 
 def conclude(

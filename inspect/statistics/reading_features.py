@@ -71,9 +71,14 @@ def monomials(episode: Episode, with_controls: bool, degree: int) -> Array:
     plain = [i for i in range(task.control_size) if with_controls and not task.channel(CONTROL, i).wraps]
     controls = episode.controls[:, plain].astype(np.float64)
     values = np.concatenate([others[:, ~wraps], frames, controls], axis=1)
-    count = values.shape[1]
-    if math.comb(count + degree, degree) > MAX_TERMS:
+    if math.comb(values.shape[1] + degree, degree) > MAX_TERMS:
         return values[:, :0]
+    return products(values, degree)
+
+
+def products(values: Array, degree: int) -> Array:
+    """(T, F): all products of up to ``degree`` of V values (T, V), which are the first columns."""
+    count = values.shape[1]
     terms = [values]
     last = np.arange(count)  # of each product, its last factor: the next one is not before it
     for _ in range(degree - 1):

@@ -43,8 +43,12 @@ other: their coefficients are large."""
 MORE_FEATURES = 0.99
 """Largest share of the variance that changes of the state leave of what the state leaves: noise decides on others."""
 
-CLOSER = 0.8
-"""Largest share of the variance that a landmark, or a polynomial, leaves of what simpler features leave."""
+CLOSER, CURVED = 0.8, 0.95
+"""Largest share of the variance that a landmark or a cubic polynomial, or a quadratic one, leaves of what simpler
+features leave. Readings that are slightly curved over most states differ from a line at rare ones."""
+
+REACHED = 0.95
+"""Quantile of the largest values of a feature in the episodes that limits it: some other episodes also reach it."""
 
 MAX_STEPS = 20_000
 """Number of steps to which a model is fitted; of more, every second one and so on."""
@@ -184,15 +188,16 @@ class _Fitted:
         noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
         fit = self.option.channel, self.coefficients, self.constants, self.option.heading, self.landmark
         spread = float(self.option.slopes(rows, self.errors).std())
-        return ChannelModel(*fit, noise, bias, self.degree, spread, _limits(rows, self.degree))
+        return ChannelModel(*fit, noise, bias, self.degree, spread, _limits(rows, self.degree, len(self.landmark) > 0))
 
 
-def _limits(rows: Sequence[Rows], degree: int) -> Array:
-    """(2, V) range of the values of monomials; V is 0 without any."""
-    if not degree:
+def _limits(rows: Sequence[Rows], degree: int, has_landmark: bool) -> Array:
+    """(2, V) range of the features, or of the values of monomials; V is 0 with a landmark, whose law has no limits."""
+    if has_landmark:
         return np.empty((2, 0))
-    values = np.concatenate([row.monomials[1] for row in rows])
-    return np.stack([values.min(0), values.max(0)])
+    values = [row.monomials[1] if degree else row.features for row in rows]
+    low, high = ([f(x, axis=0) for x in values] for f in (np.min, np.max))
+    return np.stack([np.quantile(low, 1.0 - REACHED, axis=0), np.quantile(high, REACHED, axis=0)])
 
 
 def _options(episodes: Sequence[Episode], key: str) -> list[Option]:
@@ -221,7 +226,10 @@ def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Opti
             for fit in _ridges([row.features for row in rows], y, groups)
         ),
         (CLOSER, list(_landmark_fits(rows, y, options))),
-        *((CLOSER, _polynomial_fits(rows, y, options, degree)) for degree in DEGREES),
+        *(
+            (share, _polynomial_fits(rows, y, options, degree))
+            for share, degree in zip((CURVED, CLOSER), DEGREES, strict=True)
+        ),
     ]
     best: dict[int, _Fitted] = {}
     for share, fits in stages:

@@ -21,11 +21,16 @@ from beliefscope.inspect.statistics.reading_features import (
     landmark_features,
     monomials,
     positions,
+    products,
 )
 from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, significant, wrapped
 
 DIGITS = 8
 """Significant digits of stored coefficients."""
+
+EXTRAPOLATED = 1.0
+"""Largest part of expected readings that is due to features outside of the limits, in standard deviations of the noise.
+"""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,11 @@ class ComparedReadings:
         return np.where(self.model.is_angle, near, self.measured)
 
     @property
+    def known(self) -> Mask:
+        """(T,): steps with expected readings."""
+        return np.asarray(np.isfinite(self.expected).all(1))
+
+    @property
     def fresh(self) -> Mask:
         """(T,): steps with a reading other than the one before, which may be repeated; all those of controls."""
         steps = np.flatnonzero(self.present)
@@ -63,6 +73,7 @@ class ComparedReadings:
         """(S,) at most ``MAX_PAIRS`` steps with a reading, and with an expected one ``delay`` steps earlier."""
         steps = np.flatnonzero(self.present)
         steps = steps[(steps - delay >= FIRST_CHANGES) & (steps - delay < len(self.present))]
+        steps = steps[self.known[steps - delay]]
         return steps[:: 1 + len(steps) // MAX_PAIRS]
 
     def errors(self, delay: int = 0, others: Array | None = None) -> Array:
@@ -107,7 +118,8 @@ class ChannelModel:
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
         degree: of the ``monomials`` that are the features; 0 for others.
         gain_spread: standard deviation between these episodes of the slope of the readings on the expected ones.
-        limits: (2, V) range of the V values that the monomials are products of: a polynomial is not extrapolated.
+        limits: (2, V) range in the record of the V values that the monomials are products of, or of the V = F features;
+            V is 0 without limits, as of landmarks and in records of earlier versions.
     """
 
     index: int
@@ -126,16 +138,24 @@ class ChannelModel:
         return len(self.constants) > 1
 
     def expected(self, inputs: Array, states: Array, places: Array) -> Array:
-        """(T,) from features (T, F), states (T, n) and positions (T, p); NaN outside of the limits.
+        """(T,) from features (T, F), states (T, n) and positions (T, p); NaN outside of the limits (``EXTRAPOLATED``).
 
         Angles are continuous.
         """
         own = landmark_features(places, self.landmark) if len(self.landmark) else inputs
-        columns = own @ self.coefficients + self.constants
-        result = np.unwrap(angle_of(columns, states, self.heading)) if self.is_angle else columns[:, 0]
+        result = self._from(own, states)
+        if not self.limits.size:
+            return result
         low, high = self.limits
-        values = inputs[:, : len(low)]
-        return np.where(((values < low) | (values > high)).any(1), np.nan, result)
+        inside = np.clip(own[:, : len(low)], low, high)
+        extrapolated = result - self._from(products(inside, self.degree) if self.degree else inside, states)
+        extrapolated = wrapped(extrapolated) if self.is_angle else extrapolated
+        return np.where(np.abs(extrapolated) > EXTRAPOLATED * self.noise, np.nan, result)
+
+    def _from(self, own: Array, states: Array) -> Array:
+        """(T,) expected readings, from all features of the channel (T, F)."""
+        columns = own @ self.coefficients + self.constants
+        return np.unwrap(angle_of(columns, states, self.heading)) if self.is_angle else columns[:, 0]
 
     def to_json(self) -> dict[str, Any]:
         """JSON values; the rows of the coefficients are columns."""
@@ -230,17 +250,24 @@ class ReadingModel:
         return len(self.of_channels) == count and not any(values.any() for values in others)
 
     def expected(self, episode: Episode) -> Array:
-        """(T, A) expected readings of the states of an episode; NaN if the model has features of another version."""
-        degrees = {model.degree for model in self.of_channels} - {0}
-        inputs = {degree: monomials(episode, self.key != CONTROL, degree) for degree in degrees}
-        inputs[0] = features(episode, self.key != CONTROL)[0]
-        of_features = (m for m in self.of_channels if not len(m.landmark))
-        if any(len(m.coefficients) != inputs[m.degree].shape[1] for m in of_features):
+        """(T, A) expected readings of the states of an episode; NaN if the model has features of another version.
+
+        Also NaN at states that the record does not have.
+        """
+        if (inputs := self._inputs(episode)) is None:
             return np.full((len(episode), len(self.of_channels)), np.nan)
         states = episode.states.astype(np.float64)
         places = positions(episode.task, states)
         columns = [m.expected(inputs[m.degree], states, places) for m in self.of_channels]
         return np.stack(columns, axis=1)
+
+    def _inputs(self, episode: Episode) -> dict[int, Array] | None:
+        """Features (T, F), and monomials by degree, of an episode; None if the model has those of another version."""
+        degrees = {model.degree for model in self.of_channels} - {0}
+        inputs = {degree: monomials(episode, self.key != CONTROL, degree) for degree in degrees}
+        inputs[0] = features(episode, self.key != CONTROL)[0]
+        of_features = (m for m in self.of_channels if not len(m.landmark))
+        return None if any(len(m.coefficients) != inputs[m.degree].shape[1] for m in of_features) else inputs
 
     def compare(self, episode: Episode) -> ComparedReadings:
         """The readings of an episode beside the expected ones.
@@ -250,6 +277,13 @@ class ReadingModel:
         readings, present = readings_of(episode, self.key)[:, self.channels], steps_of(episode, self.key)
         expected = self.expected(episode)
         return ComparedReadings(readings, expected, present & np.isfinite(expected).all(1), self)
+
+    def unknown_steps(self, episode: Episode) -> tuple[int, int]:
+        """Numbers of the steps with readings: at states that the record does not have, and all."""
+        present = steps_of(episode, self.key)
+        if self._inputs(episode) is None:
+            return 0, int(present.sum())
+        return int((present & np.isnan(self.expected(episode)).any(1)).sum()), int(present.sum())
 
 
 def readings_of(episode: Episode, key: str) -> Array:

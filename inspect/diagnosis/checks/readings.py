@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -44,6 +44,9 @@ EDGES = 151
 CLEARLY = 0.5
 """Largest ratio of the squares that a bias in an interval leaves to those of a drift or a gain."""
 
+EXPLAINED = ("level", "drift", "size", "roughness")
+"""Kinds of statistics that another healthy motion changes: the level of readings, and their standard deviation."""
+
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
 
@@ -78,7 +81,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     """
     values: dict[str, float] = {}
     for model in (model for model in models if model.channels):
-        if model.key not in (*episode.observations, CONTROL) or not np.isfinite(episode.states).all():
+        if not is_expected(model, episode):
             continue
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)
@@ -105,6 +108,21 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
                 pairs = np.delete(exchanged[i], i)
                 values[f"exchanged/{axis}/all"] = float(max(replaced[i], pairs.max(initial=0.0)))
     return values
+
+
+def is_expected(model: ReadingModel, episode: Episode) -> bool:
+    """Whether an episode has labels and the sensor of a model."""
+    return model.key in (*episode.observations, CONTROL) and bool(np.isfinite(episode.states).all())
+
+
+def without_explained(row: Mapping[str, float]) -> dict[str, float]:
+    """Statistics without those of channels that the labels explain (``EXPLAINED``), of which the errors count."""
+    return {name: value for name, value in row.items() if not _is_explained(name, row)}
+
+
+def _is_explained(statistic: str, row: Mapping[str, float]) -> bool:
+    kind, subject, _ = statistic.split("/")
+    return kind in EXPLAINED and f"reading bias/{subject}/all" in row
 
 
 def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingModel]) -> tuple[int, int] | None:
@@ -138,7 +156,8 @@ def _short_delay(compared: ComparedReadings) -> float:
     """
     noise, biases = compared.model.noise, compared.model.biases
     error, change = compared.readings - compared.expected, np.gradient(compared.expected, axis=0)
-    error, change = (x[compared.fresh] / noise for x in (error, change))
+    chosen = compared.fresh & np.isfinite(change).all(1)
+    error, change = (x[chosen] / noise for x in (error, change))
     unbiased = error - error.mean(0)
     unbiased -= _interval_means(unbiased)
     known = 1.0 - 1.0 / np.sqrt(1.0 + len(error) * np.square(biases / noise))
@@ -239,8 +258,7 @@ def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]
     Args:
         dt: s per step.
     """
-    known = (np.arange(len(compared.present)) >= FIRST_CHANGES) & compared.present.any()
-
+    known = (np.arange(len(compared.present)) >= FIRST_CHANGES) & compared.present.any() & compared.known
     signals = compared.readings, compared.expected, compared.fresh, known
     delay, errors = fitted_lag(*signals, largest_lag(dt)), compared.errors()
     if np.isnan(delay):

@@ -110,6 +110,32 @@ def test_readings_in_the_body_of_a_rotation_in_space_are_expected() -> None:
     assert model.channels == (0, 1, 2)
 
 
+def test_linear_models_are_not_extrapolated() -> None:
+    """Steps beyond the record do not count; those of a component that the readings do not depend on do."""
+    gps, far = models()[0], np.arange(STEPS) >= 90
+    within = replace(NEW, states=NEW.states * np.float32([0.5, 0.5, 1.0]))
+    away = replace(within, states=within.states + np.where(far, 5.0, 0.0)[:, None].astype(np.float32) * [1, 0, 0])
+    np.testing.assert_array_equal(gps.compare(away).present, ~far & (np.arange(STEPS) >= 2))
+    assert gps.unknown_steps(away) == (30, STEPS - 2)
+    turned = replace(within, states=within.states + np.float32([0.0, 0.0, 4.0 * np.pi]))
+    assert gps.unknown_steps(turned) == gps.unknown_steps(within) == (0, STEPS - 2)
+    earlier = {**gps.to_json(), "of_channels": [{**m.to_json(), "limits": [[], []]} for m in gps.of_channels]}
+    assert ReadingModel.from_json(earlier).unknown_steps(away) == (0, STEPS - 2), "records of earlier versions"
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_delays_do_not_depend_on_steps_beyond_the_record(delay: int) -> None:
+    """The readings there are those of another law."""
+    gps = models()[0]
+    far = (np.arange(STEPS) % 40) > 25
+    late = NEW.observations["gps"][np.maximum(np.arange(STEPS) - delay, 0)] + 3.0 * far[:, None]
+    away = with_readings(NEW, "gps", late)
+    away = replace(away, states=NEW.states + np.where(far, 5.0, 0.0)[:, None] * np.float32([1.0, 1.0, 0.0]))
+    values = reading_statistics(away, [gps])
+    assert values["reading lag/gps/all"] == pytest.approx(delay, abs=0.1)
+    assert np.isfinite([value for name, value in values.items()]).all()
+
+
 def test_errors_are_those_of_the_noise_where_channels_match() -> None:
     """A signed permutation of the channels has them at the places of this permutation."""
     clean = models()[0].compare(NEW).errors()
@@ -328,7 +354,7 @@ def test_repeated_readings_have_no_delay_of_their_own() -> None:
 
 def test_a_bias_from_some_step_on_is_no_delay_of_a_motion_in_its_direction() -> None:
     rng = np.random.default_rng(4)
-    x = np.cumsum(DT * (1.0 + 0.2 * np.sin(np.arange(STEPS) / 9.0)))
+    x = np.cumsum(0.35 * DT * (1.0 + 0.2 * np.sin(np.arange(STEPS) / 9.0))) - 1.0
     moving = replace(NEW, states=np.column_stack([x, 0.2 * x, np.zeros(STEPS)]).astype(np.float32))
     gps = moving.states[:, :2] + np.array([3.0, -2.0]) + rng.normal(0.0, NOISE, (STEPS, 2))
     bias = np.where(np.arange(STEPS) < 80, 0.0, 6.0 * NOISE)[:, None] * [1.0, 0.0]
