@@ -41,6 +41,9 @@ BLOCKS = 10
 EDGES = 151
 """Number of steps, evenly spaced, at which a bias may begin or end."""
 
+ONSETS = 20
+"""Number of times, evenly spaced, at which a drift may begin."""
+
 CLEARLY = 0.5
 """Largest ratio of the squares that a bias in an interval leaves to those of a drift or a gain."""
 
@@ -200,20 +203,33 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
     """(A,) slope of errors (S, A) with a mean of 0 by the times (S,), and the part (S, A) that is a drift or a bias.
 
     A gain and a bias in an interval also change errors over time. The slope is shrunk by the likelihood ratio of the
-    better of these to a line, for ``BLOCKS`` pairs of independent errors. The part is that of the line, if it leaves
-    least of the three, or of the interval, which has more parameters, if it leaves clearly less (``CLEARLY``).
+    better of these to a ramp from some step on, for ``BLOCKS`` pairs of independent errors. The part is that of the
+    ramp, if it leaves least of the three, or of the interval, which has more parameters, if it leaves clearly less
+    (``CLEARLY``).
     """
     time = times[:, None]
     power = np.square(errors).sum(0)
     slope = (time * errors).sum(0) / np.square(time).sum()
     interval = _interval_means(errors)
     gain = expected * ((expected * errors).sum(0) / np.maximum(np.square(expected).sum(0), 1e-24))
-    fits = slope * time, interval, gain
-    left = [np.maximum(np.square(errors - fit).sum(0), 1e-9 * power + 1e-24) for fit in fits]
-    by_line, by_interval, by_gain = left
-    is_interval = by_interval < CLEARLY * np.minimum(by_line, by_gain)
-    part = np.where(is_interval, interval, np.where(by_line < by_gain, slope * time, 0.0))
-    return slope * np.minimum(np.minimum(by_interval, by_gain) / by_line, 1.0) ** BLOCKS, part
+    ramp = _ramp(errors, times)
+    left = [np.maximum(np.square(errors - fit).sum(0), 1e-9 * power + 1e-24) for fit in (ramp, interval, gain)]
+    by_ramp, by_interval, by_gain = left
+    is_interval = by_interval < CLEARLY * np.minimum(by_ramp, by_gain)
+    part = np.where(is_interval, interval, np.where(by_ramp < by_gain, ramp, 0.0))
+    return slope * np.minimum(np.minimum(by_interval, by_gain) / by_ramp, 1.0) ** BLOCKS, part
+
+
+def _ramp(errors: Array, times: Array) -> Array:
+    """(S, A) ramps from one of ``ONSETS`` times on that explain most of errors (S, A) with a mean of 0 at times (S,)."""
+    onsets = np.linspace(times[0], times[-1], ONSETS + 1)[:-1]
+    ramps = np.maximum(times[:, None] - onsets, 0.0)  # (S, O)
+    ramps -= ramps.mean(0)
+    powers = np.square(ramps).sum(0)[:, None]
+    products = ramps.T @ errors  # (O, A)
+    best = (np.square(products) / powers).argmax(0)
+    channels = np.arange(errors.shape[1])
+    return np.asarray(ramps[:, best] * (products[best, channels] / powers[best, 0]))
 
 
 def _interval_means(errors: Array) -> Array:
