@@ -268,8 +268,15 @@ def _informative_phases(traces: Sequence[Trace]) -> list[dict[str, Mask]]:
 
 
 def long_phases(trace: Trace) -> dict[str, Mask]:
-    """``phases`` of at least ``MIN_STEPS`` steps."""
-    return {phase: mask for phase, mask in _informative_phases([trace])[0].items() if mask.sum() >= MIN_STEPS}
+    """``phases`` of at least ``MIN_STEPS`` steps, with names for statistics ``KIND/SUBJECT/PHASE``.
+
+    These contain no slash: a group ``speed below 0.5 m/s`` has a division slash instead.
+    """
+    return {
+        phase.replace("/", "\N{DIVISION SLASH}"): mask
+        for phase, mask in _informative_phases([trace])[0].items()
+        if mask.sum() >= MIN_STEPS
+    }
 
 
 def pooled_phases(traces: Sequence[Trace]) -> dict[str, Mask]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -106,3 +107,18 @@ def test_a_faulty_sensor_is_not_broken_dynamics() -> None:
     result = diagnose(loaded(Cart(weight=0.5)), faulty, profile=profile())
     probability = {c.cause.name: c.probability for c in result.causes}
     assert probability["rear.sign"] > 0.9 > 0.2 > probability.get("dynamics.broken", 0.0)
+
+
+@pytest.mark.slow
+def test_units_of_groups_may_have_a_slash() -> None:
+    task = replace(TASK, name="fast_cart", covariates={"speed": bs.Covariate("continuous", cuts=(0.4,), unit="m/s")})
+    episodes = [drive(seed) for seed in range(16)]
+    fast = [
+        replace(e, task=task, covariates={"speed": np.linalg.norm(e.controls, axis=1) / task.dt}) for e in episodes
+    ]
+    adapter = bs.Adapter(Cart(), batched=False, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
+    filter_ = bs.load_filter(adapter, task, name="cart")
+    record = HealthyProfile.from_json(profile_of(filter_, fast[:12], "cart").to_json())
+    result = diagnose(filter_, dict(enumerate(fast[12:])), profile=record)
+    assert result.state == "healthy"
+    assert any(name.startswith("nees/fused/speed below 0.4 m") for name in record.statistics)
