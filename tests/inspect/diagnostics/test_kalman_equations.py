@@ -330,3 +330,55 @@ def test_predictions_alone_are_checked_without_innovations() -> None:
         "Jacobians against finite differences",
         "Noise that the covariances contain",
     ]
+
+
+class Redundant:
+    """Updates in turn with sensors of one position (2,), m."""
+
+    def __init__(self, std: tuple[float, ...]) -> None:
+        self.std = dict(zip(("front", "rear", "left", "right"), std, strict=False))
+
+    def initialize_beliefs(self, *, mean: Any, covariance: Any) -> None:
+        self.mean, self.covariance = mean, covariance
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        self.covariance = self.covariance + 0.05**2 * np.eye(2)
+        before, innovation = [], []
+        for key, std in self.std.items():
+            size = self.covariance + std**2 * np.eye(2)
+            gain = self.covariance @ np.linalg.inv(size)
+            before.append((self.mean, self.covariance))
+            innovation.append((observations[key] - self.mean, size))
+            self.mean = self.mean + gain @ innovation[-1][0]
+            self.covariance = self.covariance - gain @ self.covariance
+        return {
+            "estimate_mean": self.mean,
+            "estimate_covariance": self.covariance,
+            "predicted_mean": np.stack([mean for mean, _ in before]),
+            "predicted_covariance": np.stack([covariance for _, covariance in before]),
+            "innovation": np.stack([nu for nu, _ in innovation]),
+            "innovation_covariance": np.stack([size for _, size in innovation]),
+        }
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_redundant_sensors_have_right_corrections(count: int) -> None:
+    """A repeated step has fewer values than there are sensors."""
+    filter_ = Redundant((0.1, 0.05, 0.1, 0.2)[:count])
+    redundant = bs.Task(
+        name="redundant",
+        components=(bs.Component("x", "m"), bs.Component("y", "m")),
+        observations=dict.fromkeys(filter_.std, (2,)),
+        modalities={key: (key,) for key in filter_.std},
+        control_size=0,
+        dt=0.1,
+    )
+    rng = np.random.default_rng(0)
+    states = np.cumsum(rng.normal(0.0, 0.05, (60, 2)), axis=0)
+    readings = {key: states + rng.normal(0.0, std, (60, 2)) for key, std in filter_.std.items()}
+    episode = bs.Episode(redundant, states, np.zeros((60, 0)), readings)
+    adapter = bs.Adapter(filter_, batched=False, modalities=tuple(filter_.std), initial_std=(0.3, 0.3))
+    checkpoint = bs.load_filter(adapter, redundant)
+    values = jacobian_statistics(bs.trace(checkpoint, [episode]), checkpoint)
+    for key in filter_.std:
+        assert values[f"correction slope/{key}/all"] == pytest.approx(1.0, abs=1e-3)
