@@ -1,4 +1,4 @@
-"""Covariances that can be inverted, whatever the units of the state: a particle set may have collapsed."""
+"""Covariances that can be inverted, whatever the units of the state, and those that are none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ FLOOR = 1e-8
 """Part of a component's usual variance, or of its own if that is larger, that is added to its variances."""
 
 SMALLEST = 1e-30
-"""Variance of a component that has none in any covariance."""
+"""Variance of a component that has none in any covariance: a particle set may have collapsed."""
+
+INDEFINITE = 1e-3
+"""Eigenvalue of a correlation matrix below zero, and difference from its transpose, that are not rounding."""
 
 
 def with_floor(covariance: NDArray[Any], usual: NDArray[Any] | None = None) -> NDArray[np.float64]:
@@ -32,3 +35,29 @@ def usual_variances(covariance: NDArray[Any]) -> NDArray[np.float64]:
     """(n,) median of the positive variances of each component in covariances (..., n, n); 0 if there are none."""
     variances = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, covariance.shape[-1]).astype(np.float64)
     return np.array([np.median(v[v > 0.0]) if (v > 0.0).any() else 0.0 for v in variances.T])
+
+
+def is_covariance(matrices: NDArray[Any]) -> NDArray[np.bool_]:
+    """(...): whether matrices (..., n, n) are symmetric with positive variances, and not ``is_indefinite``.
+
+    Unknown and infinite matrices are not.
+    """
+    matrices = np.where(np.isfinite(matrices), matrices, np.nan)
+    variance = np.diagonal(matrices, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    difference = np.abs(matrices - np.swapaxes(matrices, -1, -2)) / (scale[..., :, None] * scale[..., None, :])
+    is_symmetric = (difference <= INDEFINITE).all((-2, -1))
+    return np.asarray(is_symmetric & (variance > 0.0).all(-1) & ~is_indefinite(matrices))
+
+
+def is_indefinite(covariance: NDArray[Any]) -> NDArray[np.bool_]:
+    """(...): whether a covariance (..., n, n) has a negative variance, or correlations that no errors have.
+
+    The tolerance covers the rounding of single precision. Unknown covariances, NaN, are not indefinite.
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+    known = np.isfinite(correlation).all((-2, -1))
+    eigenvalues = np.linalg.eigvalsh(np.where(known[..., None, None], correlation, 1.0))
+    return np.asarray(known & ((variance < 0.0).any(-1) | (eigenvalues[..., 0] < -INDEFINITE)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,10 +20,11 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.notebook_html import html_table
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.text import percent
 from beliefscope.filters.angles import Angles
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.filters.covariance_floor import is_covariance, with_floor
 from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.adapter import FailedStep
@@ -75,7 +77,7 @@ class Metrics:
             external filter that fails without the others.
         squares: (R, 1 + keys of ``rmse``) of each episode: number of evaluated steps, sums of squared errors.
 
-    ``nll``, ``nees`` and ``coverage95`` are NaN, and null in JSON, for an estimator without a covariance.
+    ``nll``, ``nees`` and ``coverage95`` are of the steps with a covariance; NaN, and null in JSON, if there are none.
     """
 
     rmse: dict[str, float]
@@ -144,6 +146,8 @@ def evaluate(
             An external filter runs without information of the others' sensors (``external/ablation.py``).
         engine, workers: where to run, as for ``filters.engine.run_blocks``. The values do not depend on them.
 
+    Warns if covariances of an external filter are not symmetric and positive definite; they count as unknown.
+
     Raises:
         BadInput: there is no episode; episodes, faults or modality do not fit the filter's task; or there are several
             workers for an external filter that has no build function.
@@ -168,6 +172,8 @@ def evaluate(
             pairs = zip(torch.from_numpy(error).unbind(1), torch.from_numpy(covariance).unbind(1), strict=True)
             runs.setdefault(name, {}).update(zip((number for number, *_ in block), pairs, strict=True))
     complete = {name: [by[i] for i in range(len(by))] for name, by in runs.items() if len(by) == len(episodes)}
+    if isinstance(filter_, ExternalFilter):
+        complete[FILTER] = _with_valid_covariances(filter_.task, complete[FILTER])
     pooled = {name: _pool(filter_.task, by, episodes) for name, by in complete.items()}
     names = filter_.task.modalities if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
     return replace(
@@ -317,6 +323,26 @@ def _stay(task: Task, mean: Tensor, states: Tensor) -> Run:
     return _errors(task, mean, states), torch.full((*states.shape, states.shape[-1]), torch.nan)
 
 
+def _with_valid_covariances(task: Task, trajectories: Sequence[Run]) -> list[Run]:
+    """The runs of each episode with NaN in place of invalid covariances. Warns with their share of the counted steps.
+
+    Estimators without any covariance cause no warning.
+    """
+    valid = [is_covariance(covariance.numpy()) for _, covariance in trajectories]
+    counted = np.concatenate([mask[task.first_counted(len(mask)) :] for mask in valid])
+    if not counted.all() and not all(covariance.isnan().all() for _, covariance in trajectories):
+        measured = "those of the other steps" if counted.any() else "unknown"
+        warnings.warn(
+            f"covariances are not symmetric and positive definite in {percent(1.0 - counted.mean(), '.3g')} of the "
+            f"steps; {', '.join(CONSISTENCY.values())} are {measured}",
+            stacklevel=3,
+        )
+    return [
+        (error, torch.where(torch.from_numpy(mask)[:, None, None], covariance, torch.nan))
+        for (error, covariance), mask in zip(trajectories, valid, strict=True)
+    ]
+
+
 def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:
     """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each episode."""
     # An estimate that counts turns has no larger errors.
@@ -354,11 +380,13 @@ def _root_mean(squares: Mapping[str, Tensor]) -> dict[str, float]:
 
 
 def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
-    """Metrics of errors (S, n) with covariances (S, n, n), SI units; covariances are all NaN if there are none."""
+    """Metrics of errors (S, n) with covariances (S, n, n), SI units; unknown covariances are NaN."""
     error, covariance = error.double(), covariance.double()
     rmse = _root_mean(squares(task, error))
-    if covariance.isnan().all():
+    known = ~covariance.isnan().any((-2, -1))
+    if not known.any():
         return Metrics(rmse, math.nan, math.nan, math.nan)
+    error, covariance = error[known], covariance[known]
     n = error.shape[-1]
     covariance = torch.from_numpy(with_floor(covariance.numpy()))
     squared = (error.unsqueeze(-2) @ torch.linalg.solve(covariance, error.unsqueeze(-1))).flatten()

@@ -24,6 +24,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
+from beliefscope.filters.covariance_floor import is_covariance
 from beliefscope.filters.evaluate import squares
 from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.filters.names import code_parts, external_name, is_code
@@ -230,12 +231,16 @@ def summary(trace: Trace) -> Iterator[Row]:
     each component has its own column, such as ``hinge_x_cm``. ``beta_image`` and ``weight_image`` are the mean fusion
     weight beta and effective weight.
     ``nll`` in nats, m and rad; ``nees`` over n, 1 if consistent; ``coverage95`` the share of steps with the truth in
-    the 95 % ellipsoid; ``ess`` the effective share of the particles; NaN where a filter lacks the quantity.
+    the 95 % ellipsoid; ``ess`` the effective share of the particles; NaN where a filter lacks the quantity, or has
+    an invalid covariance (``is_covariance``).
     """
     error = measures.errors(trace)[:, -1]
     squared = {key: values.numpy() for key, values in squares(trace.task, torch.from_numpy(error)).items()}
     main, components = trace.task.main_error.key, [component.key for component in trace.task.components]
     columns = {"nees": measures.nees(trace)[:, -1], "nll": measures.nll(trace)[:, -1]}
+    if trace.particles is None:  # sets of particles may collapse
+        valid = is_covariance(trace.estimate_covariance)
+        columns = {name: np.where(valid, values, np.nan) for name, values in columns.items()}
     squared_sigmas, limit = error.shape[-1] * columns["nees"], chdtri(error.shape[-1], 0.05)
     columns["coverage95"] = np.where(np.isnan(squared_sigmas), np.nan, squared_sigmas <= limit)
     if trace.effective_sample_size is not None and trace.particle_count:

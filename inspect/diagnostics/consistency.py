@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import capitalised, plural
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.covariance_floor import is_indefinite
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Entry, RunDiagnostic, drawn_steps, fields_of
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
@@ -33,7 +34,7 @@ from beliefscope.inspect.statistics.calibration import (
 )
 from beliefscope.inspect.statistics.innovations import Whiteness, autocorrelations, nis_of, whiteness_of
 from beliefscope.inspect.statistics.intervals import LEVEL, mean_interval, nees_limit, too_few
-from beliefscope.inspect.statistics.measures import Array, Mask
+from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.trace import Trace
 
 ALL, FUSED = "all", "fused"
@@ -200,10 +201,6 @@ class Consistency(RunDiagnostic):
         return plots
 
 
-INDEFINITE = 1e-3
-"""Eigenvalue of a correlation matrix below zero that is not rounding."""
-
-
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if not trace.has_covariance or not np.isfinite(trace.estimate_covariance).any():
@@ -239,23 +236,10 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
         healthy=healthy,
         updates_note=measures.updates_note(first),
         indefinite=sum(
-            int(_is_indefinite(trace.estimate_covariance[measures.counted(trace)].astype(float)).sum())
+            int(is_indefinite(trace.estimate_covariance[measures.counted(trace)].astype(float)).sum())
             for trace in traces
         ),
     )
-
-
-def _is_indefinite(covariance: Array) -> Mask:
-    """(T,): whether a covariance (T, n, n) has a negative variance, or correlations that no errors have.
-
-    The tolerance covers the rounding of single precision. Unknown covariances, NaN, are not indefinite.
-    """
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
-    correlation = covariance / (scale[:, :, None] * scale[:, None])
-    known = np.isfinite(correlation).all((-2, -1))
-    eigenvalues = np.linalg.eigvalsh(np.where(known[:, None, None], correlation, 1.0))
-    return known & ((variance < 0.0).any(-1) | (eigenvalues[:, 0] < -INDEFINITE))
 
 
 def trajectory_statistics(trace: Trace) -> dict[str, float]:

@@ -16,7 +16,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.covariance_floor import with_floor
+from beliefscope.filters.covariance_floor import is_covariance, with_floor
 from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.filters.evaluate import blocks_of, external_run
 from beliefscope.filters.external.ablation import with_only
@@ -258,7 +258,8 @@ def _run_external(
     seen = [with_only(episode, slice_.only or None, external.adapter.absent) for episode in episodes]
     values, _ = external.run(seen, seed, progress)
     errors, covariance = external_run(external.task, values, batch.states)
-    return errors.numpy(), covariance
+    valid = torch.from_numpy(is_covariance(covariance.numpy()))
+    return errors.numpy(), torch.where(valid[..., None, None], covariance, torch.nan)
 
 
 def sample_steps(episodes: Sequence[Episode], task: Task, count: int) -> Batch:

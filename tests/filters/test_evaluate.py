@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,14 +15,18 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
-from beliefscope.filters.evaluate import evaluate, metrics, nees_bounds
+from beliefscope.filters.evaluate import CONSISTENCY, evaluate, metrics, nees_bounds
+from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import as_external
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start
+from beliefscope.inspect.sweep import summary
+from beliefscope.inspect.trace import trace
 
 DOOR = find_task("door")
 
@@ -285,3 +290,57 @@ def test_only_applies_to_filters_without_a_weight_model() -> None:
     assert fused.rmse != image.rmse
     with pytest.raises(BadInput, match=r"Modality 'touch' is not in this filter"):
         evaluate(filter_, episodes, only="touch")
+
+
+TAG = Task(
+    name="tag",
+    components=(Component("x", "m"), Component("y", "m")),
+    observations={"gps": (2,)},
+    modalities={"gps": ("gps",)},
+    control_size=0,
+    dt=0.1,
+    warmup=0,
+)
+
+
+class Constant:
+    """Follows the readings; its covariance is invalid from step 30 on."""
+
+    def __init__(self, invalid: list[list[float]]) -> None:
+        self.invalid = torch.tensor(invalid)
+
+    def initialize_beliefs(self, *, mean: torch.Tensor, covariance: torch.Tensor) -> None:
+        self.step = 0
+
+    def __call__(
+        self, *, observations: dict[str, torch.Tensor], controls: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        covariance = 0.01 * torch.eye(2) if self.step < 30 else self.invalid
+        self.step += 1
+        return observations["gps"], covariance.expand(len(controls), 2, 2)
+
+
+@pytest.mark.parametrize(
+    "invalid", [[[-0.01, 0.0], [0.0, -0.01]], [[0.0, 0.0], [0.0, 0.0]], [[0.01, 0.008], [0.0, 0.01]]]
+)
+def test_invalid_covariances_are_unknown(invalid: list[list[float]]) -> None:
+    rng = np.random.default_rng(0)
+    states = np.cumsum(rng.normal(0.0, 0.05, (40, 2)), axis=0)
+    episode = Episode(TAG, states, np.zeros((40, 0)), {"gps": states + rng.normal(0.0, 0.1, (40, 2))})
+    filter_ = as_external(Adapter(Constant(invalid), initial_std=(0.1, 0.1), task=TAG), "tag")
+    with pytest.warns(UserWarning, match="not symmetric and positive definite in 25 % of the steps.*the other steps"):
+        result = evaluate(filter_, [episode], modalities=True)
+    with warnings.catch_warnings(action="error"):
+        valid = evaluate(filter_, [episode.part(0, 30)])
+    assert (result.nll, result.nees, result.coverage95) == pytest.approx((valid.nll, valid.nees, valid.coverage95))
+    row = next(summary(trace(filter_, episode)))
+    assert np.isnan([row[name] for name in CONSISTENCY]).all()
+
+
+def test_without_any_valid_covariance_consistency_is_unknown() -> None:
+    states = np.cumsum(np.random.default_rng(0).normal(0.0, 0.05, (40, 2)), axis=0)
+    episode = Episode(replace(TAG, warmup=30), states, np.zeros((40, 0)), {"gps": states})
+    filter_ = as_external(Adapter(Constant([[0.0, 0.0], [0.0, 0.0]]), initial_std=(0.1, 0.1), task=episode.task), "tag")
+    with pytest.warns(UserWarning, match="in 100 % of the steps; NLL, NEES/n, 95 % coverage are unknown"):
+        result = evaluate(filter_, [episode])
+    assert np.isnan([result.nll, result.nees, result.coverage95]).all()
