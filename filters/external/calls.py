@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -99,7 +100,11 @@ def described(error: Exception, where: str, adapter: Adapter, task: Task) -> str
     """An exception of a filter in one line, with its location, such as ``step 0``."""
     message = (str(error).strip().splitlines() or ["no message"])[0]
     text = f"fails at {where}: {type(error).__name__}: {message}"
-    if where == "step 0" and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
+    if isinstance(adapter.module, nn.Module) and re.search("scalar type|dtype|[Ii]nput type", message):
+        types = [str(dtype).removeprefix("torch.") for dtype in (dtype_of(adapter.module), torch.get_default_dtype())]
+        text += f"; its inputs are {types[0]} as its parameters, images uint8; "
+        text += f"tensors that it creates without a dtype are {types[1]}"
+    elif where == "step 0" and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
         text += "; the first axis of its inputs is that of N episodes; Adapter(filter, batched=False) has none"
     if isinstance(error, KeyError) and message.strip("'") not in task.observations:
         text += f"; the observations are {', '.join(task.observations)}"

@@ -263,6 +263,22 @@ def test_a_filter_of_one_trajectory_without_batched_false_is_told_of_the_axis() 
         trace(external(vehicle.NumpyKalman()), vehicle.drive(7, 10))
 
 
+class Single(vehicle.TorchKalman):
+    """Multiplies by a matrix of the default type."""
+
+    def forward(
+        self, *, observations: dict[str, torch.Tensor], controls: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        controls = controls @ torch.eye(controls.shape[-1])
+        return super().forward(observations=observations, controls=controls)
+
+
+def test_an_error_of_types_names_those_of_inputs_and_new_tensors() -> None:
+    filter_ = external(Single().double(), std=STD)
+    with pytest.raises(BadInput, match=r"float64 as its parameters, images uint8; tensors .* are float32$"):
+        evaluate(filter_, [vehicle.drive(1)])
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_module_on_a_gpu_gets_its_inputs_there() -> None:
     module, episode = vehicle.TorchKalman().cuda(), vehicle.drive(8)
