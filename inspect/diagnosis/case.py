@@ -47,15 +47,19 @@ second: the permutation test cannot distinguish one of six episodes from an unus
 Rows = Sequence[Mapping[str, float]]
 
 
-def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None) -> float:
+def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None, total: int | None = None) -> float:
     """The alarm rate of a diagnosis of ``count`` episodes with a record of ``healthy`` episodes.
 
     A single episode has a p-value of at least 1 / (healthy + 1). Default: ``ALARM_RATE``, or that p-value if it is
     larger. Raises BadInput for a lower rate, and for a record of fewer than ``MIN_HEALTHY`` episodes.
+
+    total: number of episodes in the data of the record, of which the held-out ones are used.
     """
     if healthy < MIN_HEALTHY:
+        part, kind = ("", "") if total in (None, healthy) else (f", the held-out part of {total},", " held-out ones")
         raise BadInput(
-            f"a healthy record of {plural(healthy, 'episode')} is too small; measure it from at least {MIN_HEALTHY}"
+            f"a healthy record of {plural(healthy, 'episode')}{part} is too small; "
+            f"measure it from at least {MIN_HEALTHY}{kind}"
         )
     smallest = 1 / (healthy + 1) if count == 1 else 0.0
     if alarm_rate is not None and alarm_rate < smallest:

@@ -242,7 +242,7 @@ def _profile(checkpoint: Checkpoint, options: Options, diagnosed: Collection[Epi
         return required_profile(checkpoint)
     with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
         indices = data.held_out()
-        checked_alarm_rate(len(indices), len(diagnosed), options.alarm_rate)
+        checked_alarm_rate(len(indices), len(diagnosed), options.alarm_rate, len(data))
         advance(0.0)
         episodes = [data[index] for index in indices]
         if warning := overlap_warning(episodes, () if options.faults else diagnosed):
