@@ -111,13 +111,13 @@ class Inputs:
         used: set[Path] = set()
         hashes: dict[str, Path] = {}
         tasks: set[str] = set()
-        problems: list[str] = []
+        problems: list[tuple[Path, str]] = []
         for path in self.checkpoints:
             try:
                 provenance_of(path)
                 _filter(path, self.data[0] if self.data else None)
             except BadInput as error:
-                problems.append(str(error))
+                problems.append((path, str(error)))
                 continue
             for data_path in self.data or (sample_path(_filter(path).task),):
                 checkpoint = _filter(path, data_path)
@@ -144,16 +144,26 @@ class Inputs:
         return list(dict.fromkeys(cells))
 
 
-def _report_unusable(problems: list[str], count: int, skip: Callable[[str], None] | None) -> None:
-    """Call ``skip`` with each problem of ``count`` checkpoints; raise BadInput without it, or if none is usable."""
+def _report_unusable(problems: list[tuple[Path, str]], count: int, skip: Callable[[str], None] | None) -> None:
+    """Call ``skip`` with the problems of ``count`` checkpoints; raise BadInput without it, or if none is usable.
+
+    A problem of several checkpoints is stated once, with the names of the others.
+    """
+    groups: dict[str, list[tuple[Path, str]]] = {}
+    for path, problem in problems:
+        groups.setdefault(problem.replace(path.name, ""), []).append((path, problem))
+    texts = []
+    for (_, problem), *others in groups.values():
+        names = ", ".join(path.name for path, _ in others)
+        texts.append(f"{problem} (the same: {names})" if others else problem)
     if problems and (skip is None or len(problems) == count):
         if len(problems) == 1:
-            raise BadInput(problems[0])
+            raise BadInput(texts[0])
         advice = "; --skip-bad leaves them out" if len(problems) < count else ""
-        raise BadInput(f"{len(problems)} of {count} checkpoints are unusable: {'; '.join(problems)}{advice}")
-    for problem in problems:
+        raise BadInput(f"{len(problems)} of {count} checkpoints are unusable: {'; '.join(texts)}{advice}")
+    for text in texts:
         assert skip is not None
-        skip(problem)
+        skip(text)
 
 
 def provenance_of(path: Path) -> Mapping[str, Any]:

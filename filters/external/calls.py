@@ -104,7 +104,9 @@ def described(error: Exception, where: str, adapter: Adapter, task: Task) -> str
         types = [str(dtype).removeprefix("torch.") for dtype in (dtype_of(adapter.module), torch.get_default_dtype())]
         text += f"; its inputs are {types[0]} as its parameters, images uint8; "
         text += f"tensors that it creates without a dtype are {types[1]}"
-    elif where == "step 0" and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError):
+    elif (
+        where == "step 0" and adapter.batched and isinstance(error, IndexError | TypeError | ValueError | RuntimeError)
+    ):
         text += "; the first axis of its inputs is that of N episodes; Adapter(filter, batched=False) has none"
     if isinstance(error, KeyError) and message.strip("'") not in task.observations:
         text += f"; the observations are {', '.join(task.observations)}"

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from textwrap import shorten
 
 import torch
 from safetensors import SafetensorError
@@ -37,8 +38,11 @@ def load_weights(module: object, path: Path, place: str) -> None:
     except (OSError, SafetensorError) as error:
         raise BadInput(f"weights {str(path)!r} cannot be read: {reason_unreadable(path, error)}") from None
     except RuntimeError as error:
-        reason = " ".join(str(error).split())
-        raise BadInput(f"weights {str(path)!r} do not fit {place}: {reason:.200}") from None
+        lines = str(error).splitlines() or ["no message"]
+        reasons = lines[1:] or lines  # after a heading
+        reason = shorten(reasons[0].strip().rstrip("."), 200, placeholder=" ...")
+        more = f", and {len(reasons) - 1} more" if len(reasons) > 1 else ""
+        raise BadInput(f"weights {str(path)!r} do not fit {place}: {reason}{more}") from None
 
 
 @lru_cache(maxsize=16)

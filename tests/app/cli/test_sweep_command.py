@@ -102,6 +102,9 @@ def test_weights_of_an_external_filter_are_a_pattern(
     assert path == f"{tmp_path}/own.py:Own@{tmp_path}/runs/0.safetensors"
     code, _, error = run("sweep", "--checkpoints", "own.py:Own@other/*.safetensors", "-o", "sweep")
     assert (code, "no checkpoint (.safetensors) matches 'other/*.safetensors'" in error) == (2, True)
-    save_file({"other": np.zeros(2, np.float32)}, "runs/bad.safetensors")
+    for name in ("bad", "worse"):
+        save_file({"other": np.zeros(2, np.float32)}, f"runs/{name}.safetensors")
     code, _, error = run(*sweep, "-o", "sweep", "--skip-bad")
     assert (code, error.count("skipped: ")) == (0, 1)
+    reason = 'Missing key(s) in state_dict: "bias", and 1 more (the same: worse.safetensors)'
+    assert reason in " ".join(error.split())
