@@ -111,9 +111,9 @@ class Metrics:
 
     def _repr_html_(self) -> str:
         """Errors beside those of the baselines, and the measures of consistency, in a notebook."""
-        columns = {FILTER: self, **self.baselines}
-        rows = [[f"RMSE {key}", *(m and m.rmse.get(key) for m in columns.values())] for key in self.rmse]
-        rows += [[label, getattr(self, name), *([None] * len(self.baselines))] for name, label in CONSISTENCY.items()]
+        columns = {FILTER: self, **{name: baseline for name, baseline in self.baselines.items() if baseline}}
+        rows = [[f"RMSE {key}", *(m.rmse.get(key) for m in columns.values())] for key in self.rmse]
+        rows += [[label, getattr(self, name), *[None] * (len(columns) - 1)] for name, label in CONSISTENCY.items()]
         return html_table("", ["measure", *columns], rows)
 
     def _errors(self) -> dict[str, Any]:

@@ -21,19 +21,20 @@ LABELS = {
 def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
     """The metrics of a filter and its baselines, a row for each measure; then those of its modalities, if any.
 
-    Without steps that the errors omit, those from step 0 are the same and have no rows.
+    Baselines that the filter cannot run have no column. Without steps that the errors omit, those from step 0 are the same and have no rows.
 
     metrics: of ``filters.evaluate.Metrics.to_dict``.
     """
-    columns = [metrics, *(baseline or {} for baseline in metrics["baselines"].values())]
+    baselines = {name: baseline for name, baseline in metrics["baselines"].items() if baseline}
+    columns = [metrics, *baselines.values()]
     rows = [
         (f"rmse {name}{label}", *(_number(column.get(key, {}).get(name)) for column in columns))
         for key, label in LABELS.items()
         if key == "rmse" or metrics.get(key) != metrics["rmse"]
         for name in metrics.get(key, {})
     ]
-    rows += [(label, _number(metrics[name]), "", "") for name, label in CONSISTENCY.items()]
-    tables = [Table(title, ("measure", "filter", *metrics["baselines"]), rows, _start_note(metrics))]
+    rows += [(label, _number(metrics[name]), *[""] * len(baselines)) for name, label in CONSISTENCY.items()]
+    tables = [Table(title, ("measure", "filter", *baselines), rows, _start_note(metrics))]
     errors = {
         label.format(name): (metrics[key][name] or {}).get("rmse", {})
         for name in metrics.get("standalone", {})

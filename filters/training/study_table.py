@@ -237,17 +237,17 @@ def headline_keys(rmse: Iterable[str], main: str = "position_cm") -> list[str]:
 
 def _baseline_table(rows: Sequence[Row]) -> str:
     """RMSE from step 0 and of the baselines, for position and angles; empty without any."""
-    lines = []
+    lines, names = [], [name for name in BASELINES if any(row.baselines.get(name) for row in rows)]
     for row in rows:
-        parts = [row.mean, row.from_step_0, *(row.baselines.get(name, {}) for name in BASELINES)]
+        parts = [row.mean, row.from_step_0, *(row.baselines.get(name, {}) for name in names)]
         for key in headline_keys(row.mean, row.main) if row.baselines else ():
             values = ["" if (value := part.get(key)) is None else f"{value:.2f}" for part in parts]
             lines.append(f"| {row.filter} | {row.blackout:.0%} | {label(key)} | {' | '.join(values)} |")
     if not lines:
         return ""
     head = ["\nThe RMSE, the RMSE from step 0 and the baselines, all from the same starts.\n"]
-    head.append(f"| filter | image blackout | quantity | RMSE | from step 0 | {' | '.join(BASELINES)} |")
-    head.append("| --- | ---: | --- |" + " ---: |" * (2 + len(BASELINES)))
+    head.append(f"| filter | image blackout | quantity | RMSE | from step 0 | {' | '.join(names)} |")
+    head.append("| --- | ---: | --- |" + " ---: |" * (2 + len(names)))
     return "\n".join(head + lines) + "\n"
 
 

@@ -45,7 +45,10 @@ def test_a_filter_that_keeps_its_start_is_no_better_than_stay() -> None:
     notes = []
     for filter_ in (Keep(), Gps()):
         metrics = evaluate(external(filter_), episodes, baselines=True)
-        notes.append(accuracy_tables("", metrics.to_dict())[0].note)
+        table = accuracy_tables("", metrics.to_dict())[0]
+        notes.append(table.note)
+        assert table.columns == ("measure", "filter", "stay")  # external filters have no dynamics baseline
+        assert {len(row) for row in table.rows} == {3}
     assert notes[0].startswith(f"No better than stay: rmse {', '.join(metrics.rmse)}. ")
     assert notes[1].startswith("No better than stay: rmse vx_m/s, vy_m/s. ")
     verdicts = [DIAGNOSTICS["errors"]([trace(external(f), episodes[0])]).verdict for f in (Keep(), Gps())]

@@ -24,7 +24,7 @@ def evaluate(
     from step 0, before and after the first contact; NLL, the negative log-likelihood of the truth in nats; NEES/n,
     the normalised estimation error squared per dimension, 1 for a calibrated covariance; 95 % coverage, the fraction of
     steps with the truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its
-    estimate; dynamics is the filter with all observations masked.
+    estimate; dynamics is the filter with all observations masked, which an external filter does not support.
 
     Each modality has two errors: of its update, the fused filter's prior of each step updated with this modality only;
     and standalone, of the same filter and random numbers with the observations of all other modalities masked in every
