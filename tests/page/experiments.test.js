@@ -5,6 +5,7 @@ import {
   cellOf,
   faultKinds,
   faultLevel,
+  repeatsSeed,
   seedGroups,
 } from '../../app/page/tabs/experiment_groups.js';
 import { columnsOf, entryColumns } from '../../app/page/tabs/experiment_columns.js';
@@ -251,11 +252,11 @@ test('seeds, addresses, dates, and texts, ids and times of every checkpoint do n
       run_id: 100 + i,
       started_at: 1764361200.5 + 600 * i,
       train: { wallTime: 612 - i },
-      time_step: 0.1 * i,
+      time_step: 0.1 * (i % 2),
       url: `https://tracker/${i % 2}`,
       env_id: i < 2 ? 'door' : 'push',
       lr: ['1e-3', 3e-4][i % 2],
-      dropout: 0.1 * i,
+      dropout: 0.1 * (i % 3),
       width: 64,
       seeding: i < 2 ? 'grid' : 'random',
     })),
@@ -267,6 +268,67 @@ test('seeds, addresses, dates, and texts, ids and times of every checkpoint do n
   assert.deepEqual(groupEntries(rows, ','), []);
   const twice = [...rows, ...rows.map((row) => ({ ...row, faults: '' }))];
   assert.deepEqual(settingEntries(twice), settingEntries(rows), 'each checkpoint counts once');
+});
+
+/** Two learning rates with three seeds each, and two checkpoints that were modified after the training. */
+const SWEPT = recorded(
+  ...[0, 1, 2, 3, 4, 5].map((i) => ({ lr: i < 3 ? 3e-3 : 1e-3, seed: i % 3, final_loss: -4 - i })),
+  { lr: 3e-3, seed: 0, final_loss: -4, broken: 'gyro' },
+  { lr: 3e-3, seed: 0, final_loss: -4, broken: 'sigma' },
+);
+
+test('an absent entry is a value, and results of the training are no settings', () => {
+  assert.deepEqual(settingEntries(SWEPT), ['lr', 'broken']);
+  const groups = seedGroups(SWEPT, settingEntries(SWEPT));
+  assert.deepEqual(
+    groups.map(({ name, members }) => [name, members.length]),
+    [
+      ['crossmodal-ekf, lr 0.003', 3],
+      ['crossmodal-ekf, lr 0.001', 3],
+      ['crossmodal-ekf, broken gyro, lr 0.003', 1],
+      ['crossmodal-ekf, broken sigma, lr 0.003', 1],
+    ],
+  );
+  assert.ok(!groups.some(repeatsSeed));
+});
+
+test('a group that repeats a seed is marked', () => {
+  const groups = seedGroups(SWEPT, ['lr']);
+  assert.deepEqual(groups.map(repeatsSeed), [true, false]);
+  const columns = columnsOf(SWEPT, true, ['lr'], []);
+  const seeds = columns.find(({ key }) => key === 'seeds');
+  assert.deepEqual(
+    groups.map((row) => seeds?.content(row)),
+    ['5, repeated', '3'],
+  );
+  const unseeded = recorded({ lr: 1 }, { lr: 1 });
+  assert.ok(!seedGroups(unseeded, []).some(repeatsSeed));
+});
+
+test('numbers that hardly repeat are results if there are seeds, else settings', () => {
+  const elbo = (/** @type {object} */ more) =>
+    [1, 2, 3, 4].map((i) => ({ elbo: i / 7, loss_weight: i % 2, ...more, seed: i }));
+  assert.deepEqual(settingEntries(recorded(...elbo({}))), ['loss_weight']);
+  const unseeded = elbo({ acc: 1 }).map(({ seed, ...others }) => ({
+    ...others,
+    valLoss: seed % 2,
+  }));
+  assert.deepEqual(settingEntries(recorded(...unseeded)), ['elbo', 'loss_weight']);
+  assert.deepEqual(settingEntries(recorded({ loss: 'l1' }, { loss: 'l2' }, { loss: 'l2' })), [
+    'loss',
+  ]);
+});
+
+test('groups are named by results of the training only if no setting distinguishes them', () => {
+  const groups = seedGroups(SWEPT.slice(1, 4), ['final_loss', 'lr']);
+  assert.deepEqual(
+    groups.map(({ name }) => name),
+    [
+      'crossmodal-ekf, lr 0.003, final_loss −5',
+      'crossmodal-ekf, lr 0.003, final_loss −6',
+      'crossmodal-ekf, lr 0.001, final_loss −7',
+    ],
+  );
 });
 
 test('a checkpoint without provenance does not make columns of equal entries', () => {
@@ -298,6 +360,8 @@ test('the CSV has the displayed rows and columns with all digits', () => {
   assert.ok(lines[1].startsWith(`${rows[0].name},0.123456789,`));
   assert.ok(lines[1].includes(`,${1 / 3},`));
   assert.ok(lines[1].endsWith(',"a, ""b"""'));
+  const [, last] = tableCsv(rows.slice(2), columns).split('\n');
+  assert.ok(last.endsWith(','), 'an absent entry is empty');
 });
 
 test('the CSV of means has their standard deviations', () => {
@@ -306,7 +370,7 @@ test('the CSV of means has their standard deviations', () => {
   const columns = columnsOf(rows, true, [], []);
   const [head, line] = tableCsv(seedGroups(rows, []), columns).split('\n');
   assert.ok(head.includes('"RMSE, cm","RMSE, cm, standard deviation"'));
-  assert.ok(line.includes(`,2,1.5,${Math.SQRT1_2},`));
+  assert.ok(line.includes(`,2,1.5,${Math.SQRT1_2},`), 'the number of checkpoints has no mark');
   assert.ok(!line.includes('±'));
 });
 

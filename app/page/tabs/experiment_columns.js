@@ -6,6 +6,7 @@
 /** @typedef {{columns: Column[], entries: string[], count: number, grouping: string[], pinned: string[]}} TableLayout */
 
 import { displayName } from '../core/units.js';
+import { repeatsSeed } from './experiment_groups.js';
 import { groupEntries, namesIn } from './experiment_group_menu.js';
 import { differingEntries, entryText, isNumeric } from './experiment_provenance.js';
 import { faultsText, NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
@@ -14,9 +15,10 @@ import { faultsText, NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js'
 const SEEDS = {
   key: 'seeds',
   title: 'seeds',
-  help: 'Number of checkpoints; their standard deviation is behind ±',
+  help: 'Number of checkpoints; their standard deviation is behind ±. Repeated: several have the same seed, so that they differ in something else',
   number: true,
-  content: (row) => String('members' in row ? row.members.length : 1),
+  content: (row) =>
+    `${'members' in row ? row.members.length : 1}${repeatsSeed(row) ? ', repeated' : ''}`,
 };
 /** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow | SeedGroup) => string}} Column */
 

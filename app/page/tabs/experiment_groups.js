@@ -3,7 +3,7 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { NumberKey } from './experiment_rows.js' */
 
-import { entryText, numberIn, provenanceOf } from './experiment_provenance.js';
+import { entryText, isResult, isSeed, numberIn, provenanceOf } from './experiment_provenance.js';
 import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
 
 /**
@@ -46,6 +46,23 @@ export function seedGroups(rows, entries) {
     const name = names.get(settings.get(first) ?? '') ?? first.filter;
     return { ...first, .../** @type {ExperimentRow} */ (means), name, spread, members };
   });
+}
+
+/**
+ * Whether several checkpoints of a group have the same seed, so that they differ in something else.
+ * @param {ExperimentRow | SeedGroup} row
+ */
+export function repeatsSeed(row) {
+  const seeds = 'members' in row ? row.members.map(seedOf).filter(Boolean) : [];
+  return new Set(seeds).size < seeds.length;
+}
+
+/** Seeds of the training, as text; empty without any. @param {ExperimentRow} row */
+function seedOf(row) {
+  const { finetuned, plan } = entriesOf(row.training);
+  const recorded = Object.entries(provenanceOf(row)).filter(([name]) => isSeed(name));
+  const seeds = [...recorded.sort(), finetuned?.seed, plan?.seed].filter((seed) => seed != null);
+  return seeds.length ? JSON.stringify(seeds) : '';
 }
 
 /** Identifies a displayed row: a checkpoint, or a group by its first one. @param {ExperimentRow | SeedGroup} row */
@@ -132,7 +149,8 @@ const LONGEST_VALUE = 24; // characters of a setting in the name of a group
 const FINE_TUNING = 'fine-tuning';
 
 /**
- * Keys of settings that distinguish the groups; each divides them into as many parts as possible.
+ * Keys of settings that distinguish the groups; each divides them into as many parts as possible. Results of the
+ * training are the last resort.
  * @param {Map<string, unknown>[]} groups
  */
 function distinguishing(groups) {
@@ -141,9 +159,13 @@ function distinguishing(groups) {
   const keys = [];
   const parts = (/** @type {string[]} */ names) =>
     new Set(groups.map((settings) => JSON.stringify(names.map((name) => settings.get(name))))).size;
-  while (keys.length < MOST_LABELS && parts(keys) < groups.length) {
-    const counts = all.map((key) => parts([...keys, key]));
-    keys.push(all[counts.indexOf(Math.max(...counts))]);
+  for (let count = parts(keys); keys.length < MOST_LABELS && count < groups.length;) {
+    const options = all
+      .map((key) => ({ key, count: parts([...keys, key]), isLast: Number(isResult(key)) }))
+      .filter((option) => option.count > count)
+      .sort((a, b) => a.isLast - b.isLast || b.count - a.count);
+    keys.push(options[0].key);
+    count = options[0].count;
   }
   return keys;
 }

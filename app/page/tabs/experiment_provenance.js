@@ -10,6 +10,10 @@ const DATE = /^\d{4}-\d{2}-\d{2}(?:[T _]|$)/;
 /** Last words of the names of times: `wall_time` and `createdAt`, but not `time_step`. */
 const TIMES = ['time', 'timestamp', 'duration', 'seconds', 'runtime', 'at'];
 
+/** Words in the names of results of the training, such as `final_loss`; a `loss_weight` is a setting. */
+const RESULTS = ['loss', 'losses', 'metric', 'metrics', 'rmse', 'accuracy', 'score'];
+const DISTINCT = 0.8; // number of different values over that of checkpoints, above which each has its own
+
 /** @type {WeakMap<ExperimentRow, Record<string, Entry>>} */
 const parsed = new WeakMap();
 
@@ -68,23 +72,36 @@ export const differingEntries = (rows) =>
 
 /**
  * Names of the entries that distinguish settings of the training rather than its runs. All differing ones but seeds,
- * addresses, dates, and texts, numeric ids and times that differ for every checkpoint.
+ * addresses, dates, results, and texts, numeric ids and times that differ for nearly every checkpoint. An absent entry
+ * is a value.
  * @param {ExperimentRow[]} rows
  */
 export function settingEntries(rows) {
-  return [...entryValues(rows)]
+  const all = [...entryValues(rows)].filter(([, values]) => new Set(values).size > 1);
+  const haveSeeds = all.some(([name]) => isSeed(name));
+  return all
     .filter(([name, values]) => {
+      if (isSeed(name)) return false;
       const entries = values.filter((value) => value !== null);
-      if (new Set(values).size < 2 || hasWord(name, 'seed')) return false;
       if (entries.every(isAddress) || entries.every((value) => DATE.test(String(value))))
         return false;
-      // A number that always differs can be a setting that was drawn at random, such as a learning rate.
-      const isNamedRun = hasWord(name, 'id') || TIMES.includes(wordsOf(name).at(-1) ?? '');
-      const isRun = isNamedRun || entries.some((value) => numberIn(value) === null);
-      return !isRun || new Set(entries).size < entries.length || entries.length < 2;
+      const areNumbers = entries.every((value) => numberIn(value) !== null);
+      const isDistinct = new Set(entries).size > DISTINCT * values.length;
+      if (!areNumbers || hasWord(name, 'id') || TIMES.includes(wordsOf(name).at(-1) ?? ''))
+        return !isDistinct;
+      // Seeds repeat settings: numbers that hardly repeat are results. Without seeds, they can be settings that were
+      // drawn at random, such as a learning rate.
+      return !isResult(name) && !(haveSeeds && isDistinct);
     })
     .map(([name]) => name);
 }
+
+/** Whether a name is that of a seed. @param {string} name */
+export const isSeed = (name) => hasWord(name, 'seed');
+
+/** Whether a name is that of a result of the training. @param {string} name */
+export const isResult = (name) =>
+  RESULTS.some((word) => hasWord(name, word)) && !hasWord(name, 'weight');
 
 /**
  * Whether a name has a word: `random_seed`, `trainSeed` and `data.seed` have the word seed.
