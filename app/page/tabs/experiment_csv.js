@@ -5,7 +5,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { csv } from '../core/download.js';
-import { NUMBERS, valueOf } from './experiment_rows.js';
+import { faultsText, NUMBERS, valueOf } from './experiment_rows.js';
 
 /** @typedef {{title: string, value: (row: ExperimentRow | SeedGroup) => unknown}} Field */
 
@@ -28,11 +28,11 @@ export function tableCsv(rows, columns) {
  * @param {Column} column
  * @returns {Field[]}
  */
-function fieldsOf(rows, { key, title, number, content }) {
-  const isContent = !number || key === 'seeds';
-  const field = {
-    title,
-    value: isContent ? content : (/** @type {ExperimentRow} */ row) => valueOf(row, key),
+function fieldsOf(rows, { key, title }) {
+  /** @param {ExperimentRow | SeedGroup} row */
+  const value = (row) => {
+    if (key === 'seeds') return 'members' in row ? row.members.length : 1;
+    return key === 'faults' ? faultsText(row.faults) : valueOf(row, key);
   };
   /** @param {ExperimentRow | SeedGroup} row */
   const spread = (row) =>
@@ -40,5 +40,8 @@ function fieldsOf(rows, { key, title, number, content }) {
       ? row.spread[/** @type {keyof typeof NUMBERS} */ (key)]
       : undefined;
   const hasSpread = rows.some((row) => spread(row) !== undefined);
-  return [field, ...(hasSpread ? [{ title: `${title}, standard deviation`, value: spread }] : [])];
+  return [
+    { title, value },
+    ...(hasSpread ? [{ title: `${title}, standard deviation`, value: spread }] : []),
+  ];
 }
