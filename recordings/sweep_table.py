@@ -177,6 +177,7 @@ OVERVIEW = {
     "error": "sqrt(sum(r.steps * r.error ** 2) / sum(r.steps))",
     "unit": "any_value(r.unit)",
     "nees": "sum(r.steps * r.nees) / sum(r.steps)",
+    "nll": "sum(r.steps * r.nll) / sum(r.steps)",
     "coverage95": "sum(r.steps * r.coverage95) / sum(r.steps)",
     "worst": "max(r.worst)",
     "worst_episode": "arg_max(r.episode, r.worst)",
@@ -188,7 +189,10 @@ OVERVIEW = {
     "c.training->'blackouts', 'faults', c.training->'faults', 'finetuned', c.training->'base'->'settings'))",
     "provenance": "any_value(c.provenance)",
 }
-"""Column of the overview -> its expression."""
+"""Column of the overview -> its expression; those of the components of the states follow ``unit``."""
+
+MEASURES = frozenset({"error", "worst", "worst_time", "nees", "nll", "coverage95", "ess"})
+"""Columns of the results with numbers of each step that are no errors of components."""
 
 DOCUMENTS = ["training", "provenance"]
 """Columns of the overview with JSON documents, which a table for reading leaves out."""
@@ -205,13 +209,6 @@ KEYS = {
 
 ASCENDING = ("name", "filter", "task", "faults", "unit", "coverage95")
 """Columns of the overview that are sorted in ascending order: texts, and one whose low values are bad."""
-
-_OVERVIEW_QUERY = (
-    f"SELECT {', '.join(f'{expression} AS {name}' for name, expression in OVERVIEW.items())} "
-    f"FROM {RESULTS} r JOIN {CHECKPOINTS} c USING (checkpoint) "
-    "WHERE r.phase = ? GROUP BY r.checkpoint, r.data, r.faults"
-)
-
 
 def as_csv(rows: pa.Table) -> bytes:
     """A table as CSV with a header."""
@@ -319,13 +316,31 @@ class Experiments:
     def overview(self, phase: str = "all", sort: str = "error") -> pa.Table:
         """Results of each checkpoint, data set and faults in a phase, the worst values of the column ``sort`` first.
 
-        Errors are pooled over steps: ``sqrt(sum(steps error^2) / sum(steps))``; NEES and coverage are averages over
-        steps. Raises BadInput for an unknown column.
+        Errors, also of the components of the states, are pooled over steps: ``sqrt(sum(steps error^2) / sum(steps))``;
+        NEES, NLL and coverage are averages over steps. Raises BadInput for an unknown column.
         """
-        check_name("column of the overview", sort, OVERVIEW)
+        columns: dict[str, str] = {}
+        for name, expression in OVERVIEW.items():
+            columns[name] = expression
+            if name == "unit":
+                columns |= {
+                    key: f"sqrt(sum(r.steps * r.{_quoted(key)} ** 2) / sum(r.steps))" for key in self.components()
+                }
+        check_name("column of the overview", sort, columns)
         direction = "ASC" if sort in ASCENDING else "DESC"
-        order = f"{sort} {direction} NULLS LAST, name, checkpoint, data, faults"
-        return self.query(f"{_OVERVIEW_QUERY} ORDER BY {order}", [phase])
+        return self.query(
+            f"SELECT {', '.join(f'{expression} AS {_quoted(name)}' for name, expression in columns.items())} "
+            f"FROM {RESULTS} r JOIN {CHECKPOINTS} c USING (checkpoint) "
+            "WHERE r.phase = ? GROUP BY r.checkpoint, r.data, r.faults "
+            f"ORDER BY {_quoted(sort)} {direction} NULLS LAST, name, checkpoint, data, faults",
+            [phase],
+        )
+
+    def components(self) -> list[str]:
+        """Columns of the results with the errors of components of the states, such as ``hinge_x_cm``."""
+        columns = self._database.table(RESULTS).columns
+        other = TEXTS | INTEGERS | MEASURES
+        return [name for name in columns if name not in other and not name.startswith(("beta_", "weight_"))]
 
     def phases(self) -> list[str]:
         """Names of the phases of all results."""
@@ -381,7 +396,12 @@ class Experiments:
         return path
 
 
+def _quoted(column: str) -> str:
+    return '"' + column.replace('"', '""') + '"'
+
+
 def labelled(overview: pa.Table) -> pa.Table:
-    """The overview as a table for reading: without JSON documents, and NEES over n labelled as such."""
+    """The overview as a table for reading: without JSON documents, and with NEES/n and NLL in their usual spelling."""
     rows = overview.drop_columns(DOCUMENTS)
-    return rows.rename_columns(["NEES/n" if name == "nees" else name for name in rows.column_names])
+    titles = {"nees": "NEES/n", "nll": "NLL"}
+    return rows.rename_columns([titles.get(name, name) for name in rows.column_names])

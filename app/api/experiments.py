@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI
 from fastapi.responses import Response
@@ -46,8 +46,9 @@ class ExperimentRow(Reply):
     """Results of a checkpoint over a data set in one phase.
 
     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. data_file: name of
-    the file or folder of the data. error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s
-    since the first step of the episode; None without timestamps. training: JSON of the hash of its data, plan,
+    the file or folder of the data. error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``. components: RMSE
+    of the components of the state, by name with the unit, such as ``angle_deg``. nll: nats, m, rad. worst_time: s since
+    the first step of the episode; None without timestamps. training: JSON of the hash of its data, plan,
     blackouts, faults and the settings of a fine-tuning run. provenance: JSON of the file beside the checkpoint.
     """
 
@@ -59,7 +60,9 @@ class ExperimentRow(Reply):
     steps: int
     error: Number
     unit: str
+    components: dict[str, Number]
     nees: Number
+    nll: Number
     coverage95: Number
     worst: Number
     worst_episode: int | None
@@ -135,11 +138,18 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
         rows = experiments.overview(phase)
         files = {row["data"]: Path(row["path"]).name for row in experiments.query("FROM datasets").to_pylist()}
         names = catalog_names(store)
+        components = experiments.components()
+
+        def fields(row: dict[str, Any]) -> dict[str, Any]:
+            """Fields of a row; the components that its task lacks are null."""
+            errors = {name: row.pop(name) for name in components}
+            return as_json(row | {"components": {name: error for name, error in errors.items() if error is not None}})
+
         tasks = set(rows["task"].to_pylist()) & set(store.tasks())
         data = {data.hash: name for task in tasks for name, data in store.datasets(task).items()}
         sent = [
             ExperimentRow(
-                **as_json(row) | {"provenance": standard_json(row["provenance"])},
+                **fields(row) | {"provenance": standard_json(row["provenance"])},
                 catalog_name=names.get((row["task"], row["checkpoint"])),
                 data_name=data.get(row["data"]),
                 data_file=files[row["data"]],

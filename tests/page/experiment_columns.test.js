@@ -9,6 +9,7 @@ const ROWS = [0.001, 0.01].map(
       name: `run-${i}`,
       filter: 'crossmodal-ekf',
       unit: 'cm',
+      components: {},
       training: '{}',
       checkpoint: String(i).repeat(64),
       provenance: JSON.stringify({ lr, width: 32 * i }),

@@ -22,6 +22,7 @@ import {
 import {
   comparedWith,
   numberOf,
+  numbersOf,
   parseSort,
   rowKey,
   sortText,
@@ -354,7 +355,7 @@ test('the CSV has the displayed rows and columns with all digits', () => {
   const lines = tableCsv(rows.slice(0, 2), columns).split('\n');
   assert.equal(
     lines[0],
-    'checkpoint,lr,"RMSE, cm",NEES/n,95 % coverage,"worst, cm",episodes,steps,note',
+    'checkpoint,lr,"RMSE, cm","hinge x, cm","hinge y, cm","angle, °",NEES/n,NLL,95 % coverage,"worst, cm",episodes,steps,note',
   );
   assert.equal(lines.length, 2 + 2); // with the title and the end
   assert.ok(lines[1].startsWith(`${rows[0].name},0.123456789,`));
@@ -362,6 +363,36 @@ test('the CSV has the displayed rows and columns with all digits', () => {
   assert.ok(lines[1].endsWith(',"a, ""b"""'));
   const [, last] = tableCsv(rows.slice(2), columns).split('\n');
   assert.ok(last.endsWith(','), 'an absent entry is empty');
+});
+
+test('errors of components are columns of the table, of conditions and of means', () => {
+  const rows = rowsOf(
+    { components: { angle_deg: 64, 'speed_m/s': 0.5, hinge_x_cm: 2, slip: 1 } },
+    { components: { angle_deg: 2, 'speed_m/s': 0.1, hinge_x_cm: 2, slip: 1 }, nll: 1 },
+  );
+  const numbers = numbersOf(rows);
+  assert.deepEqual(
+    Object.entries(numbers)
+      .map(([key, { title }]) => [key, title])
+      .slice(0, 6),
+    [
+      ['error', 'RMSE'],
+      ['angle_deg', 'angle, °'],
+      ['speed_m/s', 'speed, m/s'],
+      ['hinge_x_cm', 'hinge x, cm'],
+      ['slip', 'slip'],
+      ['nees', 'NEES/n'],
+    ],
+  );
+  const count = (/** @type {string} */ text) => matching(rows, text).rows.length;
+  for (const text of ['angle > 20', 'angle_deg>20', '"angle, °" > 20', 'speed>0.2', 'NLL<0'])
+    assert.equal(count(text), 1, text);
+  assert.equal(count('hinge_x = 2'), 2);
+  assert.equal(numberOf(rows[0], 'angle_deg'), 64);
+  const [group] = seedGroups(rows, []);
+  assert.deepEqual([group.components.angle_deg, group.nll], [33, -1.125]);
+  const column = columnsOf(rows, true, [], []).find(({ key }) => key === 'angle_deg');
+  assert.equal(column?.content(group), '33.00 ± 43.84');
 });
 
 test('the CSV of means has their standard deviations', () => {

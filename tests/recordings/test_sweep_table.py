@@ -80,12 +80,10 @@ def test_pooled_results_equal_the_evaluation(inputs: Inputs, sweep: Path) -> Non
     training = json.loads(row["training"])
     assert training["blackouts"] == [0.0, 0.4, 0.8]
     assert (len(training["data"]), training["finetuned"]) == (64, None)
-    components = Experiments([sweep]).query(
-        "SELECT sqrt(sum(steps * angle_deg ** 2) / sum(steps)) AS angle FROM results "
-        "WHERE phase = 'all' AND faults = '' AND checkpoint = ?",
-        [row["checkpoint"]],
-    )
-    assert components["angle"][0].as_py() == pytest.approx(expected.rmse["angle_deg"], rel=1e-4)
+    assert Experiments([sweep]).components() == ["hinge_x_cm", "hinge_y_cm", "angle_deg"]
+    for key in ("hinge_x_cm", "angle_deg"):
+        assert row[key] == pytest.approx(expected.rmse[key], rel=1e-4)
+    assert row["nll"] == pytest.approx(expected.nll, rel=1e-3)
 
 
 def test_faults_after_all_steps_are_refused(inputs: Inputs) -> None:

@@ -17,13 +17,14 @@ def experiments(
 ) -> console.Result:
     """Query the results of sweeps.
 
-    Without --sql, compares the checkpoints: pooled RMSE of the position, NEES/n, coverage and the worst step, by
-    checkpoint and faults, for the steps of one phase. docs/sweep.md lists the columns and ten queries.
+    Without --sql, compares the checkpoints: pooled RMSE of the position and of each component, NEES/n, NLL, coverage and
+    the worst step, by checkpoint and faults, for the steps of one phase. docs/sweep.md lists the columns and ten queries.
 
     \b
     Examples:
       beliefscope experiments sweep --phase contact
       beliefscope experiments sweep --sort nees --top 5 --json -
+      beliefscope experiments sweep --sort heading_deg
       beliefscope experiments sweep --sql "SELECT phase, avg(coverage95) FROM results GROUP BY phase"
       beliefscope experiments sweep-a sweep-b -o all.csv
     """

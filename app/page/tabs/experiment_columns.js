@@ -9,7 +9,7 @@ import { displayName } from '../core/units.js';
 import { repeatsSeed } from './experiment_groups.js';
 import { groupEntries, namesIn } from './experiment_group_menu.js';
 import { differingEntries, entryText, isNumeric } from './experiment_provenance.js';
-import { faultsText, NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
+import { faultsText, numberOf, numbersOf, valueOf } from './experiment_rows.js';
 
 /** @type {Column} */
 const SEEDS = {
@@ -67,19 +67,17 @@ export function columnsOf(rows, areGroups, entries, pinned) {
       content: (/** @type {ExperimentRow} */ row) => faultsText(row[key]),
     })),
     ...(areGroups ? [SEEDS] : []),
-    ...NUMBER_KEYS.map((key) => ({ key, ...NUMBERS[key] })).map(
-      ({ key, title, help, hasUnit, format }) => ({
-        key,
-        title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
-        help,
-        number: true,
-        content: (/** @type {ExperimentRow | SeedGroup} */ row) => {
-          const spread = 'spread' in row ? row.spread[key] : undefined;
-          const more = spread === undefined ? '' : ` ± ${format(spread)}`;
-          return `${format(row[key])}${more}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`;
-        },
-      }),
-    ),
+    ...Object.entries(numbersOf(rows)).map(([key, { title, help, hasUnit, format }]) => ({
+      key,
+      title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
+      help,
+      number: true,
+      content: (/** @type {ExperimentRow | SeedGroup} */ row) => {
+        const spread = 'spread' in row ? row.spread[key] : undefined;
+        const more = spread === undefined ? '' : ` ± ${format(spread)}`;
+        return `${format(numberOf(row, key))}${more}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`;
+      },
+    })),
     ...entries.map((name) => ({
       key: name,
       title: name,

@@ -5,7 +5,7 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { csv } from '../core/download.js';
-import { faultsText, NUMBERS, valueOf } from './experiment_rows.js';
+import { faultsText, valueOf } from './experiment_rows.js';
 
 /** @typedef {{title: string, value: (row: ExperimentRow | SeedGroup) => unknown}} Field */
 
@@ -35,10 +35,7 @@ function fieldsOf(rows, { key, title }) {
     return key === 'faults' ? faultsText(row.faults) : valueOf(row, key);
   };
   /** @param {ExperimentRow | SeedGroup} row */
-  const spread = (row) =>
-    'spread' in row && key in NUMBERS
-      ? row.spread[/** @type {keyof typeof NUMBERS} */ (key)]
-      : undefined;
+  const spread = (row) => ('spread' in row ? row.spread[key] : undefined);
   const hasSpread = rows.some((row) => spread(row) !== undefined);
   return [
     { title, value },

@@ -3,7 +3,7 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 
 import { entryNames, numberIn, provenanceOf } from './experiment_provenance.js';
-import { faultsText, NUMBER_KEYS, NUMBERS, valueOf } from './experiment_rows.js';
+import { faultsText, numbersOf, valueOf } from './experiment_rows.js';
 
 /** @typedef {(row: ExperimentRow) => boolean} Test */
 
@@ -118,9 +118,10 @@ function columnKey(rows, name) {
   const units = [...new Set(rows.map(({ unit }) => unit))];
   const entries = entryNames(rows);
   if (entries.includes(name)) return name;
-  const numbers = NUMBER_KEYS.map((key) => {
-    const { title } = NUMBERS[key];
-    return { key, names: [key, title, ...units.map((unit) => `${title}, ${unit}`)] };
+  const numbers = Object.entries(numbersOf(rows)).map(([key, { title }]) => {
+    const name = title.replace(/, .*/, ''); // without the unit
+    const others = [name, name.replaceAll(' ', '_')];
+    return { key, names: [key, title, ...others, ...units.map((unit) => `${title}, ${unit}`)] };
   });
   const others = [...TEXT_KEYS, ...entries].map((key) => ({ key, names: [key] }));
   const columns = [...numbers, { key: 'name', names: ['checkpoint'] }, ...others];
@@ -135,7 +136,7 @@ const TEXT_KEYS = /** @type {const} */ (['name', 'filter', 'task', 'faults']);
  * @param {string} name
  */
 function columnList(rows, name) {
-  const all = [...NUMBER_KEYS, ...TEXT_KEYS, ...entryNames(rows)];
+  const all = [...Object.keys(numbersOf(rows)), ...TEXT_KEYS, ...entryNames(rows)];
   const similar = all.filter((column) => normal(column).includes(normal(name)));
   const names = [...new Set([...similar, ...all])];
   const listed = names.slice(0, LISTED).map((name) => (/[\s<>=!]/.test(name) ? `"${name}"` : name));

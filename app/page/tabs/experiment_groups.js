@@ -1,18 +1,16 @@
 /** Groups of the rows of a sweep: mean and spread over training seeds, and the level of their sensor faults. */
 
 /** @import { ExperimentRow } from '../types/server.js' */
-/** @import { NumberKey } from './experiment_rows.js' */
 
 import { entryText, isResult, isSeed, numberIn, provenanceOf } from './experiment_provenance.js';
-import { NUMBER_KEYS, rowKey } from './experiment_rows.js';
+import { numberOf, numbersOf, rowKey } from './experiment_rows.js';
 
 /**
  * A row for several checkpoints: its numbers are means over them.
- * @typedef {ExperimentRow & {members: ExperimentRow[], spread: Partial<Record<NumberKey, number>>}} SeedGroup
+ * @typedef {ExperimentRow & {members: ExperimentRow[], spread: Record<string, number>}} SeedGroup
  */
 
-/** The numbers whose spread over seeds is displayed. @type {NumberKey[]} */
-const SPREAD_KEYS = ['error', 'nees', 'coverage95', 'worst'];
+const COUNTS = ['episodes', 'steps']; // numbers without a spread over seeds
 
 /**
  * Joins the checkpoints with equal filter, training and values of the named entries of the provenance.
@@ -30,21 +28,26 @@ export function seedGroups(rows, entries) {
     if (!groups.get(key)?.push(row)) groups.set(key, [row]);
   }
   const names = namesOf([...settings.values()]);
+  const numbers = Object.keys(numbersOf(rows));
   return [...groups.values()].map((unsorted) => {
     // The first checkpoint identifies the group, whatever the order of the rows.
     const members = unsorted.sort((a, b) => a.checkpoint.localeCompare(b.checkpoint));
     const [first] = members;
-    /** @type {Partial<Record<NumberKey, number | null>>} */
+    /** @type {Record<string, number | null>} */
     const means = {};
-    /** @type {Partial<Record<NumberKey, number>>} */
+    /** @type {Record<string, number>} */
     const spread = {};
-    for (const key of NUMBER_KEYS) {
+    for (const key of numbers) {
       const moments = meanAndSpread(members, key);
       means[key] = moments.mean;
-      if (SPREAD_KEYS.includes(key) && members.length > 1) spread[key] = moments.spread;
+      if (!COUNTS.includes(key) && members.length > 1) spread[key] = moments.spread;
     }
+    const components = Object.fromEntries(
+      Object.keys(first.components).map((key) => [key, means[key]]),
+    );
     const name = names.get(settings.get(first) ?? '') ?? first.filter;
-    return { ...first, .../** @type {ExperimentRow} */ (means), name, spread, members };
+    const row = /** @type {ExperimentRow} */ ({ ...first, ...means, components });
+    return { ...row, name, spread, members };
   });
 }
 
@@ -183,10 +186,10 @@ function labelOf(key, value) {
 /**
  * Mean and sample standard deviation of the known values; null without any, spread 0 of a single one.
  * @param {ExperimentRow[]} rows
- * @param {NumberKey} key
+ * @param {string} key of a number
  */
 function meanAndSpread(rows, key) {
-  const values = rows.map((row) => row[key]).filter((value) => value !== null);
+  const values = rows.map((row) => numberOf(row, key)).filter((value) => value !== null);
   if (!values.length) return { mean: null, spread: 0 };
   const mean = values.reduce((sum, value) => sum + value, 0) / values.length;
   const squares = values.reduce((sum, value) => sum + (value - mean) ** 2, 0);

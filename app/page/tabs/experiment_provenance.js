@@ -157,7 +157,7 @@ export const isAddress = (value) => typeof value === 'string' && /^https?:\/\//.
 const named = (row, entries) =>
   Object.fromEntries(
     Object.entries(entries).map(([name, value]) => [
-      name in row ? `provenance.${name}` : name,
+      name in row || name in row.components ? `provenance.${name}` : name,
       value,
     ]),
   );

@@ -3,14 +3,13 @@
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
-import { fixed, percent } from '../core/units.js';
+import { displayName, fixed, percent } from '../core/units.js';
 import { numberIn, provenanceOf } from './experiment_provenance.js';
 
-/** @typedef {'error' | 'nees' | 'coverage95' | 'worst' | 'episodes' | 'steps'} NumberKey */
 /** @typedef {{title: string, help: string, hasUnit: boolean, format: (value: number | null) => string}} NumberColumn */
 
-/** Numbers of a row. @type {Record<NumberKey, NumberColumn>} */
-export const NUMBERS = {
+/** Numbers of all rows. @satisfies {Record<string, NumberColumn>} */
+const NUMBERS = {
   error: {
     title: 'RMSE',
     help: 'Root mean square error of the position, or of the first map component, pooled over the steps',
@@ -20,6 +19,12 @@ export const NUMBERS = {
   nees: {
     title: 'NEES/n',
     help: 'Mean normalised estimation error squared per component: 1 if the covariance is consistent',
+    hasUnit: false,
+    format: (value) => fixed(value, 2),
+  },
+  nll: {
+    title: 'NLL',
+    help: 'Mean negative log-likelihood of the true state (nats; m, rad)',
     hasUnit: false,
     format: (value) => fixed(value, 2),
   },
@@ -39,16 +44,45 @@ export const NUMBERS = {
   steps: { title: 'steps', help: 'Number of steps', hasUnit: false, format: String },
 };
 
-export const NUMBER_KEYS = /** @type {NumberKey[]} */ (Object.keys(NUMBERS));
+const UNIT = /_(deg|cm|m)(\/s²?)?$/; // at the end of the key of a component
 
 /**
- * Value of a column: of the row itself or of its provenance.
+ * Numbers of some rows by key: `NUMBERS`, with the RMSE of each component of the state after `error`.
+ * @param {ExperimentRow[]} rows
+ * @returns {Record<string, NumberColumn>}
+ */
+export function numbersOf(rows) {
+  const { error, ...others } = NUMBERS;
+  const keys = [...new Set(rows.flatMap(({ components }) => Object.keys(components)))];
+  return {
+    error,
+    ...Object.fromEntries(keys.map((key) => [key, componentColumn(key)])),
+    ...others,
+  };
+}
+
+/** @param {string} key such as angle_deg @returns {NumberColumn} */
+function componentColumn(key) {
+  const [ending = '', unit = '', rate = ''] = key.match(UNIT) ?? [];
+  const name = displayName(key.slice(0, key.length - ending.length));
+  return {
+    title: unit ? `${name}, ${unit === 'deg' ? '°' : unit}${rate}` : name,
+    help: `Root mean square error of ${name}, pooled over the steps`,
+    hasUnit: false,
+    format: (value) => fixed(value, 2),
+  };
+}
+
+/**
+ * Value of a column: of the row itself, of its components or of its provenance.
  * @param {ExperimentRow} row
  * @param {string} column
  */
 export function valueOf(row, column) {
   const value =
-    column in row ? row[/** @type {keyof ExperimentRow} */ (column)] : provenanceOf(row)[column];
+    column in row
+      ? row[/** @type {keyof ExperimentRow} */ (column)]
+      : (row.components[column] ?? provenanceOf(row)[column]);
   return typeof value === 'boolean' ? String(value) : (value ?? null);
 }
 

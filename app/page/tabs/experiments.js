@@ -20,8 +20,7 @@ import { GroupMenu, namesText } from './experiment_group_menu.js';
 import { cellOf, faultKinds, seedGroups } from './experiment_groups.js';
 import { isNumeric } from './experiment_provenance.js';
 import {
-  NUMBER_KEYS,
-  NUMBERS,
+  numbersOf,
   parseSort,
   rowKey,
   sortText,
@@ -183,7 +182,10 @@ export class Experiments {
       if (load !== this.#loads) return;
       [this.#rows, this.#count] = [rows, count];
       const { entries } = entryColumns(rows, []);
-      this.#numbers = [...NUMBER_KEYS, ...entries.filter((name) => isNumeric(rows, name))];
+      this.#numbers = [
+        ...Object.keys(numbersOf(rows)),
+        ...entries.filter((name) => isNumeric(rows, name)),
+      ];
       setPanelState(this.#host, 'ready');
       this.#fillPickers(sweep);
       this.#draw();
@@ -200,7 +202,9 @@ export class Experiments {
   #fillPickers(sweep) {
     const { state } = this.#store;
     /** @type {Record<string, string>} */
-    const titles = Object.fromEntries(NUMBER_KEYS.map((key) => [key, NUMBERS[key].title]));
+    const titles = Object.fromEntries(
+      Object.entries(numbersOf(this.#rows)).map(([key, { title }]) => [key, title]),
+    );
     const kinds = faultKinds(this.#rows);
     for (const kind of kinds) titles[levelName(kind)] = `level of ${kind}`;
     const fill = (

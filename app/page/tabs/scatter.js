@@ -2,7 +2,6 @@
 
 /** @import { ExperimentRow } from '../types/server.js' */
 /** @import { SeedGroup } from './experiment_groups.js' */
-/** @import { NumberKey } from './experiment_rows.js' */
 
 import { svgElement } from '../core/dom.js';
 import { scaled } from '../core/colours.js';
@@ -10,7 +9,7 @@ import { fixed, niceStep, significant } from '../core/units.js';
 import { colourOf, estimatorOf } from '../widgets/filter_colours.js';
 import { extent, padded } from '../widgets/plots.js';
 import { cellOf, faultLevel } from './experiment_groups.js';
-import { NUMBERS, numberOf } from './experiment_rows.js';
+import { numberOf, numbersOf } from './experiment_rows.js';
 
 const MARGIN = { left: scaled(54), right: scaled(10), top: scaled(8), bottom: scaled(34) }; // px
 const TICKS = 5;
@@ -143,9 +142,10 @@ export function coloured(mark, { filter }, filters) {
  * @param {string} name
  */
 function axis(rows, name) {
-  const exists = name in NUMBERS || rows.some((row) => numberOf(row, name) !== null);
-  const key = /** @type {NumberKey} */ (exists ? name : 'error');
-  const { title, hasUnit } = NUMBERS[key] ?? { title: name, hasUnit: false };
+  const numbers = numbersOf(rows);
+  const exists = name in numbers || rows.some((row) => numberOf(row, name) !== null);
+  const key = exists ? name : 'error';
+  const { title, hasUnit } = numbers[key] ?? { title: name, hasUnit: false };
   const units = [...new Set(rows.map(({ unit }) => unit))];
   return {
     title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,

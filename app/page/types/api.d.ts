@@ -541,8 +541,9 @@ export interface components {
          * @description Results of a checkpoint over a data set in one phase.
          *
          *     checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it. data_file: name of
-         *     the file or folder of the data. error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``. worst_time: s
-         *     since the first step of the episode; None without timestamps. training: JSON of the hash of its data, plan,
+         *     the file or folder of the data. error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``. components: RMSE
+         *     of the components of the state, by name with the unit, such as ``angle_deg``. nll: nats, m, rad. worst_time: s since
+         *     the first step of the episode; None without timestamps. training: JSON of the hash of its data, plan,
          *     blackouts, faults and the settings of a fine-tuning run. provenance: JSON of the file beside the checkpoint.
          */
         ExperimentRow: {
@@ -562,8 +563,14 @@ export interface components {
             error: number | null;
             /** Unit */
             unit: string;
+            /** Components */
+            components: {
+                [key: string]: number | null;
+            };
             /** Nees */
             nees: number | null;
+            /** Nll */
+            nll: number | null;
             /** Coverage95 */
             coverage95: number | null;
             /** Worst */

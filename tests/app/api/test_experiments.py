@@ -49,6 +49,8 @@ def test_results(settings: Settings, sweep: Path, open_client: Callable[..., Tes
         expected = Experiments([sweep]).overview("contact").to_pylist()
         assert answer["count"] == len(expected) == 4
         for row, stored in zip(answer["rows"], expected, strict=True):
+            errors = {key: stored.pop(key) for key in ("hinge_x_cm", "hinge_y_cm", "angle_deg")}
+            assert row["components"] == errors
             assert stored.items() <= row.items()
             assert (row["data_name"], row["data_file"]) == ("own", "own.h5")
             assert row["catalog_name"] == ("image-ekf" if stored["checkpoint"] == info_hash("image-ekf") else None)
