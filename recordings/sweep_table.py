@@ -210,6 +210,7 @@ KEYS = {
 ASCENDING = ("name", "filter", "task", "faults", "unit", "coverage95")
 """Columns of the overview that are sorted in ascending order: texts, and one whose low values are bad."""
 
+
 def as_csv(rows: pa.Table) -> bytes:
     """A table as CSV with a header."""
     data = io.BytesIO()

@@ -97,12 +97,27 @@ class CheckpointComparison(Diagnostic):
     modules: tuple[ModuleChange, ...]
 
     def improvements(self) -> list[Difference]:
-        """Improved measures, largest effect first: errors, then belief measures."""
-        return sorted((d for d in self.differences if d.improved), key=lambda d: (not d.is_error, d.effect))
+        """Improved measures: of clean data, with faults, of single modalities; errors first, then largest effects."""
+        return self._ranked((d for d in self.differences if d.improved), -1.0)
 
     def regressions(self) -> list[Difference]:
-        """Regressed measures, largest effect first: errors, then belief measures."""
-        return sorted((d for d in self.differences if d.regressed), key=lambda d: (not d.is_error, -d.effect))
+        """Regressed measures in the same order."""
+        return self._ranked((d for d in self.differences if d.regressed), 1.0)
+
+    def regressed_slices(self) -> list[str]:
+        """Slices of all modalities with a regressed measure: clean data, then faults."""
+        partial = {size.slice.name for size in self.slices if size.slice.only}
+        return list(dict.fromkeys(d.slice for d in self.regressions() if d.slice not in partial))
+
+    def _ranked(self, changes: Iterable[Difference], sign: float) -> list[Difference]:
+        slices = {size.slice.name: size.slice for size in self.slices}
+
+        def rank(d: Difference) -> tuple[bool | float, ...]:
+            slice_ = slices[d.slice]
+            kind = bool(slice_.only), bool(slice_.faults), slice_.contact is not None
+            return (*kind, not d.is_error, -sign * d.effect)
+
+        return sorted(changes, key=rank)
 
     @property
     def frozen(self) -> tuple[str, ...]:

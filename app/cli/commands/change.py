@@ -21,6 +21,9 @@ def change(
     seed: int = 0,
     engine: opt.Engine = "local",
     workers: int = 1,
+    fail_on_regression: bool = opt.flag(
+        "Exit with 1 if a slice of all modalities, clean or with faults, has regressed.", "--fail-on-regression"
+    ),
     output: Path | None = opt.option("DIR", "New folder for change.json, .svg, .pdf and .md.", None, "-o"),
 ) -> console.Result:
     """Report improvements and regressions between filters.
@@ -29,7 +32,8 @@ def change(
     error and covariance measure before and after, by data slice: clean, contact, free motion, 80 % image blackout,
     each modality only, and those of --slice; with 95 % intervals over episodes. A difference counts as improved or
     regressed if it is at least 2 % and its interval excludes zero. Also lists the events with the largest increase in
-    error, and the change of each module of checkpoints.
+    error, and the change of each module of checkpoints. With --fail-on-regression, the exit code is 1 if clean data or
+    data with faults have regressed; slices of some modalities only do not count.
 
     \b
     Examples:
@@ -37,6 +41,7 @@ def change(
       beliefscope change unimodal-ekf crossmodal-ekf --task push
       beliefscope change crossmodal-ekf my_filter.py:build --task door
       beliefscope change base.safetensors finetuned.safetensors --data door.h5 -o report
+      beliefscope change base.safetensors finetuned.safetensors --fail-on-regression --json -
       beliefscope change crossmodal-pf finetuned.safetensors --slice blackout-in-contact:faults=blackout=1:contact=yes
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.compare.checkpoints")
@@ -48,6 +53,7 @@ def change(
     from beliefscope.inspect.compare.checkpoints import compare_checkpoints, write_comparison
     from beliefscope.inspect.diagnostics.views import as_json
     from beliefscope.inspect.standalone import removal_note
+    from beliefscope.inspect.statistics.intervals import too_few
 
     if output is not None and (output.exists() or not output.parent.is_dir()):
         raise BadInput(f"output {str(output)!r} exists, or its parent folder does not; give the name of a new folder")
@@ -55,10 +61,13 @@ def change(
     target = checkpoints[0].task
     selection = parse_slices(slices or (), (), target)
     with opt.open_episodes(target, data, skip_bad) as episodes, console.progress("Comparing") as advance:
+        indices = range(len(episodes)) if every else episodes.held_out()
+        if fail_on_regression and (why := too_few(len(indices))):
+            raise BadInput(f"--fail-on-regression: {why}")
         report = compare_checkpoints(
             *checkpoints,
             episodes,
-            range(len(episodes)) if every else episodes.held_out(),
+            indices,
             slices=selection,
             particles=particles,
             seed=seed,
@@ -77,6 +86,7 @@ def change(
         "frozen": list(report.frozen),
         "improved": as_json(report.improvements()),
         "regressed": as_json(report.regressions()),
+        "regressed_slices": report.regressed_slices(),
         "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
         "serve": serve_command([*filter(is_source, (before, after))], data, seed),
     }
@@ -85,4 +95,7 @@ def change(
     text = "\n\n".join([heading, report.text, *notes])
     if output is not None:
         write_comparison(output, document, text, report.plot())
-    return console.Result(document, text)
+    failed = report.regressed_slices() if fail_on_regression else []
+    if failed:
+        console.note(f"regressed: {', '.join(failed)}")
+    return console.Result(document, text, code=int(bool(failed)))

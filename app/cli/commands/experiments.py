@@ -17,8 +17,9 @@ def experiments(
 ) -> console.Result:
     """Query the results of sweeps.
 
-    Without --sql, compares the checkpoints: pooled RMSE of the position and of each component, NEES/n, NLL, coverage and
-    the worst step, by checkpoint and faults, for the steps of one phase. docs/sweep.md lists the columns and ten queries.
+    Without --sql, compares the checkpoints: pooled RMSE of the position and of each component, NEES/n, NLL, coverage
+    and the worst step, by checkpoint and faults, for the steps of one phase. docs/sweep.md lists the columns and ten
+    queries.
 
     \b
     Examples:

@@ -52,6 +52,10 @@ if __name__ == "__main__":
 """
 
 
+def reversed_filters(change: tuple[str, ...]) -> tuple[str, ...]:
+    return (change[0], change[2], change[1], *change[3:])
+
+
 def test_report_names_filters_and_removed_sensors(
     run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,5 +73,11 @@ def test_report_names_filters_and_removed_sensors(
     event = json.loads(Path("report/change.json").read_text())["events"][0]
     query = parse_qs(event["link"].removeprefix("?"))
     assert query["filter"] == ["cart-beacon"]
+    code, out, error = run(*change, "--fail-on-regression", "--json", "-")
+    assert (code, error.splitlines()[-1]) == (1, "regressed: clean")
+    document = json.loads(out)
+    assert document["regressed_slices"] == ["clean"]
+    assert "; regressed: clean: x " in document["verdict"]
+    assert run(*reversed_filters(change), "--fail-on-regression")[0] == 0
     code, _, error = run(*change, "--slice", "slip")
     assert (code, "slices select steps by contact only, not by 'slip'; a sweep has" in error) == (2, True)

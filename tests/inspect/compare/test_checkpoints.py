@@ -178,6 +178,20 @@ def test_verdict_follows_the_intervals() -> None:
     assert verdict_of(-0.20, -0.10, -0.05).startswith("Improved: contact: position 1 -> 0.905 cm (-9.52 %, ")
 
 
+def test_clean_data_come_before_faults_and_single_modalities() -> None:
+    base = comparison(True)
+    effects = {"haptics only": 0.5, "blackout 0.8": 0.3, "contact": 0.2, "clean": 0.1}
+    changes = tuple(
+        Difference(name, "position", "cm", 1.0, 1.0, math.exp(e), e, e - 0.01, e + 0.01, (e, e - 0.01, e + 0.01))
+        for name, e in effects.items()
+    )
+    result = replace(base, differences=changes)
+    assert [d.slice for d in result.regressions()] == ["clean", "contact", "blackout 0.8", "haptics only"]
+    assert "; regressed: clean: position 1 -> 1.11 cm" in result.verdict
+    assert result.regressed_slices() == ["clean", "contact", "blackout 0.8"]
+    assert replace(base, differences=changes[:1]).regressed_slices() == []
+
+
 def test_events_are_sorted_by_error_increase() -> None:
     events = comparison(True).events
     increases = [m.after - m.before for m in events]
