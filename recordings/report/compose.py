@@ -193,12 +193,17 @@ class Writer:
         omitted = (
             f" The {MAX_CHARTS} of {len(traces)} traces with the largest errors." if len(charts) < len(traces) else ""
         )
-        shaded = "Shaded: contact; g" if "contact" in traces[0].task.covariates else "G"
+        bands = {
+            "shaded: contact": any(traces[i].episode.contact.any() for i in charts),
+            "gray: image blackout": any(measures.blackout(traces[i]).any() for i in charts),
+            "dotted: the events below": bool(marks),
+        }
+        drawn = "; ".join(name for name, is_drawn in bands.items() if is_drawn)
+        legend = f" {drawn.capitalize()}." if drawn else ""
         updates = "single-modality updates of the fused filter's prior, which are not standalone filters, and of the "
         caption = (
             f"{traces[0].task.main_error.title} error of the "
-            f"{updates if traces[0].modalities_with_posterior else ''}fused estimate. "
-            f"{shaded}ray: image blackout. Dotted: the events below.{omitted}"
+            f"{updates if traces[0].modalities_with_posterior else ''}fused estimate.{legend}{omitted}"
         )
         items = [
             self.table("accuracy", accuracy(traces, standalone_runs(traces, self.report.checkpoint))),

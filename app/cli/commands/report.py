@@ -62,7 +62,9 @@ def report(
     files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
     if not files:
         raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
-    traces, checkpoint = open_traces(files, filter, task)
+    opened, checkpoint = open_traces(files, filter, task)
+    pairs = sorted(zip(files, opened, strict=True), key=lambda pair: pair[1].episode_index)
+    files, traces = [file for file, _ in pairs], [trace for _, trace in pairs]
     if quantity and checkpoint is not None and (reason := no_maps(checkpoint, traces[0], quantity)):
         raise BadInput(reason)
     steps = [parse_event(text, traces) for text in events or ()]

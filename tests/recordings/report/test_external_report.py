@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import beliefscope as bs
+from beliefscope.app.cli.main import main
 from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.maps.plane import is_outside
 from beliefscope.inspect.trace import Trace
@@ -79,3 +82,17 @@ def test_texts_name_the_quantities_of_the_run(run: Trace, filter_: bs.Checkpoint
     assert "The fused estimate is outside of the map." in text
     assert "with the standard deviations cart 30 mm, swing 5.73 deg." in text
     assert "estimates, covariance, innovations." in text
+
+
+def test_episodes_are_in_order_and_the_caption_names_what_is_drawn(
+    run: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for episode in (9, 19):
+        bs.save_trace(replace(run, episode_index=episode), tmp_path / f"{episode}.trace")
+    monkeypatch.setattr(sys, "argv", ["beliefscope", "report", str(tmp_path), "-o", str(tmp_path / "report")])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    text = re.sub("<[^>]*>", "", (tmp_path / "report" / "report.html").read_text())
+    assert "9, 19: 24 steps in total" in text
+    assert "Cart error of the fused estimate. Dotted: the events below." in text

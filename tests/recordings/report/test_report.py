@@ -120,6 +120,13 @@ def test_page_is_self_contained(report: Path) -> None:
     assert "math" in page.tags
 
 
+def test_the_fused_estimate_comes_first(report: Path) -> None:
+    text = re.sub("<[^>]*>", " ", (report / "report.html").read_text())
+    names = "fused .* image-only update .* haptics-only update .* image standalone .* haptics standalone"
+    assert re.search(rf"Position RMSE\s+{names} .* counted steps", text)
+    assert "Shaded: contact; dotted: the events below." in text
+
+
 def test_texts_are_escaped(report: Path) -> None:
     text = (report / "report.html").read_text()
     assert "<script" not in text
