@@ -1,4 +1,4 @@
-"""Covariances that can be inverted, whatever the units of the state, and those that are none."""
+"""Covariances that can be inverted, whatever the units of the state, and the check of covariances."""
 
 from __future__ import annotations
 

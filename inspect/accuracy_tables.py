@@ -21,7 +21,8 @@ LABELS = {
 def accuracy_tables(title: str, metrics: Mapping[str, Any]) -> list[Table]:
     """The metrics of a filter and its baselines, a row for each measure; then those of its modalities, if any.
 
-    Baselines that the filter cannot run have no column. Without steps that the errors omit, those from step 0 are the same and have no rows.
+    Baselines that the filter cannot run have no column. Without steps that the errors omit, those from step 0 are the
+    same and have no rows.
 
     metrics: of ``filters.evaluate.Metrics.to_dict``.
     """

@@ -53,7 +53,7 @@ def checked_alarm_rate(healthy: int, count: int, alarm_rate: float | None = None
     A single episode has a p-value of at least 1 / (healthy + 1). Default: ``ALARM_RATE``, or that p-value if it is
     larger. Raises BadInput for a lower rate, and for a record of fewer than ``MIN_HEALTHY`` episodes.
 
-    total: number of episodes in the data of the record, of which the held-out ones are used.
+    total: number of all episodes in the data of the record; only the held-out ones are used.
     """
     if healthy < MIN_HEALTHY:
         part, kind = ("", "") if total in (None, healthy) else (f", the held-out part of {total},", " held-out ones")

@@ -115,7 +115,7 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     main = first.task.main_error
     table = next(item.table for item in summary.items if item.table is not None)
     column = table.columns.index(first.task.main_error.label)
-    rows = sorted(table.rows, key=lambda row: row[0] != measures.layer_label("fused"))  # first, the others in their order
+    rows = sorted(table.rows, key=lambda row: row[0] != measures.layer_label("fused"))  # the fused estimate first
     errors = "; ".join(f"{row[0]} {_number(row[column])} {main.unit}".rstrip() for row in rows)
     scored = sum(int(measures.counted(trace).sum()) for trace in report.traces)
     return facts | {f"{main.title} RMSE": f"{errors} over {plural(scored, 'counted step')}"}

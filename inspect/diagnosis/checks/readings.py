@@ -119,7 +119,7 @@ def is_expected(model: ReadingModel, episode: Episode) -> bool:
 
 
 def without_explained(row: Mapping[str, float]) -> dict[str, float]:
-    """Statistics without those of channels that the labels explain (``EXPLAINED``), of which the errors count."""
+    """Statistics without those of channels that the labels explain (``EXPLAINED``): their errors count instead."""
     return {name: value for name, value in row.items() if not _is_explained(name, row)}
 
 
@@ -221,7 +221,7 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
 
 
 def _ramp(errors: Array, times: Array) -> Array:
-    """(S, A) ramps from one of ``ONSETS`` times on that explain most of errors (S, A) with a mean of 0 at times (S,)."""
+    """(S, A) ramps from one of ``ONSETS`` times on that explain most of errors (S, A) at times (S,), without a mean."""
     onsets = np.linspace(times[0], times[-1], ONSETS + 1)[:-1]
     ramps = np.maximum(times[:, None] - onsets, 0.0)  # (S, O)
     ramps -= ramps.mean(0)

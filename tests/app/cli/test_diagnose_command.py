@@ -20,8 +20,7 @@ def test_too_few_clean_episodes_are_refused_before_the_runs(run: Run, base_setti
     line = ["diagnose", "door", "--filter", checkpoint, "--data", data, "--profile-from", data, "--particles", 30]
     code, _, error = run(*line)
     assert code == 2
-    message = "a healthy record of 1 episode, the held-out part of 2, is too small; measure it from at least 10 held-out"
-    assert message in error
+    assert "a healthy record of 1 episode, the held-out part of 2, is too small; measure it from at least 10" in error
     assert "Measuring the healthy record" not in error
 
 

@@ -113,9 +113,7 @@ def test_a_faulty_sensor_is_not_broken_dynamics() -> None:
 def test_units_of_groups_may_have_a_slash() -> None:
     task = replace(TASK, name="fast_cart", covariates={"speed": bs.Covariate("continuous", cuts=(0.4,), unit="m/s")})
     episodes = [drive(seed) for seed in range(16)]
-    fast = [
-        replace(e, task=task, covariates={"speed": np.linalg.norm(e.controls, axis=1) / task.dt}) for e in episodes
-    ]
+    fast = [replace(e, task=task, covariates={"speed": np.linalg.norm(e.controls, axis=1) / task.dt}) for e in episodes]
     adapter = bs.Adapter(Cart(), batched=False, modalities=tuple(SENSORS), initial_std=(0.02, 0.02))
     filter_ = bs.load_filter(adapter, task, name="cart")
     record = HealthyProfile.from_json(profile_of(filter_, fast[:12], "cart").to_json())
