@@ -51,6 +51,9 @@ SURE = 0.5
 COMPARABLE = 0.3
 """Smallest ratio of their probabilities for two causes that cannot be separated."""
 
+EQUAL = 0.8
+"""As ``COMPARABLE``, of two causes the first of which is as probable as all others together."""
+
 LISTED = 5
 """Maximum number of listed causes."""
 
@@ -298,7 +301,7 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
         return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {action}"
     first = candidates[0]
     similar = [c for c in candidates[1:3] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
-    if first.probability < SURE and similar:
+    if similar and (first.probability < SURE or _are_equal(first, similar[0])):
         *titles, last = (first.cause.title, *(_lower(c.cause.title) for c in similar))
         if _are_alike([first, *similar]):
             return f"{', '.join(titles)} and {last}, by one cause or by several; try: {first.next}"
@@ -313,6 +316,11 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     if masked:
         text += "; the filter is unaffected" if is_known else "; the errors of the filter are in the healthy range"
     return text if first.probability >= SURE else f"{text}; try: {first.next}"
+
+
+def _are_equal(first: Candidate, second: Candidate) -> bool:
+    """Whether one of two causes is present, and about as probably the other one (``EQUAL``)."""
+    return first.probability + second.probability < 1.0 + SHOWN and second.probability > EQUAL * first.probability
 
 
 def _are_alike(candidates: Sequence[Candidate]) -> bool:

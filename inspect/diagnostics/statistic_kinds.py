@@ -93,6 +93,7 @@ KINDS = {
     "reading scatter": ("variation between episodes of the error{of}, relative to its noise,", False, 0.3),
     "reading gain": ("slope{of} on the value expected from the labels", False, 0.02),
     "reading noise": ("noise{of} around the value expected from the labels, relative to healthy noise,", True, 0.05),
+    "reading ratio": ("ratio{of} to the value expected from the labels", False, 0.01),
     "label shift": ("evidence for labels with an offset from all sensors", False, 0.1),
     "inverted": ("evidence for the opposite sign of the channel{of}", False, 0.1),
     "exchanged": ("evidence for another order of the channels{of}", False, 0.1),

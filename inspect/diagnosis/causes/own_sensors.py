@@ -20,7 +20,7 @@ KNOWN = ("image", "force", "torque", "effector_position", "contact")
 SYNCHRONISE = "Synchronise the clocks of the sensors."
 """Next action of a delay."""
 
-BIASED = ("level", "drift", "saturation", "contact lag", "reading bias")
+BIASED = ("level", "drift", "saturation", "contact lag", "reading bias", "reading ratio")
 """Kinds of statistics of vector sensors that a bias changes."""
 
 DELAYED = (
@@ -117,7 +117,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
     drift = (Symptom(of("reading drift"), 0),)
-    slope = (Symptom(of("reading gain"), 0),)
+    slope = (Symptom(of("reading gain"), 0), Symptom(of("reading ratio"), 0))
     gain = (Symptom(of("size"), 0, otherwise=slope), Symptom(of("noise"), 0, otherwise=slope))
     rough = f"{scaled}|{of('roughness')}"
     entries = (

@@ -41,6 +41,9 @@ BLOCKS = 10
 EDGES = 151
 """Number of steps, evenly spaced, at which a bias may begin or end."""
 
+AS_GOOD = 0.9
+"""Ratio of the squares that a drift leaves to those of a gain from which the latter is as good."""
+
 ONSETS = 20
 """Number of times, evenly spaced, at which a drift may begin."""
 
@@ -76,7 +79,8 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     ``reading lag``: steps by which new readings of a sensor follow the expected ones; of a short delay, also fractions.
     The others are those at this lag. ``reading bias``: mean error relative to the noise. ``reading drift``: change of
     the error over the episode, likewise. ``reading gain``: slope of the readings on the expected ones. ``reading
-    noise``: standard deviation from this line, relative to the noise.
+    noise``: standard deviation from this line, relative to the noise. ``reading ratio``: gain without a bias, if it
+    explains the errors as well as a bias, and else nearly 1; not of angles.
     ``inverted``: half the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then
     fit (``FITS``), hardly worse than with biases (``SIMPLER``). ``exchanged``: likewise, of the errors of two channels
     to those with these channels exchanged, whatever their signs, for the best other channel; or of one channel to those
@@ -106,6 +110,8 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
             values[f"reading drift/{axis}/all"] = float(line["drift"][i] / model.noise[i])
             values[f"reading gain/{axis}/all"] = float(line["gain"][i])
             values[f"reading noise/{axis}/all"] = float(line["noise"][i] / model.noise[i])
+            if not model.is_angle[i]:
+                values[f"reading ratio/{axis}/all"] = float(line["ratio"][i])
             values[f"inverted/{axis}/all"] = float(inverted[i])
             if count > 1:
                 pairs = np.delete(exchanged[i], i)
@@ -176,15 +182,16 @@ def _delay(error: Array, change: Array) -> float:
 
 
 def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict[str, Array]:
-    """``bias``, ``drift``, ``gain`` and ``noise`` (A,) of readings (S, A) at times (S,), from 0 to 1 over the episode.
+    """``bias``, ``drift``, ``gain``, ``noise`` and ``ratio`` (A,) of readings (S, A) at times (S,), from 0 to 1.
 
     They are those of a line through the expected readings, and, if there is a drift, the times; NaN for too few steps.
     Noise changes slopes as well: gains are shrunk towards 1 if their standard errors exceed the spread (A,) of healthy
     ones, but little if they differ from 1 by far more than ``SURELY`` of them (positive-part James-Stein estimator).
-    The noise is that before the gain.
+    The noise is that before the gain. The ratio is a gain without a bias, which is known even if the expected readings
+    hardly vary. It is shrunk towards 1 by the likelihood ratio of a bias, and of the drift, to it.
     """
     if len(readings) < MIN_STEPS:
-        return dict.fromkeys(("bias", "drift", "gain", "noise"), np.full(readings.shape[1], np.nan))
+        return dict.fromkeys(("bias", "drift", "gain", "noise", "ratio"), np.full(readings.shape[1], np.nan))
     x, y = expected - expected.mean(0), readings - readings.mean(0)
     drift, drifted = _drift(x, y - x, times - times.mean())
     y = y - drifted
@@ -195,8 +202,12 @@ def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict
     sure = 1.0 - np.square(SURELY * error / np.maximum(np.abs(slope - 1.0), 1e-12))
     share = np.maximum(np.minimum(np.square(spread / error), 1.0), sure)
     before = np.where(sure > 0.0, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
-    bias, gain = (readings - expected).mean(0), 1.0 + share * (slope - 1.0)
-    return {"bias": bias, "drift": drift, "gain": gain, "noise": rest / before}
+    errors, gain = readings - expected, 1.0 + share * (slope - 1.0)
+    ratio = (expected * errors).sum(0) / np.maximum(np.square(expected).sum(0), 1e-24)
+    others = errors - drifted
+    by_bias, by_ratio = (np.square(e).mean(0) + 1e-24 for e in (others - others.mean(0), errors - ratio * expected))
+    ratio = 1.0 + np.minimum(by_bias / by_ratio, 1.0) ** (len(errors) / 2.0) * ratio
+    return {"bias": errors.mean(0), "drift": drift, "gain": gain, "noise": rest / before, "ratio": ratio}
 
 
 def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
@@ -204,8 +215,8 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
 
     A gain and a bias in an interval also change errors over time. The slope is shrunk by the likelihood ratio of the
     better of these to a ramp from some step on, for ``BLOCKS`` pairs of independent errors. The part is that of the
-    ramp, if it leaves least of the three, or of the interval, which has more parameters, if it leaves clearly less
-    (``CLEARLY``).
+    ramp, if it leaves less than a gain, which has fewer parameters (``AS_GOOD``), or of the interval, which has more
+    than both, if it leaves clearly less (``CLEARLY``).
     """
     time = times[:, None]
     power = np.square(errors).sum(0)
@@ -214,7 +225,7 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
     gain = expected * ((expected * errors).sum(0) / np.maximum(np.square(expected).sum(0), 1e-24))
     ramp = _ramp(errors, times)
     left = [np.maximum(np.square(errors - fit).sum(0), 1e-9 * power + 1e-24) for fit in (ramp, interval, gain)]
-    by_ramp, by_interval, by_gain = left
+    by_ramp, by_interval, by_gain = left[0], left[1], AS_GOOD * left[2]
     is_interval = by_interval < CLEARLY * np.minimum(by_ramp, by_gain)
     part = np.where(is_interval, interval, np.where(by_ramp < by_gain, ramp, 0.0))
     return slope * np.minimum(np.minimum(by_interval, by_gain) / by_ramp, 1.0) ** BLOCKS, part

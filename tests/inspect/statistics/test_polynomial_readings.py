@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -160,3 +161,55 @@ def test_noise_does_not_spread_gains_beyond_healthy_ones() -> None:
         }
     )
     assert reading_statistics(drive(100), [old])["reading gain/drag/all"] == 1.0, "of a record of an earlier version"
+
+
+TANK = replace(CART, observations={"gauge": (1,)}, modalities={"gauge": ("gauge",)})
+GAUGE = 0.05
+
+
+def fill(seed: int, offset: float = 0.0, size: float = 1.0) -> Episode:
+    """A gauge of a smooth level around an offset."""
+    rng = np.random.default_rng(seed)
+    x, v, u = smooth(rng, 3).T
+    x = offset + size * x
+    return Episode(TANK, np.stack([x, v], 1), u[:, None], {"gauge": x[:, None] + rng.normal(0.0, GAUGE, (len(x), 1))})
+
+
+def changed(offset: float, size: float, change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> dict[str, float]:
+    """Statistic of the errors of the gauge -> mean over new episodes with changed readings, by steps."""
+    (model,) = fit_reading_models([fill(seed, offset, size) for seed in range(20)], ["gauge"])
+    rows = []
+    for episode in (fill(100 + i, offset, size) for i in range(10)):
+        readings = change(episode.observations["gauge"].astype(np.float64), np.arange(len(episode))[:, None])
+        faulty = replace(episode, observations={"gauge": readings.astype(np.float32)})
+        rows.append(reading_statistics(faulty, [model]))
+    kinds = ("bias", "drift", "gain", "ratio", "noise")
+    return {kind: float(np.mean([row[f"reading {kind}/gauge/all"] for row in rows])) for kind in kinds}
+
+
+@pytest.mark.parametrize("onset", [0, 40, 80])
+def test_a_ramp_from_any_step_on_is_a_drift(onset: int) -> None:
+    values = changed(0.0, 0.5, lambda y, t: y + 0.005 * np.maximum(t - onset, 0))
+    assert values["drift"] > 1.0
+    assert values["gain"] == pytest.approx(1.0, abs=0.03)
+    assert values["ratio"] == pytest.approx(1.0, abs=0.03)
+    assert values["noise"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.2])
+def test_a_gain_is_no_drift(gain: float) -> None:
+    values = changed(1.0, 0.5, lambda y, t: gain * y)
+    assert values["gain"] == pytest.approx(gain, abs=0.03)
+    assert values["ratio"] == pytest.approx(gain, abs=0.03)
+    assert abs(values["drift"]) < 0.3
+
+
+def test_a_gain_of_readings_that_hardly_vary_is_a_ratio() -> None:
+    """Their slope is unknown. A bias has the same ratio, unless the expected readings vary."""
+    gained = changed(2.0, 0.05, lambda y, t: 0.95 * y)
+    assert gained["ratio"] == pytest.approx(0.95, abs=0.01)
+    for offset, size in ((2.0, 0.5), (0.0, 0.05), (0.0, 1.0)):
+        biased = changed(offset, size, lambda y, t: y - 0.1)
+        assert biased["bias"] == pytest.approx(-0.1 / GAUGE, abs=0.3)
+        assert biased["ratio"] == pytest.approx(1.0, abs=0.02)
+        assert biased["gain"] == pytest.approx(1.0, abs=0.1)
