@@ -44,6 +44,7 @@ from beliefscope.inspect.traces.sensors import displayed_sensors
 from beliefscope.recordings.report.diagnosis import report_diagnosis
 from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
+from beliefscope.recordings.report.latex import latex_table
 from beliefscope.recordings.report.page import page
 from beliefscope.recordings.report.pdf import print_page
 from beliefscope.recordings.report.sections import (
@@ -171,10 +172,12 @@ class Writer:
         return Item(caption, (*files, *data), svg=(self.folder / files[0]).read_text(encoding="utf-8"))
 
     def table(self, name: str, table: Table) -> Item:
-        """Write a table as CSV with all digits; missing values are empty."""
+        """Write a table as CSV with all digits, where missing values are empty, and as LaTeX as on the page."""
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([table.columns, *table.rows])
-        return Item(table.title, (self.write(f"tables/{name}.csv", text.getvalue().encode()),), table)
+        contents = {"csv": text.getvalue(), "tex": latex_table(table)}
+        files = (self.write(f"tables/{name}.{suffix}", content.encode()) for suffix, content in contents.items())
+        return Item(table.title, tuple(files), table)
 
     def write(self, file: str, data: bytes) -> str:
         """Write a file; returns its path in the folder."""

@@ -21,7 +21,7 @@ from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.restarts import restarts_text
-from beliefscope.recordings.report.sections import Item, Report, Section
+from beliefscope.recordings.report.sections import Item, Report, Section, number_text, text_columns
 from beliefscope.recordings.report.text import definitions, methods
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -45,7 +45,7 @@ def page(
         "inline_svg": lambda item, number: inline_svg(item, f"f{number}-"),
         "math": mathml,
         "number": _number,
-        "text_columns": _text_columns,
+        "text_columns": text_columns,
         "typeset": typeset,
     }
     figures, tables = count(1), count(1)
@@ -144,16 +144,10 @@ def _episodes(report: Report) -> Table:
     return Table("Episodes", columns, rows)
 
 
-def _text_columns(table: Table) -> list[bool]:
-    """Whether each column contains text; other columns are right-aligned."""
-    return [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
-
-
 def _number(value: Value) -> str:
     """Three significant digits; a dash for missing values."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "\N{EN DASH}"
     if not isinstance(value, float):
         return _code(str(value))
-    text = f"{value:#.3g}".rstrip(".") if abs(value) < 1000.0 else f"{value:.0f}"
-    return text.replace("-", "\N{MINUS SIGN}")
+    return number_text(value).replace("-", "\N{MINUS SIGN}")

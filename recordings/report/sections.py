@@ -157,6 +157,16 @@ def _accuracy(traces: Sequence[Trace]) -> list[dict[str, Value]]:
     return rows
 
 
+def text_columns(table: Table) -> list[bool]:
+    """Whether each column contains text; other columns are right-aligned."""
+    return [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
+
+
+def number_text(value: float) -> str:
+    """Three significant digits."""
+    return f"{value:#.3g}".rstrip(".") if abs(value) < 1000.0 else f"{value:.0f}"
+
+
 def _reach(map_: LikelihoodMap) -> NDArray[Any]:
     """(2,) largest offset of a map along its axes; 0 along the missing one of a curve."""
     return np.array([np.abs(offsets).max() for offsets in (map_.offsets_x, map_.offsets_y)])
