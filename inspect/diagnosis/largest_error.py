@@ -48,8 +48,9 @@ class LargestError:
 
 
 def largest_error(checkpoint: Checkpoint, traces: Sequence[Trace]) -> LargestError | None:
-    """The largest main error of all steps; None without a known true state."""
-    errors = [np.nan_to_num(measures.main_error(trace)[:, -1], nan=-1.0, posinf=-1.0) for trace in traces]
+    """The largest main error of the counted steps, after the warm-up; None without a known true state there."""
+    counted = (np.where(measures.counted(t), measures.main_error(t)[:, -1], np.nan) for t in traces)
+    errors = [np.nan_to_num(error, nan=-1.0, posinf=-1.0) for error in counted]
     index = int(np.argmax([error.max(initial=-1.0) for error in errors]))
     trace, size = traces[index], errors[index].max(initial=-1.0)
     if size < 0.0:

@@ -2,7 +2,13 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { divergence, finding, largest, outageFinding } from '../../app/page/step/finding.js';
+import {
+  divergence,
+  finding,
+  largest,
+  largestErrorStep,
+  outageFinding,
+} from '../../app/page/step/finding.js';
 import { largestError } from '../../app/page/tabs/diagnosis_cause.js';
 import { STEPS as TOUR, placeBeside } from '../../app/page/widgets/tour.js';
 
@@ -208,6 +214,21 @@ test('a fault comes first, then the outage, then the largest error', () => {
     'Healthy: all is normal.',
     'the record, which the diagnosis describes',
   );
+});
+
+test('the largest error of the warm-up is no finding', () => {
+  const error = () => series((t) => (t === 3 ? 9 : t === 11 ? 1 : 0.5));
+  const steps = (/** @type {number} */ first_counted) =>
+    [null, FAULT.causes[0].steps].map((cause) => {
+      const trace = { ...run(11), error, header: { first_counted } };
+      if (!cause) return finding(trace, 0, null).step;
+      const evidence = [{ text: 'it is biased', step: null }];
+      const causes = [{ ...FAULT.causes[0], steps: null, evidence }];
+      return finding(trace, 0, { ...FAULT, causes }).step;
+    });
+  assert.deepEqual(steps(5), [11, 11]);
+  assert.deepEqual(steps(0), [3, 3]);
+  assert.equal(largestErrorStep({ ...run(11), error, header: { first_counted: STEPS } }), 3);
 });
 
 test('the largest error of several episodes is an evidence with its sources', () => {

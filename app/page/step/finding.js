@@ -137,7 +137,7 @@ function faultFinding(trace, { state, masked, headline, causes }) {
     tone: state === 'fault' && !masked ? 'bad' : 'warn',
     headline: typeset(sentence(headline.replaceAll('`', ''))),
     evidence: typeset(sentences.filter(Boolean).join(' ')),
-    step: step ?? largest(trace.error('fused', 'main') ?? []),
+    step: step ?? largestErrorStep(trace),
     component: affectedComponent(trace.components, cause),
   };
 }
@@ -182,7 +182,7 @@ function injectedFinding(trace, component) {
 function effect(trace, steps) {
   const change = steps ? errorChange(trace, steps[0], steps[1] - 1) : '';
   const error = trace.error('fused', 'main');
-  const step = largest(error ?? []);
+  const step = largestErrorStep(trace);
   if (change || !error || step === null) return change;
   const size = withUnit(fixed(error[step], 2), trace.mainUnit);
   const { sigmas = NaN, component = '' } = trace.largestDeviation(step) ?? {};
@@ -217,7 +217,7 @@ function errorChange(trace, first, last) {
  */
 function worstFinding(trace, component) {
   const error = trace.error('fused', 'main') ?? [];
-  const step = largest(error);
+  const step = largestErrorStep(trace);
   if (step === null) {
     const headline = 'The true state of this run is unknown.';
     return { tone: 'none', headline, evidence: '', step };
@@ -306,6 +306,16 @@ export function outageFinding(trace, component, failed = null) {
     evidence: sentence(evidence.join('; ')),
     step: first,
   };
+}
+
+/**
+ * Step of the largest error of the fused estimate after the warm-up, as in metrics; null without truth.
+ * @param {Trace} trace
+ */
+export function largestErrorStep(trace) {
+  const error = Array.from(trace.error('fused', 'main') ?? []);
+  const first = trace.header.first_counted;
+  return largest(error.map((value, step) => (step < first ? NaN : value))) ?? largest(error);
 }
 
 /**

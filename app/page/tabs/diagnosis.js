@@ -11,7 +11,7 @@ import { SHOWN } from '../core/constants.js';
 import { create, createButton, html, pause, setOptions } from '../core/dom.js';
 import { displayName, percent, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
-import { affectedComponent, largest } from '../step/finding.js';
+import { affectedComponent, largestErrorStep } from '../step/finding.js';
 import { readingCharts } from '../timeline/reading_charts.js';
 import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { choice } from '../widgets/pickers.js';
@@ -269,8 +269,8 @@ export class Diagnosis {
    */
   #openStep(episode, step, cause) {
     const { state } = this.#store;
-    const worst =
-      episode === state.episode ? largest(this.#trace?.error('fused', 'main') ?? []) : null;
+    const trace = episode === state.episode ? this.#trace : null;
+    const worst = trace && largestErrorStep(trace);
     const component = affectedComponent(this.#trace?.components ?? [], cause) ?? state.component;
     this.#store.set({ episode, step: step ?? worst ?? 0, component, playing: false });
   }

@@ -274,11 +274,13 @@ export class Timeline {
     return Math.max(1, Math.round((this.#window[1] - this.#window[0]) / 10));
   }
 
-  /** The visible step with the largest error of the fused estimate. */
+  /** The visible step with the largest error of the fused estimate, after the warm-up if it is visible. */
   get largestError() {
     const error = this.#trace && selectedError(this.#trace, this.#store.state);
     if (!error) return this.#step;
-    const [from, to] = this.#window.map((edge) => this.#nearest(edge));
+    const [start, to] = this.#window.map((edge) => this.#nearest(edge));
+    const first = this.#trace?.header.first_counted ?? 0;
+    const from = first <= to ? Math.max(start, first) : start;
     let result = from;
     for (let t = from; t <= to; t++) if (error[t] > error[result]) result = t;
     return result;

@@ -75,7 +75,9 @@ def test_a_shifted_image_is_the_source_of_the_error() -> None:
     found = largest_error(checkpoint, [run])
     assert found is not None
     assert found.sources.startswith("image ")
-    assert (found.episode, found.step) == (9, result.worst_step)
+    counted = np.where(measures.counted(run), measures.main_error(run)[:, -1], -1.0)
+    assert (found.episode, found.step) == (9, int(counted.argmax()))
+    assert found.step >= run.task.warmup > result.worst_step, "the diagnostic also describes the start"
 
 
 def test_filters_without_virtual_observations_have_a_reason() -> None:
