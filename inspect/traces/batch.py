@@ -11,6 +11,7 @@ from torch import Tensor
 
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Gaussian, Recurrent, StepTrace
@@ -20,11 +21,15 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
+from beliefscope.inspect.traces.external import are_independent, run_together
 from beliefscope.inspect.traces.restarts import trace_with_restarts
 from beliefscope.inspect.traces.run import assemble_trace, step_arrays, trace
 
 EPISODES, STEPS = 32, 10_000
 """Maximum number of episodes in one run, and of their steps; limits memory."""
+
+FEWEST = 5
+"""Fewest episodes that an external filter runs over in batches: it first runs over one alone and two together."""
 
 Episodes = Dataset | Mapping[int, Episode] | Sequence[Episode]
 """Episodes by their indices."""
@@ -41,35 +46,72 @@ def trace_all(
     progress: Progress = None,
     restart: bool = False,
 ) -> Iterator[Trace]:
-    """Trace the episodes with these indices, those of equal length together, with an external filter one by one.
+    """Trace the episodes with these indices, those of equal length together.
 
     The traces have the random numbers of ``trace`` and differ from it by rounding only, which may select another
     particle in a resampling. Raises BadInput as ``trace``.
+    External filters run one by one if they draw random numbers or if their batches are not independent.
 
     Args:
         progress: called with the completed fraction, 0..1.
         restart: whether an external filter that fails at a step is restarted (``trace_with_restarts``).
     """
-    done = 0
     if isinstance(checkpoint, ExternalFilter):
-        for index in indices:
-            share = part_of(progress, done, len(indices))
-            if restart:
-                yield trace_with_restarts(checkpoint, data[index], index, seed, faults, share)
-            else:
-                yield trace(checkpoint, data[index], index, seed, particles, faults, share)
-            done += 1
+        yield from _trace_external(checkpoint, data, indices, seed, faults, progress, restart)
         return
+    done = 0
     for episodes in _blocks(data, indices):
-        lengths: dict[int, list[int]] = {}
-        for index, episode in episodes.items():
-            checkpoint.check_task(episode)
-            lengths.setdefault(len(episode), []).append(index)
-        for _, members in sorted(lengths.items()):
-            share = part_of(progress, done, len(indices), len(members))
-            selected = {index: episodes[index] for index in members}
+        for selected in _by_length(checkpoint, episodes):
+            share = part_of(progress, done, len(indices), len(selected))
             yield from _run_together(checkpoint, selected, seed, particles, faults, share)
-            done += len(members)
+            done += len(selected)
+
+
+def _trace_external(
+    external: ExternalFilter,
+    data: Episodes,
+    indices: Collection[int],
+    seed: int,
+    faults: Faults,
+    progress: Progress,
+    restart: bool,
+) -> Iterator[Trace]:
+    """Traces in the order of the indices: in batches, if this changes no result and the filter fails in no episode."""
+    run_one = trace_with_restarts if restart else trace
+    done, in_batches, is_checked = 0, external.adapter.batched and len(indices) >= FEWEST, False
+    for block in _blocks(data, indices):
+        traces: dict[int, Trace] = {}
+        try:
+            for group in _by_length(external, block) if in_batches else ():
+                if len(group) == 1:
+                    continue
+                inputs = [faults.apply(episode, seed) for episode in group.values()]
+                faults.check(external.task, len(inputs[0]))
+                in_batches = is_checked = is_checked or are_independent(external, inputs[:2], seed)
+                if not in_batches:
+                    break
+                run = {"seed": seed, "faults": faults}
+                origins = [{**run, "episode_index": i, "data_hash": e.digest()} for i, e in group.items()]
+                share = part_of(progress, done + len(traces), len(indices), len(group))
+                traces |= zip(group, run_together(external, inputs, share, origins), strict=True)
+        except BadInput:  # one of the episodes, which the filter runs over alone
+            in_batches, traces = False, {}
+        for index, episode in block.items():
+            share = part_of(progress, done, len(indices))
+            if index in traces:
+                yield traces[index]
+            else:
+                yield run_one(external, episode, index, seed, faults=faults, progress=share)
+            done += 1
+
+
+def _by_length(checkpoint: Checkpoint, episodes: Mapping[int, Episode]) -> list[dict[int, Episode]]:
+    """The episodes by index in groups of equal length, shortest first. Raises BadInput if one is of another task."""
+    lengths: dict[int, dict[int, Episode]] = {}
+    for index, episode in episodes.items():
+        checkpoint.check_task(episode)
+        lengths.setdefault(len(episode), {})[index] = episode
+    return [group for _, group in sorted(lengths.items())]
 
 
 def _blocks(data: Episodes, indices: Iterable[int]) -> Iterator[dict[int, Episode]]:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.engine import Progress
-from beliefscope.filters.external.adapter import EXTRA, letters_of
+from beliefscope.filters.external.adapter import EXTRA, Values, letters_of
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
+
+SAME = 1e-4
+"""Largest rounding difference between runs alone and in a batch, relative to a value and to the largest one."""
 
 
 def trace_external(
@@ -56,7 +61,49 @@ def run_external(
     values, modalities = external.run([seen or episode], provenance["seed"], progress, start)
     if seen is not None:
         modalities, values = (), {name: v for name, v in values.items() if not letters_of(name).startswith("K")}
-    arrays = {name: np.ascontiguousarray(value[:, 0].numpy()) for name, value in values.items()}
+    return _assemble(external, episode, 0, start, values, modalities, provenance)
+
+
+def run_together(
+    external: ExternalFilter, episodes: Sequence[Episode], progress: Progress, provenance: Sequence[Mapping[str, Any]]
+) -> list[Trace]:
+    """As ``run_external`` for episodes of equal length in one batch, each with its provenance."""
+    start = external.start(episodes)
+    values, modalities = external.run(episodes, provenance[0]["seed"], progress, start)
+    return [
+        _assemble(external, episode, i, start, values, modalities, own)
+        for i, (episode, own) in enumerate(zip(episodes, provenance, strict=True))
+    ]
+
+
+def are_independent(external: ExternalFilter, episodes: Sequence[Episode], seed: int) -> bool:
+    """Whether the values of an episode are the same alone and in a batch of several, except for rounding.
+
+    They differ if a filter draws random numbers or has operations over the batch. Raises BadInput as ``run_external``.
+    """
+    (alone, names), (together, others) = (external.run(group, seed) for group in (episodes[:1], episodes))
+    return (names, alone.keys()) == (others, together.keys()) and all(
+        torch.allclose(value.double(), together[name][:, :1].double(), SAME, SAME * _size(value), equal_nan=True)
+        for name, value in alone.items()
+    )
+
+
+def _size(values: Tensor) -> float:
+    finite = values[values.isfinite()].abs()
+    return float(finite.max()) if len(finite) else 0.0
+
+
+def _assemble(
+    external: ExternalFilter,
+    episode: Episode,
+    i: int,
+    start: Gaussian,
+    values: Values,
+    modalities: tuple[str, ...],
+    provenance: Mapping[str, Any],
+) -> Trace:
+    """The trace of episode i of a batch."""
+    arrays = {name: np.ascontiguousarray(value[:, i].numpy()) for name, value in values.items()}
     settings: dict[str, Any] = {"torch": torch.__version__, "source": external.source}
     if "particles" in arrays:
         settings["particles"] = arrays["particles"].shape[1]
@@ -65,8 +112,8 @@ def run_external(
         modalities=modalities,
         kind=external.kind,
         filter=external.name,
-        start_mean=start.mean[0].numpy(),
-        start_covariance=np.ascontiguousarray(start.covariance[0].numpy()),
+        start_mean=start.mean[i].numpy(),
+        start_covariance=np.ascontiguousarray(start.covariance[i].numpy()),
         checkpoint_hash=external.hash,
         **{**provenance, "settings": settings | dict(provenance.get("settings", {}))},
         **fill_missing(arrays, len(modalities)),
