@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from beliefscope.datasets.text import percent
 
 FLOOR = 1e-8
 """Part of a component's usual variance, or of its own if that is larger, that is added to its variances."""
@@ -48,6 +54,27 @@ def is_covariance(matrices: NDArray[Any]) -> NDArray[np.bool_]:
     difference = np.abs(matrices - np.swapaxes(matrices, -1, -2)) / (scale[..., :, None] * scale[..., None, :])
     is_symmetric = (difference <= INDEFINITE).all((-2, -1))
     return np.asarray(is_symmetric & (variance > 0.0).all(-1) & ~is_indefinite(matrices))
+
+
+def without_invalid(trajectories: Sequence[Tensor], firsts: Sequence[int]) -> list[Tensor]:
+    """Covariances (T, n, n) of each episode, invalid ones replaced by NaN. Warns with their share of the counted steps.
+
+    Episodes without any covariance, NaN, cause no warning.
+
+    Args:
+        firsts: first counted step of each episode.
+    """
+    valid = [is_covariance(covariances.numpy()) for covariances in trajectories]
+    counted = np.concatenate([mask[first:] for mask, first in zip(valid, firsts, strict=True)])
+    if not counted.all() and not all(covariances.isnan().all() for covariances in trajectories):
+        warnings.warn(
+            f"covariances are not symmetric and positive definite in {percent(1.0 - counted.mean(), '.3g')} of the "
+            f"steps; NLL, NEES/n and 95 % coverage are {'those of the other steps' if counted.any() else 'unknown'}",
+            stacklevel=3,
+        )
+    return [
+        c.where(torch.from_numpy(mask)[:, None, None], torch.nan) for c, mask in zip(trajectories, valid, strict=True)
+    ]
 
 
 def is_indefinite(covariance: NDArray[Any]) -> NDArray[np.bool_]:

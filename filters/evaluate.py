@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,11 +19,10 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.notebook_html import html_table
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.text import percent
 from beliefscope.filters.angles import Angles
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.covariance_floor import is_covariance, with_floor
+from beliefscope.filters.covariance_floor import with_floor, without_invalid
 from beliefscope.filters.engine import Engine, Progress, run_blocks
 from beliefscope.filters.external.ablation import with_only
 from beliefscope.filters.external.adapter import FailedStep
@@ -173,7 +171,9 @@ def evaluate(
             runs.setdefault(name, {}).update(zip((number for number, *_ in block), pairs, strict=True))
     complete = {name: [by[i] for i in range(len(by))] for name, by in runs.items() if len(by) == len(episodes)}
     if isinstance(filter_, ExternalFilter):
-        complete[FILTER] = _with_valid_covariances(filter_.task, complete[FILTER])
+        errors, covariances = zip(*complete[FILTER], strict=True)
+        firsts = [filter_.task.first_counted(len(error)) for error in errors]
+        complete[FILTER] = [*zip(errors, without_invalid(covariances, firsts), strict=True)]
     pooled = {name: _pool(filter_.task, by, episodes) for name, by in complete.items()}
     names = filter_.task.modalities if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
     return replace(
@@ -321,26 +321,6 @@ def _errors(task: Task, mean: Tensor, truth: Tensor) -> Tensor:
 def _stay(task: Task, mean: Tensor, states: Tensor) -> Run:
     """The run of an estimator that keeps the start (N, n) as its estimate of the states (T, N, n)."""
     return _errors(task, mean, states), torch.full((*states.shape, states.shape[-1]), torch.nan)
-
-
-def _with_valid_covariances(task: Task, trajectories: Sequence[Run]) -> list[Run]:
-    """The runs of each episode with NaN in place of invalid covariances. Warns with their share of the counted steps.
-
-    Estimators without any covariance cause no warning.
-    """
-    valid = [is_covariance(covariance.numpy()) for _, covariance in trajectories]
-    counted = np.concatenate([mask[task.first_counted(len(mask)) :] for mask in valid])
-    if not counted.all() and not all(covariance.isnan().all() for _, covariance in trajectories):
-        measured = "those of the other steps" if counted.any() else "unknown"
-        warnings.warn(
-            f"covariances are not symmetric and positive definite in {percent(1.0 - counted.mean(), '.3g')} of the "
-            f"steps; {', '.join(CONSISTENCY.values())} are {measured}",
-            stacklevel=3,
-        )
-    return [
-        (error, torch.where(torch.from_numpy(mask)[:, None, None], covariance, torch.nan))
-        for (error, covariance), mask in zip(trajectories, valid, strict=True)
-    ]
 
 
 def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:

@@ -341,6 +341,6 @@ def test_without_any_valid_covariance_consistency_is_unknown() -> None:
     states = np.cumsum(np.random.default_rng(0).normal(0.0, 0.05, (40, 2)), axis=0)
     episode = Episode(replace(TAG, warmup=30), states, np.zeros((40, 0)), {"gps": states})
     filter_ = as_external(Adapter(Constant([[0.0, 0.0], [0.0, 0.0]]), initial_std=(0.1, 0.1), task=episode.task), "tag")
-    with pytest.warns(UserWarning, match="in 100 % of the steps; NLL, NEES/n, 95 % coverage are unknown"):
+    with pytest.warns(UserWarning, match="in 100 % of the steps; NLL, NEES/n and 95 % coverage are unknown"):
         result = evaluate(filter_, [episode])
     assert np.isnan([result.nll, result.nees, result.coverage95]).all()
