@@ -38,6 +38,9 @@ MIN_STEPS = 10
 NEAR_ANGLE = 0.2
 """Largest error of an angle, rad, from which a prediction of the run shows the dynamics."""
 
+PREDICTED = 0.05
+"""Smallest variance of the predicted changes, relative to that of the true ones, for a slope on them."""
+
 ROUNDING = 1e-12
 """Largest variance that a prediction adds by rounding, relative to that of the states; smallest process noise."""
 
@@ -137,7 +140,7 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
         variance = np.maximum(np.median(np.diagonal(added, axis1=-2, axis2=-1), axis=0), smallest)
         squared = np.maximum(np.square(residual).mean(0), smallest)
         more = {"dynamics nis": squared / variance, "process noise": np.sqrt(variance)}
-    return values | _of_changes(task, residual, change, more, states.std(0))
+    return values | _of_changes(task, residual, change, more, states.std(0), are_exact=starts)
 
 
 def _offset(trace: Trace, steps: NDArray[np.intp], residual: Array) -> Array:
@@ -164,13 +167,27 @@ def _moved(change: Array, std: Array) -> Mask:
     return np.asarray(np.abs(change).sum(0) > MIN_PATH * std)
 
 
-def _of_changes(task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array) -> dict[str, float]:
-    """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,)."""
+def _of_changes(
+    task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array, are_exact: bool = False
+) -> dict[str, float]:
+    """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,).
+
+    are_exact: whether predictions start at true states, so that they have no noise. The bias is then what a slope on
+        the predicted changes does not explain: that on the true ones decreases with the process noise, and its
+        intercept depends on the speed.
+    """
     moved = _moved(change, std)
     centred, around = residual - residual.mean(0), change - change.mean(0)
     excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
+    bias = residual.mean(0) - excess * change.mean(0)
+    if are_exact:
+        predicted = residual + change
+        spread = np.square(predicted - predicted.mean(0)).sum(0)
+        slope = (centred * predicted).sum(0) / np.maximum(spread, 1e-12)
+        varies = moved & (spread > PREDICTED * np.square(around).sum(0))
+        bias = np.where(varies, residual.mean(0) - slope * predicted.mean(0), bias)
     columns = {
-        "dynamics bias": residual.mean(0) - excess * change.mean(0),
+        "dynamics bias": bias,
         "dynamics error": np.sqrt(np.square(residual).mean(0)),
         "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
         "dynamics spread": (centred - excess * around).std(0),
