@@ -32,7 +32,8 @@ import pyarrow.parquet as pq
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.sweep import Inputs
-from beliefscope.recordings.sweep_table import CHECKPOINTS, RESULTS, TABLES, Experiments, run_sweep
+from beliefscope.recordings.experiments import Experiments
+from beliefscope.recordings.sweep_table import CHECKPOINTS, RESULTS, TABLES, run_sweep
 
 DOCS = Path(__file__).parents[1] / "docs" / "sweep.md"
 REPEATS = 20

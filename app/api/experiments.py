@@ -19,7 +19,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.diagnostics.views import as_json
 
 if TYPE_CHECKING:
-    from beliefscope.recordings.sweep_table import Experiments as Tables
+    from beliefscope.recordings.experiments import Experiments as Tables
 
 LARGEST = 2000
 """Maximum number of rows that are sent."""
@@ -108,7 +108,7 @@ class EpisodeResults(Reply):
 
 def add_routes(app: FastAPI, store: TraceStore) -> None:
     def tables(name: str) -> Tables:
-        from beliefscope.recordings.sweep_table import Experiments as Tables  # pyarrow and DuckDB are slow to import
+        from beliefscope.recordings.experiments import Experiments as Tables  # pyarrow and DuckDB are slow to import
 
         folder = sweep_folders(store.settings).get(name)
         if folder is None:
@@ -166,7 +166,7 @@ def add_routes(app: FastAPI, store: TraceStore) -> None:
 
     @app.get("/api/experiments/{sweep}/results.csv")
     def results_as_csv(sweep: str, phase: str = "all") -> Response:
-        from beliefscope.recordings.sweep_table import as_csv
+        from beliefscope.recordings.experiments import as_csv
 
         name = {"Content-Disposition": f'attachment; filename="results-{phase.replace(" ", "-")}.csv"'}
         return Response(as_csv(tables(sweep).overview(phase)), media_type="text/csv", headers=name)

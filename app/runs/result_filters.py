@@ -61,7 +61,7 @@ def _candidates(task: str, name: str, settings: Settings) -> Iterator[tuple[str,
     if (match := NAME.fullmatch(name)) is None:
         return
     for sweep, folder in sweep_folders(settings).items():
-        from beliefscope.recordings.sweep_table import Experiments  # pyarrow and DuckDB are slow to import
+        from beliefscope.recordings.experiments import Experiments  # pyarrow and DuckDB are slow to import
 
         with suppress(BadInput):  # damaged tables; the list of sweeps reports them
             tables = Experiments([folder])

@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from beliefscope.inspect.failures.events import Failures
     from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
     from beliefscope.inspect.trace import Trace, load_trace, save_trace
+    from beliefscope.recordings.experiments import Experiments
     from beliefscope.recordings.live import LiveRecorder
     from beliefscope.recordings.recorded_diagnosis import diagnose_runs
-    from beliefscope.recordings.sweep_table import Experiments
 
 __version__ = "0.2.0"
 
@@ -75,7 +75,7 @@ _SOURCES = {
     "inspect.trace": ("Trace", "load_trace", "save_trace"),
     "recordings.live": ("LiveRecorder",),
     "recordings.recorded_diagnosis": ("diagnose_runs",),
-    "recordings.sweep_table": ("Experiments",),
+    "recordings.experiments": ("Experiments",),
 }
 """Module -> its public names."""
 

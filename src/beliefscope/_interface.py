@@ -38,8 +38,9 @@ from beliefscope.inspect.maps.likelihood_map import LikelihoodMap, Quantity
 from beliefscope.inspect.maps.map_engine import COARSE, MapEngine
 from beliefscope.inspect.sweep import Inputs, location, source_of
 from beliefscope.inspect.trace import Trace, trace as trace_episode
+from beliefscope.recordings.experiments import Experiments
 from beliefscope.recordings.interactive.export import write_interactive
-from beliefscope.recordings.sweep_table import Experiments, run_sweep
+from beliefscope.recordings.sweep_table import run_sweep
 from beliefscope.recordings.write import write_recording
 
 Filter = Checkpoint | str | Path

@@ -12,7 +12,8 @@ import pytest
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import pretrained_path
 from beliefscope.inspect.sweep import Cell, Inputs
-from beliefscope.recordings.sweep_table import Experiments, run_sweep
+from beliefscope.recordings.experiments import Experiments
+from beliefscope.recordings.sweep_table import run_sweep
 
 READY = "() => document.querySelector('#experiments').dataset.state === 'ready'"
 

@@ -24,15 +24,8 @@ from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.sweep import Inputs, describe_checkpoint, summary
 from beliefscope.inspect.trace import trace
-from beliefscope.recordings.sweep_table import (
-    RESULTS,
-    TABLES,
-    Experiments,
-    is_finished,
-    replaced_results,
-    run_sweep,
-    write_tables,
-)
+from beliefscope.recordings.experiments import Experiments
+from beliefscope.recordings.sweep_table import RESULTS, TABLES, is_finished, replaced_results, run_sweep, write_tables
 
 pytestmark = pytest.mark.slow
 

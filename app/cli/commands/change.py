@@ -1,9 +1,16 @@
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.text import plural
 from beliefscope.recordings.report.command_lines import serve_command
+
+if TYPE_CHECKING:
+    from beliefscope.datasets.task import Task
+    from beliefscope.inspect.compare.checkpoints import CheckpointComparison
 
 
 def change(
@@ -45,13 +52,9 @@ def change(
       beliefscope change crossmodal-pf finetuned.safetensors --slice blackout-in-contact:faults=blackout=1:contact=yes
     """
     opt.prepare_workers(engine, workers, "beliefscope.inspect.compare.checkpoints")
-    from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
-    from beliefscope.app.runs.catalog import served_names
     from beliefscope.filters.finetuning.slices import parse_slices
-    from beliefscope.filters.names import is_source
     from beliefscope.filters.open_filter import open_filters
     from beliefscope.inspect.compare.checkpoints import compare_checkpoints, write_comparison
-    from beliefscope.inspect.diagnostics.views import as_json
     from beliefscope.inspect.standalone import removal_note
     from beliefscope.inspect.statistics.intervals import too_few
 
@@ -76,20 +79,7 @@ def change(
             progress=advance,
         )
         data_hash = episodes.hash
-    (first, second), data_name = served_names((before, after), data)
-    links = [
-        comparison_permalink(permalink(target, second, data_name, m.episode, m.step, m.faults), m, first)
-        for m in report.events
-    ]
-    document = report.to_dict() | {
-        "data_hash": data_hash,
-        "frozen": list(report.frozen),
-        "improved": as_json(report.improvements()),
-        "regressed": as_json(report.regressions()),
-        "regressed_slices": report.regressed_slices(),
-        "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
-        "serve": serve_command([*filter(is_source, (before, after))], data, seed),
-    }
+    document = {"data_hash": data_hash} | _document(report, target, (before, after), data, seed)
     heading = f"Before: {report.filters[0]}; after: {report.filters[1]}; {plural(len(report.episodes), 'episode')}"
     notes = dict.fromkeys(filter(None, map(removal_note, checkpoints)))
     text = "\n\n".join([heading, report.text, *notes])
@@ -99,3 +89,27 @@ def change(
     if failed:
         console.note(f"regressed: {', '.join(failed)}")
     return console.Result(document, text, code=int(bool(failed)))
+
+
+def _document(
+    report: CheckpointComparison, task: Task, sources: tuple[str, str], data: Path | None, seed: int
+) -> dict[str, Any]:
+    """The report as JSON values, with a link to each event and the command that serves the filters."""
+    from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
+    from beliefscope.app.runs.catalog import served_names
+    from beliefscope.filters.names import is_source
+    from beliefscope.inspect.diagnostics.views import as_json
+
+    (first, second), data_name = served_names(sources, data)
+    links = [
+        comparison_permalink(permalink(task, second, data_name, m.episode, m.step, m.faults), m, first)
+        for m in report.events
+    ]
+    return report.to_dict() | {
+        "frozen": list(report.frozen),
+        "improved": as_json(report.improvements()),
+        "regressed": as_json(report.regressions()),
+        "regressed_slices": report.regressed_slices(),
+        "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
+        "serve": serve_command([*filter(is_source, sources)], data, seed),
+    }

@@ -29,7 +29,7 @@ def experiments(
       beliefscope experiments sweep --sql "SELECT phase, avg(coverage95) FROM results GROUP BY phase"
       beliefscope experiments sweep-a sweep-b -o all.csv
     """
-    from beliefscope.recordings.sweep_table import Experiments, labelled, write_rows
+    from beliefscope.recordings.experiments import Experiments, labelled, write_rows
 
     tables = Experiments(sweeps)
     rows = tables.query(sql) if sql is not None else tables.overview(phase, sort)

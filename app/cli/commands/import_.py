@@ -23,8 +23,7 @@ def import_(
     ),
     output: Path | None = opt.option(
         "RUN.trace|RUN.live|DATA.h5|DIR",
-        "Output: a trace; a data set; a run, for the folder 'live' of a workspace; or a folder for one trace per "
-        "episode, or for runs if its name is 'live'.",
+        "A trace, a data set, a run for the folder 'live' of a workspace, or a folder of traces, named 'live' of runs.",
         None,
         "-o",
         "--output",
@@ -46,10 +45,10 @@ def import_(
     """Import recordings and logs as traces or data sets.
 
     The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
-    If a live run is in progress or was killed, its complete steps are imported. If the output is a folder, each
-    file becomes a trace of the same name; a file with several episodes becomes one trace per episode, with its index
-    after the name. In a folder named 'live', such as that of a workspace, the files are runs, which the page displays.
-    Files that cannot be imported are reported, and the others are written.
+    If a live run is in progress or was killed, its complete steps are imported. If the output is a folder, each file
+    becomes a trace of the same name; a file with several episodes becomes one trace per episode, with its index after
+    the name. In a folder named 'live', such as that of a workspace, they are runs, which the page displays. Files that
+    cannot be imported are reported.
 
     For a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a

@@ -117,7 +117,7 @@ def serve(
     for name, folder in settings.studies.items():
         Study(name, folder, has_checkpoints=True).read()  # raises BadInput early
     if sweep:
-        from beliefscope.recordings.sweep_table import Experiments  # DuckDB is slow to import
+        from beliefscope.recordings.experiments import Experiments  # DuckDB is slow to import
 
         Experiments(settings.sweeps.values())
     serve_page(settings, port, open_page, host, access)

@@ -57,7 +57,8 @@ def sweep(
     """
     opt.prepare_workers(engine, workers, "beliefscope.recordings.sweep_table")
     from beliefscope.inspect.sweep import Inputs, find_checkpoints
-    from beliefscope.recordings.sweep_table import SHOWN, Experiments, labelled, run_sweep
+    from beliefscope.recordings.experiments import SHOWN, Experiments, labelled
+    from beliefscope.recordings.sweep_table import run_sweep
 
     opt.check_folder(output, "output")
     inputs = Inputs(

@@ -19,7 +19,8 @@ from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path, save_checkpoint
 from beliefscope.inspect.sweep import Inputs
-from beliefscope.recordings.sweep_table import CHECKPOINTS, Experiments, run_sweep
+from beliefscope.recordings.experiments import Experiments
+from beliefscope.recordings.sweep_table import CHECKPOINTS, run_sweep
 
 pytestmark = pytest.mark.slow
 

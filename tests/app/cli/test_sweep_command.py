@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import pretrained_path
-from beliefscope.recordings.sweep_table import Experiments
+from beliefscope.recordings.experiments import Experiments
 
 
 @pytest.mark.slow
@@ -31,7 +31,7 @@ def test_checkpoints_without_data_of_their_task_are_named(run: Callable[..., Any
 def test_the_largest_errors_are_printed(
     run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beliefscope.recordings.sweep_table.SHOWN", 1)
+    monkeypatch.setattr("beliefscope.recordings.experiments.SHOWN", 1)
     with open_dataset(sample_path("push")) as data:
         write_dataset(tmp_path / "push.h5", data.task, [data[9]])
     arguments = ["--checkpoints", pretrained_path("push", "haptics-ekf"), "--data", tmp_path / "push.h5"]
