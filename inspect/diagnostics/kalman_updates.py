@@ -63,13 +63,14 @@ def correction_slopes(steps: RepeatedSteps, updates: Updates) -> Array:
     """(K,) slopes of the filter's corrections on the expected ones, -1 to 1; NaN without a measurement.
 
     They show the sign of the H of its gains, which the products ``H P H^T`` do not show. Of more modalities than
-    values, such as of four redundant sensors in one step, the slopes next to 1 count.
+    values, such as of four redundant sensors in one step, the slopes next to that of all together count.
     """
     scale = inverse_std(steps.covariance[:, 0])
     parts = updates.corrections * scale[:, None]
     columns = parts.swapaxes(1, 2).reshape(steps.correction.size, -1)
-    difference = (steps.correction * scale).ravel() - columns.sum(1)
-    slopes = 1.0 + np.linalg.lstsq(columns, difference, rcond=1e-9)[0]
+    correction, total = (steps.correction * scale).ravel(), columns.sum(1)
+    common = float(total @ correction / max(float(total @ total), 1e-24))
+    slopes = common + np.linalg.lstsq(columns, correction - common * total, rcond=1e-9)[0]
     return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
 

@@ -140,7 +140,7 @@ def _wrong_sign(modalities: Sequence[str]) -> Cause:
         tuple(Symptom(f"correction slope/{modality}/*", -1, target="mirrored") for modality in modalities),
         f"{JACOBIANS}|measurement function/*|measurement noise/*|{FILTER}",
         "Check the sign of the innovations, reading minus expected reading, and that the corrections are added.",
-        prior=0.3,  # each wrong Jacobian explains those of the other modalities as well
+        prior=0.5,  # each wrong Jacobian explains those of the other modalities as well
     )
 
 
