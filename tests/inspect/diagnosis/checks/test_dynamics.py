@@ -262,3 +262,22 @@ def test_likelihoods_show_the_measurement_model_of_a_filter_that_has_lost_the_st
         assert values[f"measurement noise/{key}/all"] == pytest.approx(2.0 * std, rel=0.1)
         for axis in "xy":
             assert values[f"measurement function/{key} {axis}/all"] == pytest.approx(0.03 / std, rel=0.3)
+
+
+def test_the_bias_of_exact_predictions_does_not_depend_on_the_speed() -> None:
+    """The slope on true changes is that of changes with process noise: its intercept grows with the mean change."""
+    biases = {}
+    for speed in (0.0, 0.02, 0.06):
+        rng, rows = np.random.default_rng(0), []
+        for seed in range(4):
+            slow = drive(seed)
+            controls = slow.controls + np.float32(speed)
+            states = np.cumsum(controls + rng.normal(0.0, 0.05, controls.shape), axis=0)
+            readings = {key: states + rng.normal(0.0, std, states.shape) for key, std in SENSORS.items()}
+            episode = bs.Episode(TASK, states, controls, readings, seed=seed, split="test")
+            values = dynamics_statistics(bs.trace(of_cart(Cart(noise=0.05)), [episode]), of_cart(Cart(noise=0.05)))
+            rows.append(values["dynamics bias/x/all"])
+            assert values["dynamics slope/x/all"] < 0.7, "diluted"
+        biases[speed] = np.mean(rows)
+    deviation = 0.05 / math.sqrt(4 * 60)
+    assert biases == pytest.approx(dict.fromkeys(biases, 0.0), abs=4.0 * deviation)
