@@ -52,7 +52,7 @@ COMPARABLE = 0.3
 """Smallest ratio of their probabilities for two causes that cannot be separated."""
 
 EQUAL = 0.8
-"""As ``COMPARABLE``, of two causes the first of which is as probable as all others together."""
+"""As ``COMPARABLE``, if the first cause is as probable as all others together."""
 
 LISTED = 5
 """Maximum number of listed causes."""
