@@ -30,6 +30,12 @@ def load_module(place: str) -> ModuleType:
     return _run_file(Path(place)) if place.endswith(".py") else _import(place)
 
 
+def functions_of(module: ModuleType) -> list[str]:
+    """Names of the functions and classes that a module defines."""
+    names = vars(module).items()
+    return [name for name, v in names if callable(v) and getattr(v, "__module__", "") == module.__name__]
+
+
 @contextmanager
 def importable(place: str) -> Iterator[None]:
     """Append the folder of the file, or the working directory, to ``sys.path`` temporarily."""

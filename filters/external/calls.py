@@ -51,6 +51,15 @@ def has_own_start(filter_: Any) -> bool:
         return False
 
 
+def takes_file(build: Any) -> bool:
+    """Whether a build function has a parameter without a default: it receives the path of the weights."""
+    try:
+        parameters = inspect.signature(build).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    return any(p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
+
+
 def takes_start(filter_: Any) -> bool:
     """Whether the filter is called step by step from a belief that it is given."""
     return is_stepwise(filter_) and not has_own_start(filter_)

@@ -59,6 +59,7 @@ from beliefscope.filters.external.calls import (
     seeded,
     snapshot,
     steps_of,
+    takes_file,
     with_advice,
 )
 from beliefscope.filters.external.derived_values import derived
@@ -331,10 +332,10 @@ class ExternalFilter(Checkpoint):
 def load_external(
     source: str, task: str | Task = "", given: Sequence[Task] = (), named: Sequence[Task] = ()
 ) -> ExternalFilter:
-    """The filter that ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION`` returns when called without arguments.
+    """The filter that ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION`` returns when called.
 
     The global generators of torch and NumPy are seeded for the call. ``FILE.py:FUNCTION@FILE.safetensors`` loads
-    weights into the module, such as those of a fine-tuning run.
+    weights into the module, such as those of a fine-tuning run; a function with a parameter receives their path.
 
     Args:
         task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.
@@ -348,14 +349,13 @@ def load_external(
         module = user_code.load_module(place)
         build = getattr(module, attribute, None)
         if not callable(build):
-            functions = [
-                n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == module.__name__
-            ]
             problem = f"has no {attribute!r}" if build is None else f"has {attribute!r}, which is not callable"
-            raise BadInput(f"{place} {problem}. Available: {', '.join(functions) or 'none'}.")
+            raise BadInput(f"{place} {problem}. Available: {', '.join(user_code.functions_of(module)) or 'none'}.")
+        if (takes_weights := takes_file(build)) and not weights:
+            raise BadInput(f"{source} needs weights: {place}:{attribute}@FILE.safetensors")
         try:
             with seeded(0, None):  # the same parameters, and so the same hash, in every process
-                result = build()
+                result = build(*[Path(weights)] * takes_weights)
         except Exception as error:
             raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
     if weights:

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from beliefscope.datasets.episode import Episode
@@ -31,6 +32,7 @@ def episode() -> Episode:
 
 FILE = """
 import torch
+from safetensors.torch import save_file
 from torch import Tensor, nn
 class Filter(nn.Module):
     value = {value}
@@ -267,3 +269,30 @@ def test_named_tasks_are_not_the_default(tmp_path: Path) -> None:
     assert load_external(f"{path}:build", given=[DOOR], named=[own]).task.name == "door"
     with pytest.raises(BadInput, match=r"does not name its task"):
         load_external(f"{path}:build", named=[own])
+
+
+WIDE = """
+from safetensors import safe_open
+from torch import nn
+class Filter(nn.Module):
+    task = "door"
+    def __init__(self, width):
+        super().__init__()
+        self.head = nn.Linear(width, 3, bias=False)
+    def initialize_beliefs(self, mean, covariance): pass
+    def forward(self, observations, controls): return self.head.weight.sum(1).expand(len(controls), -1)
+def build(weights):
+    with safe_open(weights, "pt") as file:
+        return Filter(file.get_slice("head.weight").get_shape()[1])
+"""
+
+
+def test_a_build_function_with_a_parameter_receives_the_path_of_the_weights(tmp_path: Path, episode: Episode) -> None:
+    (tmp_path / "own.py").write_text(WIDE)
+    for width in (2, 5):
+        save_file({"head.weight": torch.ones(3, width)}, tmp_path / f"{width}.safetensors")
+        external = load_external(f"{tmp_path}/own.py:build@{tmp_path}/{width}.safetensors")
+        values, _ = external.run([episode])
+        assert values["estimate_mean"].unique().tolist() == [width]
+    with pytest.raises(BadInput, match=r"own\.py:build needs weights: .*own\.py:build@FILE\.safetensors$"):
+        load_external(f"{tmp_path}/own.py:build")
