@@ -80,7 +80,8 @@ def _controls(task: Task) -> tuple[Cause, ...]:
     if not task.control_size or commands_hand(task):
         return ()
     # Updates of single modalities, which stand in for measurements, depend on the prediction.
-    changed = f"reading */*|lag/dynamics/*|{LABELS}|{DYNAMICS}"  # expected readings may depend on the controls
+    # Expected readings may depend on the controls, such as those in a frame whose heading is one.
+    changed = f"reading */*|exchanged/*|inverted/*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
     used = Symptom("dynamics slope/*|dynamics spread/*|reading gain/control*", 0, optional=True)
     return (
         Cause(
