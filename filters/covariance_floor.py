@@ -49,11 +49,10 @@ def is_covariance(matrices: NDArray[Any]) -> NDArray[np.bool_]:
     Unknown and infinite matrices are not.
     """
     matrices = np.where(np.isfinite(matrices), matrices, np.nan)
-    variance = np.diagonal(matrices, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
-    difference = np.abs(matrices - np.swapaxes(matrices, -1, -2)) / (scale[..., :, None] * scale[..., None, :])
-    is_symmetric = (difference <= INDEFINITE).all((-2, -1))
-    return np.asarray(is_symmetric & (variance > 0.0).all(-1) & ~is_indefinite(matrices))
+    correlations = _correlations(matrices)
+    is_symmetric = (np.abs(correlations - np.swapaxes(correlations, -1, -2)) <= INDEFINITE).all((-2, -1))
+    has_variances = (np.diagonal(matrices, axis1=-2, axis2=-1) > 0.0).all(-1)
+    return np.asarray(is_symmetric & has_variances & ~is_indefinite(matrices))
 
 
 def without_invalid(trajectories: Sequence[Tensor], firsts: Sequence[int]) -> list[Tensor]:
@@ -82,9 +81,14 @@ def is_indefinite(covariance: NDArray[Any]) -> NDArray[np.bool_]:
 
     The tolerance covers the rounding of single precision. Unknown covariances, NaN, are not indefinite.
     """
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    correlations, variances = _correlations(covariance), np.diagonal(covariance, axis1=-2, axis2=-1)
+    known = np.isfinite(correlations).all((-2, -1))
+    eigenvalues = np.linalg.eigvalsh(np.where(known[..., None, None], correlations, 1.0))
+    return np.asarray(known & ((variances < 0.0).any(-1) | (eigenvalues[..., 0] < -INDEFINITE)))
+
+
+def _correlations(matrices: NDArray[Any]) -> NDArray[Any]:
+    """Matrices (..., n, n) divided by the standard deviations of their positive variances."""
+    variance = np.diagonal(matrices, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
-    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
-    known = np.isfinite(correlation).all((-2, -1))
-    eigenvalues = np.linalg.eigvalsh(np.where(known[..., None, None], correlation, 1.0))
-    return np.asarray(known & ((variance < 0.0).any(-1) | (eigenvalues[..., 0] < -INDEFINITE)))
+    return matrices / (scale[..., :, None] * scale[..., None, :])

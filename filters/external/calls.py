@@ -43,21 +43,21 @@ def is_stepwise(filter_: Any) -> bool:
 
 def has_own_start(filter_: Any) -> bool:
     """Whether the filter supplies its initial belief: ``initialize_beliefs`` has no parameters."""
-    if not is_stepwise(filter_):
-        return False
-    try:
-        return not inspect.signature(filter_.initialize_beliefs).parameters
-    except (TypeError, ValueError):  # some built-in functions have no signature
-        return False
+    return is_stepwise(filter_) and _parameters(filter_.initialize_beliefs) == []
 
 
 def takes_file(build: Any) -> bool:
     """Whether a build function has a parameter without a default: it receives the path of the weights."""
-    try:
-        parameters = inspect.signature(build).parameters.values()
-    except (TypeError, ValueError):
-        return False
+    parameters = _parameters(build) or []
     return any(p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
+
+
+def _parameters(function: Any) -> list[inspect.Parameter] | None:
+    """The parameters of a function; None if it has no signature, as some built-in functions."""
+    try:
+        return [*inspect.signature(function).parameters.values()]
+    except (TypeError, ValueError):
+        return None
 
 
 def takes_start(filter_: Any) -> bool:

@@ -9,9 +9,10 @@ import numpy as np
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.checks.innovations import angle_columns
 from beliefscope.inspect.diagnosis.checks.labels import common_part
-from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
+from beliefscope.inspect.diagnosis.checks.true_starts import run_from_truth, smallest_std, some_steps
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.statistics.signals import wrapped
 from beliefscope.inspect.trace import Trace
 
 MIN_STEPS = 10
@@ -21,46 +22,44 @@ UNCERTAIN = 0.5
 """Largest standard error of a lag in steps, for readings with the noise R."""
 
 
-def innovation_lags(trace: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
+def innovation_lags(trace: Trace, near_truth: Trace, checkpoint: ExternalFilter) -> dict[str, float]:
     """``lag/labels MODALITY/all``: steps by which the labels follow a modality, less what all have in common.
 
     Of filters that report innovations nu, but no measured states. The reading of step t is compared with the true
     states of t and of the step before, ``d = nu(t - 1) - nu(t)`` being the change of h(x). A reading that is late by L
     has ``nu(t) = -L d``: the lag is the slope of nu on d, weighted by 1 / S, around their means, since a bias is no
     delay. What is common is an error of the dynamics, by which both steps begin. None if fewer than two are known.
+
+    near_truth: the trace with the innovations of steps from true states (``with_innovations_near_truth``).
     """
     is_known = trace.observation_mean is not None or len(trace.modalities_with_posterior) > 0
-    if trace.innovation is None or is_known or not has_true_starts(checkpoint):
+    at, covariance = near_truth.innovation, near_truth.innovation_covariance
+    if at is None or covariance is None or at is trace.innovation or is_known:
         return {}
-    steps = some_steps(trace, checkpoint)
-    steps, std = steps[steps > 1], smallest_std(trace)
-    episode = trace.episode
+    steps, episode = some_steps(trace, checkpoint), trace.episode
+    steps = steps[steps > 1]
     later = {key: np.roll(values, -1, axis=0) for key, values in episode.observations.items()}
     masks = {key: np.roll(values, -1, axis=0) for key, values in episode.covariates.items()}
     before = replace(trace, episode=replace(episode, observations=later, covariates=masks))
-    at, earlier = run_from_truth(trace, checkpoint, steps, std), run_from_truth(before, checkpoint, steps - 1, std)
-    if at is None or earlier is None or "innovation" not in at or "innovation" not in earlier:
+    earlier = run_from_truth(before, checkpoint, steps - 1, smallest_std(trace))
+    if earlier is None or "innovation" not in earlier:
         return {}
-    nu, change = at["innovation"].astype(np.float64), earlier["innovation"].astype(np.float64) - at["innovation"]
-    variance = np.diagonal(at["innovation_covariance"], axis1=-2, axis2=-1).astype(np.float64)
+    nu = at[steps].astype(np.float64)
+    change = earlier["innovation"].astype(np.float64) - nu
+    variance = np.diagonal(covariance[steps], axis1=-2, axis2=-1).astype(np.float64)
     lags: dict[str, float] = {}
     for k, modality in enumerate(trace.modalities):
         keep = ~measures.absent(trace, modality)[steps]
         angles = angle_columns(trace, modality)
-        own_nu, own_change = (_wrapped(values[keep, k], angles) for values in (nu, change))
-        lags[modality] = _slope(own_nu, own_change, variance[keep, k])
+        own = nu[keep, k], change[keep, k]
+        for values in own:
+            values[:, angles] = wrapped(values[:, angles])
+        lags[modality] = _slope(*own, variance[keep, k])
     known = np.array([value for value in lags.values() if np.isfinite(value)])
     if len(known) < 2:
         return {}
     common = float(common_part(known[:, None])[0])
     return {f"lag/labels {modality}/all": value - common for modality, value in lags.items() if np.isfinite(value)}
-
-
-def _wrapped(values: Array, angles: list[int]) -> Array:
-    """Values (S, m) with angles from -pi to pi."""
-    result = values.copy()
-    result[:, angles] = (result[:, angles] + np.pi) % (2.0 * np.pi) - np.pi
-    return result
 
 
 def _slope(nu: Array, change: Array, variance: Array) -> float:

@@ -155,9 +155,10 @@ def _without_effect(trace: Trace) -> Mask:
     if not np.allclose(covariances, covariances[:, :1], rtol=1e-4, equal_nan=True):
         after = np.concatenate([means[:, 1:], after], axis=1)
         after_covariance = np.concatenate([covariances[:, 1:], after_covariance], axis=1)
-    moved = np.abs(trace.task.difference(after.astype(np.float64), means)) <= SAME * deviations(covariances)
+    moved = np.abs(trace.task.difference(after.astype(np.float64), means))
+    is_there = (moved <= SAME * deviations(covariances)).all(-1)
     largest = np.abs(covariances).max((-2, -1), keepdims=True)
-    return np.asarray(moved.all(-1) & (np.abs(after_covariance - covariances) <= SAME * largest).all((-2, -1)))
+    return np.asarray(is_there & (np.abs(after_covariance - covariances) <= SAME * largest).all((-2, -1)))
 
 
 def _by_modality(modalities: tuple[str, ...], channels: Array, total: Array) -> dict[str, float]:

@@ -66,7 +66,7 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
         near_truth = trace
         if has_truth:
             near_truth = with_innovations_near_truth(with_particles_near_truth(trace, checkpoint), checkpoint)
-            values |= innovation_lags(trace, checkpoint)
+            values |= innovation_lags(trace, near_truth, checkpoint)
         values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
         if isinstance(checkpoint, UnavailableFilter) or reports_estimates_only(trace):  # of others, its causes
             variance = np.diagonal(trace.estimate_covariance[measures.counted(trace)], axis1=-2, axis2=-1)

@@ -165,13 +165,13 @@ def with_particles_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace
 
 
 def with_innovations_near_truth(trace: Trace, checkpoint: ExternalFilter) -> Trace:
-    """As ``with_particles_near_truth``, with innovations and the means before and after the updates.
+    """As ``with_particles_near_truth``, with innovations, their covariances and the means before and after the updates.
 
     At other steps these means are the true states: angles are continuous over all steps.
     """
     if trace.innovation is None or trace.predicted_mean is None:
         return trace
-    names = ("innovation", "predicted_mean", "estimate_mean")
+    names = ("innovation", "innovation_covariance", "predicted_mean", "estimate_mean")
     near = _near_truth(trace, checkpoint, names, smallest_std(trace))
     predicted, estimate, truth = near.predicted_mean, near.estimate_mean, trace.episode.states
     if near is trace or predicted is None:

@@ -11,12 +11,14 @@ from tests.inspect.diagnosis.checks.test_innovations import Boat, loaded, sail
 import beliefscope as bs
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.checks.innovation_lags import innovation_lags
+from beliefscope.inspect.diagnosis.checks.true_starts import with_innovations_near_truth
 
 
 def lags(episode: bs.Episode) -> dict[str, float]:
     checkpoint = loaded(Boat(), every=1)
     assert isinstance(checkpoint, ExternalFilter)
-    values = innovation_lags(bs.trace(checkpoint, [episode]), checkpoint)
+    run = bs.trace(checkpoint, [episode])
+    values = innovation_lags(run, with_innovations_near_truth(run, checkpoint), checkpoint)
     return {name.removeprefix("lag/labels ").removesuffix("/all"): value for name, value in values.items()}
 
 
@@ -48,5 +50,5 @@ def test_delayed_labels_are_common_to_all_modalities() -> None:
 def test_filters_without_innovations_have_no_such_lags() -> None:
     checkpoint = loaded(Boat(), every=1)
     assert isinstance(checkpoint, ExternalFilter)
-    run = bs.trace(checkpoint, [sail(3, every=1)])
-    assert innovation_lags(replace(run, innovation=None, innovation_covariance=None), checkpoint) == {}
+    run = replace(bs.trace(checkpoint, [sail(3, every=1)]), innovation=None, innovation_covariance=None)
+    assert innovation_lags(run, with_innovations_near_truth(run, checkpoint), checkpoint) == {}
