@@ -81,7 +81,8 @@ def _controls(task: Task) -> tuple[Cause, ...]:
         return ()
     # Updates of single modalities, which stand in for measurements, depend on the prediction.
     # Expected readings may depend on the controls, such as those in a frame whose heading is one.
-    changed = f"reading */*|exchanged/*|inverted/*|lag/dynamics/*|{LABELS}|{DYNAMICS}"
+    sensors = "|".join(f"exchanged/{key}*|inverted/{key}*" for key in modelled_sensors(task))
+    changed = "|".join(filter(None, ("reading */*", sensors, "lag/dynamics/*", LABELS, DYNAMICS)))
     used = Symptom("dynamics slope/*|dynamics spread/*|reading gain/control*", 0, optional=True)
     return (
         Cause(
