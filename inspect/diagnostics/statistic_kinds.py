@@ -126,6 +126,7 @@ KINDS = {
     "following": ("delay of the hand behind its set point{axis}", False, 0.05),
     "opposed": ("evidence for the opposite sign", False, 0.1),
     "scale": ("scale{of} relative to the motion of the hand", False, 0.02),
+    "step scale": ("scale{of} relative to the steps of the set point", False, 0.02),
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
 standard deviation between episodes, below which differences are irrelevant. A name may have a place ``{of}`` for

@@ -93,8 +93,8 @@ CAUSES = (
     Cause(
         "control.scale",
         "Controls scaled",
-        (Symptom("scale/control/*", 0),),
-        f"offset/control*|{DYNAMICS}",
+        (Symptom("step scale/control/*", 0, unmeasured=(Symptom("scale/control/*", 0),)),),
+        f"scale/control/*|offset/control*|{DYNAMICS}",
         "Check the units of the controls.",
         "scale control",
     ),

@@ -224,6 +224,9 @@ def lever(force: Array, torque: Array) -> tuple[Array, float]:
 def control_statistics(episode: Episode) -> dict[str, float]:
     """Delay and scale of controls that command a hand position, against the measured position.
 
+    ``step scale``: slope of the commanded changes on the differences of the commanded positions. It is one whatever
+    the hand does, unless only the changes are scaled.
+
     Of other controls, the standard deviation of each channel: only a filter's dynamics say what they do.
     """
     if not commands_hand(episode.task):
@@ -239,11 +242,17 @@ def control_statistics(episode: Episode) -> dict[str, float]:
     steps = np.arange(len(hand))
     valid = (steps - shift >= 1) & (steps - shift < len(hand))
     a, b = change[valid], moved[steps[valid] - shift]
-    power = np.square(b).sum()
     return {
         "lag/control/all": delay,
-        "scale/control/all": float((a * b).sum() / power) if power > 1e-12 else np.nan,
+        "scale/control/all": _slope(a, b),
+        "step scale/control/all": _slope(change[:-1], np.diff(controls[:, POSITION], axis=0)),
     }
+
+
+def _slope(a: Array, b: Array) -> float:
+    """Slope of a on b, (T, 3) each; NaN if b does not vary."""
+    power = np.square(b).sum()
+    return float((a * b).sum() / power) if power > 1e-12 else np.nan
 
 
 def commands_hand(task: Task) -> bool:

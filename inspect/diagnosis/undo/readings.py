@@ -204,7 +204,8 @@ def scale_control(inputs: RunInputs, deviations: Deviations) -> RunInputs | None
     size = inputs.checkpoint.task.control_size
     factors = np.array([_scale(deviations, channel, size) for channel in range(size)])
     if commands_hand(inputs.checkpoint.task):
-        factors[CHANGE] = _ratio(deviations, "scale/control/all") or 1.0
+        names = ("step scale/control/all", "scale/control/all")
+        factors[CHANGE] = next(filter(None, (_ratio(deviations, name) for name in names)), 1.0)
     return None if (factors == 1.0).all() else with_readings(inputs, "control", lambda values, _: values / factors)
 
 

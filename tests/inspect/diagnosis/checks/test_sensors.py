@@ -217,6 +217,7 @@ def test_delay_and_scale_of_controls(task: str) -> None:
     assert values["scale/control/all"] == pytest.approx(0.5, abs=0.01)
     healthy = sensor_statistics(first, None)
     assert (healthy["lag/control/all"], healthy["scale/control/all"]) == (0.0, pytest.approx(1.0))
+    assert (values["step scale/control/all"], healthy["step scale/control/all"]) == pytest.approx((0.5, 1.0))
     assert max(abs(healthy[f"offset/control {axis}/all"]) for axis in "xyz") < 1e-6
 
 
