@@ -6,7 +6,6 @@ the units of their sensors.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput, type_name, unknown_name
 from beliefscope.datasets.task import Task
@@ -250,22 +249,12 @@ def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -
         axes: number of axes of size m_k, 0 to 2. leading: sizes of the axes before.
     """
     m = max((part.shape[-1] for part in parts if part is not None), default=0) if axes else 0
-    values = torch.full((*leading, len(parts), *(m,) * axes), torch.nan, dtype=torch.float64)
+    values = np.full((*leading, len(parts), *(m,) * axes), np.nan)  # NumPy is faster for values of a step
     for k, part in enumerate(parts):
         if part is not None:
             size = slice(part.shape[-1] if axes else None)
-            values[(..., k, *(size,) * axes)] = part.double()
-    return values
-
-
-def joined(name: str, runs: Sequence[Tensor], dim: int = 1) -> Tensor:
-    """Values (T, ...) of several runs along an axis, such as N; NaN after the last channels of smaller measurements."""
-    if len(runs) == 1:
-        return runs[0]
-    if axes := SHAPES.get(name, "").count("m"):
-        size = max(values.shape[-1] for values in runs)
-        runs = [nn.functional.pad(v, (0, size - v.shape[-1]) * axes, value=math.nan) for v in runs]
-    return torch.cat(list(runs), dim=dim)
+            values[(..., k, *(size,) * axes)] = part.double().numpy()
+    return torch.from_numpy(values)
 
 
 def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str, step: int = 0) -> Values:

@@ -6,7 +6,7 @@ import copy
 import inspect
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -204,6 +204,14 @@ def _tensors(filter_: Any) -> Iterator[Tensor]:
 @contextmanager
 def seeded(seed: int, filter_: Any) -> Iterator[None]:
     """Seeds the global generators of torch and NumPy; restores them afterwards."""
+    with kept_generators(filter_) as seed_generators:
+        seed_generators(seed)
+        yield
+
+
+@contextmanager
+def kept_generators(filter_: Any) -> Iterator[Callable[[int], None]]:
+    """Restores the global generators of torch and NumPy afterwards. Gives a function that seeds them."""
     device = device_of(filter_)
     state = np.random.get_state()  # noqa: NPY002 - filters of other projects use the global generator
     generators = [torch.default_generator]
@@ -212,11 +220,14 @@ def seeded(seed: int, filter_: Any) -> Iterator[None]:
             torch.cuda.default_generators[torch.cuda.current_device() if device.index is None else device.index]
         )
     states = [generator.get_state() for generator in generators]
-    for generator in generators:
-        generator.manual_seed(seed)
-    np.random.seed(seed % 2**32)  # noqa: NPY002
+
+    def seed_generators(seed: int) -> None:
+        for generator in generators:
+            generator.manual_seed(seed)
+        np.random.seed(seed % 2**32)  # noqa: NPY002
+
     try:
-        yield
+        yield seed_generators
     finally:
         for generator, own in zip(generators, states, strict=True):
             generator.set_state(own)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -41,7 +42,6 @@ from beliefscope.filters.external.adapter import (
     Values,
     check_values,
     copied,
-    joined,
     model_names,
     named_values,
 )
@@ -55,6 +55,7 @@ from beliefscope.filters.external.calls import (
     initialize,
     inputs_of,
     is_stepwise,
+    kept_generators,
     restore,
     seeded,
     snapshot,
@@ -65,7 +66,7 @@ from beliefscope.filters.external.calls import (
 from beliefscope.filters.external.derived_values import derived
 from beliefscope.filters.external.fingerprint import fingerprint
 from beliefscope.filters.external.module_weights import load_weights, pretrained_std
-from beliefscope.filters.external.step_values import StepValues, with_ancestors
+from beliefscope.filters.external.step_values import StepValues, check_steps, stacked, with_ancestors
 from beliefscope.filters.external.torchfilter_hooks import Capture
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.names import code_parts, external_name
@@ -170,55 +171,52 @@ class ExternalFilter(Checkpoint):
             BadInput: an episode does not fit the task, the module fails, or it returns invalid values; the message
                 names the step.
         """
-        start, runs = start or self.start(episodes), []
-        groups = [range(len(episodes))] if self.adapter.batched else [range(i, i + 1) for i in range(len(episodes))]
-        for number, group in enumerate(groups):
-
-            def share(done: float, number: int = number) -> None:
-                if progress is not None:
-                    progress((number + done) / len(groups))
-
-            belief = Gaussian(start.mean[group], start.covariance[group])
-            runs.append(self._run([episodes[i] for i in group], seed, share, belief))
-        common = [name for name in runs[0][0] if all(name in values for values, _ in runs)]
-        values = {name: joined(name, [values[name] for values, _ in runs]) for name in common}
+        filter_, batched, n = self.adapter.module, self.adapter.batched, len(self._task.components)
+        belief = self._belief(start or self.start(episodes)) if is_stepwise(filter_) else ()
+        observations, controls = inputs_of(self._task, episodes, dtype_of(filter_))
+        groups: Sequence[Any] = [slice(None)] if batched else range(len(episodes))  # an index removes the axis N
+        runs: list[tuple[Values, tuple[int, ...]]] = []
+        steps: list[list[Values]] = []  # of each run
+        report = progress or (lambda done: None)
+        with torch.no_grad(), kept_generators(filter_) as seed_generators, with_advice(filter_, episodes):
+            try:
+                for number, group in enumerate(groups):
+                    seed_generators(seed)
+                    share = partial(lambda number, done: report((number + done) / len(groups)), number)
+                    inputs, first = _at(group, observations, controls), [part[group] for part in belief]
+                    runs.append(self._run(*inputs, first, steps, share))
+                values = runs[0][0] if batched else stacked([values for values, _ in runs], dim=1)
+                check_values(values, controls.shape[:2], {"n": n}, f"{self.source} over all steps")
+            except (BadInput, RuntimeError):  # torch.stack refuses different shapes
+                # An invalid value is the likely cause.
+                check_steps(steps, controls[0, groups[0]].shape[:-1], {"n": n}, self.source)
+                raise
         return derived(self._units.to_si(values), self._task), self._names(values, runs[0][1])
 
     def _run(
-        self, episodes: Sequence[Episode], seed: int, progress: Callable[[float], None], start: Gaussian
+        self,
+        observations: Values,
+        controls: Tensor,
+        belief: Sequence[Tensor],
+        steps: list[list[Values]],
+        progress: Callable[[float], None],
     ) -> tuple[Values, tuple[int, ...]]:
-        """One call of a filter of whole sequences, or T calls; values (T, N, ...) in the filter's units."""
-        observations, controls = inputs_of(self._task, episodes, dtype_of(self.adapter.module))
+        """Unchecked values by one call of a filter of whole sequences, or by T calls, whose values ``steps`` receives.
+
+        They are in the filter's units and, as the inputs, (T, N, ...), or (T, ...) without the axis N.
+        """
         models: tuple[int, ...] = ()
-        with torch.no_grad(), seeded(seed, self.adapter.module), with_advice(self.adapter.module, episodes):
-            if not is_stepwise(self.adapter.module):
-                values = self._at_once(observations, controls)
-                progress(1.0)
-                return values, models
-            record = StepValues(len(controls))
-            try:
-                for values, models in self._steps(observations, controls, start):  # noqa: B007
-                    record.append(values)
-                    progress(len(record.steps) / len(controls))
-            except BadInput:
-                self._check_steps(record.steps, len(episodes))  # an invalid value is the likely cause
-                raise
-            return self._stacked(record, len(episodes)), models
-
-    def _stacked(self, record: StepValues, count: int) -> Values:
-        """Values of all steps; checked at once, and step by step only if one of them is invalid."""
-        sizes = {"n": len(self._task.components)}
-        try:
-            return check_values(record.stacked(), (len(record.steps), count), sizes, f"{self.source} over all steps")
-        except (BadInput, RuntimeError):  # torch.stack refuses different shapes
-            self._check_steps(record.steps, count)
-            raise
-
-    def _check_steps(self, steps: Sequence[Values], count: int) -> None:
-        """Raises BadInput that names the first step with an invalid value."""
-        sizes = {"n": len(self._task.components)}
-        for t, values in enumerate(steps):
-            check_values(values, (count,), sizes, f"{self.source} at step {t}", t)
+        if not is_stepwise(self.adapter.module):
+            with self._errors_at("all steps"):
+                values = copied(self._values(observations, controls, device_of(self.adapter.module)))
+            progress(1.0)
+            return values, models
+        record = StepValues(len(controls))
+        steps.append(record.steps)
+        for values, models in self._steps(observations, controls, belief):  # noqa: B007
+            record.append(values)
+            progress(len(record.steps) / len(controls))
+        return record.stacked(), models
 
     def live(self, episode: Episode, seed: int = 0) -> Generator[tuple[Values, tuple[str, ...]]]:
         """Like ``run`` for one episode, as an iterator over steps: (N, ...) with N = 1, and the models' names.
@@ -226,13 +224,14 @@ class ExternalFilter(Checkpoint):
         Raises BadInput as ``run``, and for a filter that processes whole sequences.
         """
         if not is_stepwise(self.adapter.module):
-            raise BadInput(
-                f"{self.source} has no initialize_beliefs: it processes all steps at once, and cannot run live"
-            )
+            reason = "it processes all steps at once, and cannot run live"
+            raise BadInput(f"{self.source} has no initialize_beliefs: {reason}")
         observations, controls = inputs_of(self._task, [episode], dtype_of(self.adapter.module))
         with torch.no_grad(), seeded(seed, self.adapter.module):
-            sizes = {"n": len(self._task.components)}
-            for t, (values, models) in enumerate(self._steps(observations, controls, self.start([episode]))):
+            sizes, batched = {"n": len(self._task.components)}, self.adapter.batched
+            inputs = _at(slice(None) if batched else 0, observations, controls)
+            for t, (values, models) in enumerate(self._steps(*inputs, self._single(episode))):
+                values = values if batched else stacked([values])
                 step = check_values(with_ancestors(values), (1,), sizes, f"{self.source} at step {t}", t)
                 yield self._units.to_si(copied(step)), self._names({n: v[None] for n, v in step.items()}, models)
 
@@ -243,13 +242,17 @@ class ExternalFilter(Checkpoint):
     def begin(self, episode: Episode) -> None:
         """Initialises the filter for an episode. Raises BadInput as ``run``."""
         with torch.no_grad():
-            self._initialize(self.start([episode]))
+            self._initialize(self._single(episode))
 
     def step(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
         """Returned values of one more step from the filter's state, (N, ...), SI units. Raises BadInput as ``run``."""
+        batched, device, leading = self.adapter.batched, device_of(self.adapter.module), controls.shape[:1]
+        if not batched:
+            observations, controls = {key: value[0] for key, value in observations.items()}, controls[0]
         with torch.no_grad(), self._errors_at("one step"):
-            output = copied(self._call(observations, controls, device_of(self.adapter.module)))
-        return self._units.to_si(check_values(output, (len(controls),), {"n": len(self._task.components)}, self.source))
+            values = self._values(observations, controls, device)
+            output = copied(values) if batched else stacked([values])
+        return self._units.to_si(check_values(output, leading, {"n": len(self._task.components)}, self.source))
 
     def snapshot(self) -> Any:
         """The filter's state, for ``restore``. Raises BadInput if it can be neither returned nor copied."""
@@ -260,17 +263,17 @@ class ExternalFilter(Checkpoint):
         restore(self.adapter.module, state)
 
     def _steps(
-        self, observations: Mapping[str, Tensor], controls: Tensor, start: Gaussian
+        self, observations: Mapping[str, Tensor], controls: Tensor, belief: Sequence[Tensor]
     ) -> Iterator[tuple[Values, tuple[int, ...]]]:
         """The unchecked values of each step, in the filter's units, and the indices of the participating models."""
-        self._initialize(start)
+        self._initialize(belief)
         filter_ = self.adapter.module
         recorded = filter_ if isinstance(filter_, nn.Module) and self.adapter.batched else None
         device = device_of(filter_)
         with Capture(recorded) as capture:
             for t, (inputs, control) in enumerate(steps_of(observations, controls)):
                 try:
-                    output = self._call(inputs, control, device)
+                    output = self._values(inputs, control, device)
                     values = capture.step(output["estimate_mean"]) | output
                 except BadInput:
                     raise
@@ -278,38 +281,29 @@ class ExternalFilter(Checkpoint):
                     raise FailedStep(str(self._error(f"step {t}", error)), t) from error
                 yield values, capture.models
 
-    def _initialize(self, start: Gaussian) -> None:
-        filter_ = self.adapter.module
-        if has_own_start(filter_):
-            with self._errors_at("initialize_beliefs"):
-                initialize(filter_)
-            return
+    def _initialize(self, belief: Sequence[Tensor]) -> None:
+        with self._errors_at("initialize_beliefs"):
+            initialize(self.adapter.module, *belief)
+
+    def _single(self, episode: Episode) -> Sequence[Tensor]:
+        """The first belief of an episode as the filter takes it: with the axis N = 1 or, if it takes none, without."""
+        belief = self._belief(self.start([episode]))
+        return belief if self.adapter.batched else [part[0] for part in belief]
+
+    def _belief(self, start: Gaussian) -> Sequence[Tensor]:
+        """Mean (N, n) and covariance (N, n, n) in the filter's units; none for a filter with a start of its own."""
+        if has_own_start(self.adapter.module):
+            return ()
         if start.covariance.isnan().any():
             raise BadInput(
                 f"{self.source} needs an initial covariance, and task {self._task.name!r} has no pretrained filter to "
                 "take it from: give Adapter(module, initial_std=...), or an initialize_beliefs without parameters"
             )
-        mean, covariance = self._units.from_si(start, dtype_of(filter_))
-        if not self.adapter.batched:
-            mean, covariance = mean[0], covariance[0]
-        with self._errors_at("initialize_beliefs"):
-            initialize(filter_, mean, covariance)
+        return self._units.from_si(start, dtype_of(self.adapter.module))
 
-    def _call(self, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device) -> Values:
-        """The filter's output by name, with the axis N, for inputs whose axis N is the last but one of the controls."""
-        if self.adapter.batched:
-            return named_values(call(self.adapter, observations, controls, device), self.source, self._task)
-        axis = controls.ndim - 2
-        single = {key: value.select(axis, 0) for key, value in observations.items()}
-        values = named_values(call(self.adapter, single, controls.select(axis, 0), device), self.source, self._task)
-        return {name: value.unsqueeze(axis) for name, value in values.items()}
-
-    def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
-        with self._errors_at("all steps"):
-            output = copied(self._call(observations, controls, device_of(self.adapter.module)))
-        return check_values(
-            output, controls.shape[:2], {"n": len(self._task.components)}, f"{self.source} over all steps"
-        )
+    def _values(self, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device) -> Values:
+        """The filter's output by name, for inputs that have the axis N only if the filter takes it."""
+        return named_values(call(self.adapter, observations, controls, device), self.source, self._task)
 
     @contextmanager
     def _errors_at(self, where: str) -> Iterator[None]:
@@ -322,11 +316,15 @@ class ExternalFilter(Checkpoint):
             raise self._error(where, error) from error
 
     def _error(self, where: str, error: Exception) -> BadInput:
-        """An exception of the module as BadInput with the location."""
         return BadInput(f"{self.source} {described(error, where, self.adapter, self._task)}")
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)
+
+
+def _at(index: Any, observations: Mapping[str, Tensor], controls: Tensor) -> tuple[Values, Tensor]:
+    """Inputs (T, N, ...) of some of the N episodes; of one of them, without the axis N."""
+    return {key: value[:, index] for key, value in observations.items()}, controls[:, index]
 
 
 def load_external(

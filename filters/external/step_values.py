@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from beliefscope.filters.external.adapter import Values, letters_of
+from beliefscope.filters.external.adapter import Values, check_values, letters_of
 from beliefscope.filters.external.ancestors import Words, ancestors, new_table, words_of
 from beliefscope.filters.external.torchfilter_hooks import RESAMPLED
 
@@ -84,13 +84,25 @@ def with_ancestors(values: Values) -> Values:
     return result
 
 
-def stacked(steps: Sequence[Values], channels: int = 0) -> Values:
-    """Values of T steps with a leading axis T, without values that some steps lack.
+def check_steps(runs: Sequence[Sequence[Values]], leading: Sequence[int], sizes: dict[str, int], source: str) -> None:
+    """Raises BadInput that names the first step of some runs with an invalid value; arguments as ``check_values``."""
+    for steps in runs:
+        for t, values in enumerate(steps):
+            check_values(values, leading, sizes, f"{source} at step {t}", t)
+
+
+def joined(name: str, runs: Sequence[Tensor]) -> Tensor:
+    """Values (T, ...) of several runs along T; NaN after the last channels of smaller measurements."""
+    return torch.cat(_of_one_size(list(runs), name, 0))
+
+
+def stacked(steps: Sequence[Values], channels: int = 0, dim: int = 0) -> Values:
+    """Values of T steps with a leading axis T, or of N runs with an axis N, without values that some of them lack.
 
     channels: smallest number m of the measurements' channels; they have the largest of all steps if that is larger.
     """
     common = [name for name in steps[0] if all(name in step for step in steps)]
-    return {name: torch.stack(_of_one_size([step[name] for step in steps], name, channels)) for name in common}
+    return {name: torch.stack(_of_one_size([step[name] for step in steps], name, channels), dim) for name in common}
 
 
 def _of_one_size(values: list[Tensor], name: str, channels: int) -> list[Tensor]:

@@ -15,9 +15,10 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.text import plural
 from beliefscope.filters.engine import Progress
-from beliefscope.filters.external.adapter import MIN_STEPS, FailedStep, joined
+from beliefscope.filters.external.adapter import MIN_STEPS, FailedStep
 from beliefscope.filters.external.calls import takes_start
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.external.step_values import joined
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
 
@@ -113,7 +114,7 @@ def _joined(runs: Sequence[Trace], episode: Episode, settings: Mapping[str, Any]
     arrays = {f.name: [getattr(run, f.name) for run in runs] for f in fields(Trace) if not f.name.startswith("start_")}
     extra = {name: np.concatenate([run.extra[name] for run in runs])[:steps] for name in first.extra}
     by_step: dict[str, Any] = {
-        name: joined(name, [torch.from_numpy(value) for value in values], dim=0).numpy()[:steps]
+        name: joined(name, [torch.from_numpy(value) for value in values]).numpy()[:steps]
         for name, values in arrays.items()
         if all(isinstance(value, np.ndarray) for value in values)
     }

@@ -216,7 +216,7 @@ def test_hash_of_an_object_covers_its_arrays() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"accepted": np.ones((2, 2))}, r"accepted of shape \(1, 2, 2\), expected \(1, K\)"),
+        ({"accepted": np.ones((2, 2))}, r"accepted of shape \(2, 2\), expected \(K\)"),
         ({"innovation": [np.ones(2)]}, "returns only innovation, expected both innovation and innovation_covariance"),
         (
             {"innovation": [np.ones(2), None], "innovation_covariance": [np.ones(2), None]},
