@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from beliefscope.datasets.episode import Episode, is_image, lost_images
+from beliefscope.inspect.diagnosis.checks.controls import law_statistics
 from beliefscope.inspect.diagnosis.checks.images import (
     brightness_of,
     frozen_images,
@@ -28,7 +29,6 @@ from beliefscope.inspect.diagnosis.checks.vectors import (
     contact_changes,
     contact_distance_statistics,
     free_motion,
-    law_statistics,
     saturated,
     stuck,
     vector_statistics,

@@ -18,7 +18,6 @@ from beliefscope.inspect.statistics.signals import (
     lag,
     noise_level,
     repeats,
-    robust_fit,
     robust_line,
 )
 
@@ -31,12 +30,6 @@ POSITION, CHANGE = slice(0, 3), slice(3, 6)
 
 STEADY = 0.1
 """Largest median deviation from the median distance in contact, relative to the mean distance."""
-
-SAME_POSITION = 1e-6
-"""m: largest variation of the distance of set points from measured positions that are the same but for rounding."""
-
-LAWFUL = 0.005
-"""m: largest median error of the law of an impedance controller; twice that of most healthy episodes."""
 
 CALMER = 0.2
 """Relative variation of the force with the contact flag below which the flag is inverted."""
@@ -221,72 +214,9 @@ def lever(force: Array, torque: Array) -> tuple[Array, float]:
     return arm, float(left)
 
 
-def control_statistics(episode: Episode) -> dict[str, float]:
-    """Delay and scale of controls that command a hand position, against the measured position.
-
-    ``step scale``: slope of the commanded changes on the differences of the commanded positions. It is one whatever
-    the hand does, unless only the changes are scaled.
-
-    Of other controls, the standard deviation of each channel: only a filter's dynamics say what they do.
-    """
-    if not commands_hand(episode.task):
-        controls = episode.controls.astype(np.float64)
-        names = [axis_name("control", i, controls.shape[1]) for i in range(controls.shape[1])]
-        return {f"size/{name}/all": float(size) for name, size in zip(names, controls.std(0), strict=True)}
-    if HAND not in episode.observations:
-        return {}
-    hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
-    moved, change = np.diff(hand, axis=0, prepend=hand[:1]), controls[:, CHANGE]
-    delay = lag(change, moved)[0]
-    shift = 0 if np.isnan(delay) else int(delay)
-    steps = np.arange(len(hand))
-    valid = (steps - shift >= 1) & (steps - shift < len(hand))
-    a, b = change[valid], moved[steps[valid] - shift]
-    return {
-        "lag/control/all": delay,
-        "scale/control/all": _slope(a, b),
-        "step scale/control/all": _slope(change[:-1], np.diff(controls[:, POSITION], axis=0)),
-    }
-
-
-def _slope(a: Array, b: Array) -> float:
-    """Slope of a on b, (T, 3) each; NaN if b does not vary."""
-    power = np.square(b).sum()
-    return float((a * b).sum() / power) if power > 1e-12 else np.nan
-
-
 def commands_hand(task: Task) -> bool:
     """Whether the controls command the position (x, y, z) of a hand that is measured."""
     return task.observations.get(HAND) == (3,) and task.control_size >= CHANGE.stop
-
-
-def impedance_statistics(episode: Episode) -> dict[str, float]:
-    """How the hand p follows its set point s under the force F, on each axis: ``s - p = offset - c F + k v``.
-
-    The law of an impedance controller with compliance c (m/N) and damping, here a delay of k steps with the velocity v
-    (m per step). The offset (m) is that of the measured position, which neither contact nor motion hides. A gain g of
-    the force divides c by g. A robust fit; c and k are NaN if the set point is the measured position. The offset and c
-    are NaN where the law does not hold (``LAWFUL``), such as for a jammed arm.
-    """
-    if not commands_hand(episode.task) or HAND not in episode.observations:
-        return {}
-    hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
-    present = episode.present(HAND)[:-1]
-    force = np.zeros_like(hand)
-    if FORCE in episode.observations and episode.observations[FORCE].shape[1] == 3:
-        force, present = episode.observations[FORCE].astype(np.float64), present & episode.present(FORCE)[:-1]
-    distance = (controls[1:, POSITION] - hand[:-1])[present].T
-    columns = np.stack([np.ones_like(hand), -force, np.gradient(hand, axis=0)], axis=-1)[:-1][present].swapaxes(0, 1)
-    if distance.shape[1] < MIN_STEPS:
-        return {}
-    fit = robust_fit(columns, distance)
-    if np.ptp(distance) < SAME_POSITION:
-        fit[:, 1:] = np.nan
-    else:
-        error = np.median(np.abs(distance - (columns @ fit[..., None])[..., 0]), axis=1)
-        fit[error > LAWFUL, :2] = np.nan
-    names = ("offset/control", f"compliance/{FORCE}", "following/control")
-    return {f"{name} {AXES[i]}/all": float(fit[i, k]) for k, name in enumerate(names) for i in range(3)}
 
 
 def contact_distance_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
@@ -347,7 +277,7 @@ def angle_channels(episode: Episode, key: str) -> list[int]:
     return [i for i, channel in enumerate(readings[episode.present(key)].T) if is_angle(channel)]
 
 
-def _vector_keys(episode: Episode) -> list[str]:
+def vector_keys(episode: Episode) -> list[str]:
     """Observation keys of vectors (T, d) other than the contact flag and the hand position."""
     return [key for key, readings in episode.observations.items() if readings.ndim == 2 and key not in (CONTACT, HAND)]
 
@@ -355,7 +285,7 @@ def _vector_keys(episode: Episode) -> list[str]:
 def vector_statistics(episode: Episode) -> dict[str, float]:
     """Statistics of all vector sensors in an episode or a window."""
     values: dict[str, float] = {}
-    for key in _vector_keys(episode):
+    for key in vector_keys(episode):
         values |= axis_statistics(episode, key)
         is_known = HAND in episode.observations and key in (FORCE, TORQUE)
         values |= {} if is_known else own_size_statistics(episode, key)
@@ -366,14 +296,6 @@ def vector_statistics(episode: Episode) -> dict[str, float]:
         if present.any():
             values[f"stuck/{HAND}/all"] = float(repeats(hand, episode.task.held_steps(HAND))[present].mean())
     return values | contact_statistics(episode) | size_statistics(episode)
-
-
-def law_statistics(episode: Episode) -> dict[str, float]:
-    """Statistics of an episode about laws between sensors and controls: of contact, and of the controller."""
-    values = wrench_statistics(episode) | control_statistics(episode) | impedance_statistics(episode)
-    for key in _vector_keys(episode):
-        values |= labelled_contact_statistics(episode, key)
-    return values
 
 
 def _moving(episode: Episode) -> Mask:

@@ -106,9 +106,11 @@ def expose_image(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
 
 
 def detrend_force(inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
-    """Force without its excess slope in free motion."""
-    slope = [_excess(deviations, f"drift/force {axis}/free motion") for axis in "xyz"]
-    if None in slope:
+    """Force without its excess slope in free motion or, without that, of what the law of the controller leaves."""
+    names = ("drift/force {}/free motion", "drift/force {}/all")
+    slopes = ([_excess(deviations, name.format(axis)) for axis in "xyz"] for name in names)
+    slope = next((values for values in slopes if None not in values), None)
+    if slope is None:
         return None
     return with_readings(
         inputs, "force", lambda f, episode: f - np.array(slope)[: f.shape[1]] * episode.dt * np.arange(len(f))[:, None]

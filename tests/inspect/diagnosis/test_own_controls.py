@@ -18,8 +18,8 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.external.load import as_external
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.inspect.diagnosis.catalog import causes_of
+from beliefscope.inspect.diagnosis.checks.controls import law_statistics
 from beliefscope.inspect.diagnosis.checks.dynamics import module_dynamics_statistics
-from beliefscope.inspect.diagnosis.checks.vectors import law_statistics
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
 from beliefscope.inspect.diagnosis.undo.readings import advance, negate_control, scale_control
 from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs, Undo

@@ -16,8 +16,9 @@ from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 from beliefscope.datasets.store import open_dataset
 from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnosis.checks.controls import impedance_statistics
 from beliefscope.inspect.diagnosis.checks.sensors import biased_steps, localise, sensor_statistics
-from beliefscope.inspect.diagnosis.checks.vectors import free_motion, impedance_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import free_motion
 from beliefscope.inspect.diagnosis.checks.windows import LENGTH, STRIDE, deviating_windows
 from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
@@ -233,8 +234,8 @@ def test_the_law_of_the_impedance_controller(episode: int) -> None:
     def law(faults: str = "") -> dict[str, float]:
         return impedance_statistics(Faults.parse(faults).apply(clean) if faults else clean)
 
-    healthy, moved, biased, scaled, negated = (
-        law(f) for f in ("", "effector_offset=0.02", "force_bias=2", "force_gain=2", "force_gain=-1")
+    healthy, moved, biased, scaled, negated, drifting = (
+        law(f) for f in ("", "effector_offset=0.02", "force_bias=2", "force_gain=2", "force_gain=-1", "force_drift=2")
     )
     offset, compliance, following = "offset/control x/all", "compliance/force x/all", "following/control x/all"
     assert 2e-4 < healthy[compliance] < 2e-2  # m/N
@@ -247,6 +248,11 @@ def test_the_law_of_the_impedance_controller(episode: int) -> None:
     assert negated[compliance] == pytest.approx(-healthy[compliance], rel=1e-3)
     for values in (moved, biased, scaled, negated):
         assert values[following] == pytest.approx(healthy[following], rel=1e-3)
+    drift = "drift/force x/all"
+    assert abs(healthy[drift]) < 0.1  # N/s
+    assert drifting[drift] == pytest.approx(healthy[drift] + 2.0, abs=1e-3)
+    for values, gain in ((moved, 1.0), (biased, 1.0), (scaled, 2.0), (negated, -1.0)):
+        assert values[drift] == pytest.approx(gain * healthy[drift], abs=1e-4)
 
 
 def test_a_set_point_that_is_the_measured_position_says_nothing_about_the_controller() -> None:
