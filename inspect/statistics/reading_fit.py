@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from beliefscope.inspect.statistics.reading_model import (
     readings_of,
     steps_of,
 )
-from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, is_angle, wrapped
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, is_angle, isolated, wrapped
 
 EXPLAINED = 0.5
 """Smallest share of the variance of a channel within episodes that its model explains in other episodes."""
@@ -52,6 +53,9 @@ REACHED = 0.95
 
 MAX_STEPS = 20_000
 """Number of steps to which a model is fitted; of more, every second one and so on."""
+
+FEW, PASSES = 0.1, 4
+"""Largest share of isolated readings that are left out of a fit, and largest number of times that they are searched."""
 
 MIN_EPISODES = 4
 """Smallest number of episodes of a model."""
@@ -82,13 +86,15 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
             for x, episode, steps in zip(inputs, episodes, present, strict=True)
             if len(steps) // stride >= MIN_STEPS
         ]
-        fits = _fit(rows, groups, _options(episodes, key)) if len(rows) >= MIN_EPISODES else []
+        options = _options(episodes, key)
+        fits = _fit(rows, groups, options) if len(rows) >= MIN_EPISODES else []
+        rows, fits, outliers = _without_outliers(rows, fits, groups, options)
         strong, weak = (
             tuple(fitted.model(rows) for fitted in fits if low < fitted.explained(rows) <= high)
             for low, high in ((EXPLAINED, 1.0), (WEAKLY_EXPLAINED, EXPLAINED))
         )
         if strong or weak:
-            result.append(ReadingModel(key, strong, weak))
+            result.append(ReadingModel(key, strong, weak, outliers))
     return tuple(result)
 
 
@@ -104,6 +110,14 @@ class Rows:
         self.states = episode.states.astype(np.float64)[steps]
         self.places = positions(episode.task, self.states)
         self.monomials = {degree: monomials(episode, key != CONTROL, degree)[steps] for degree in (1, *DEGREES)}
+
+    def part(self, chosen: Mask) -> Rows:
+        """Some of the steps, by a mask (S,)."""
+        result = copy(self)
+        for name in ("features", "readings", "states", "places"):
+            setattr(result, name, getattr(self, name)[chosen])
+        result.monomials = {degree: values[chosen] for degree, values in self.monomials.items()}
+        return result
 
 
 @dataclass(frozen=True)
@@ -239,6 +253,25 @@ def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Opti
             if least is not None and (channel not in best or least.left < share * best[channel].left):
                 best[channel] = least
     return list(best.values())
+
+
+def _without_outliers(
+    rows: list[Rows], fits: list[_Fitted], groups: Sequence[Indices], options: Sequence[Option]
+) -> tuple[list[Rows], list[_Fitted], float]:
+    """The rows and fits without isolated readings, whose errors would hide what the others depend on, and their share.
+
+    The same ones, and 0, if no reading is isolated, or if many are (``FEW``).
+    """
+    every, before = sum(len(row.readings) for row in rows), (rows, fits, 0.0)
+    for _ in range(PASSES):
+        errors = [np.stack(of_channels, axis=1) for of_channels in zip(*(fit.errors for fit in fits), strict=True)]
+        left_out = [isolated(error).any(axis=1) for error in errors]
+        if not any(steps.any() for steps in left_out):
+            break
+        rows = [row.part(np.logical_not(steps)) for row, steps in zip(rows, left_out, strict=True)]
+        fits = _fit(rows, groups, options)
+    share = 1.0 - sum(len(row.readings) for row in rows) / max(every, 1)
+    return (rows, fits, share) if 0.0 < share <= FEW else before
 
 
 def _landmark_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option]) -> Iterator[_Fitted]:

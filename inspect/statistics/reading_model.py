@@ -23,7 +23,15 @@ from beliefscope.inspect.statistics.reading_features import (
     positions,
     products,
 )
-from beliefscope.inspect.statistics.signals import MAX_PAIRS, MIN_STEPS, Array, Mask, significant, wrapped
+from beliefscope.inspect.statistics.signals import (
+    MAX_PAIRS,
+    MIN_STEPS,
+    Array,
+    Mask,
+    isolated,
+    significant,
+    wrapped,
+)
 
 DIGITS = 8
 """Significant digits of stored coefficients."""
@@ -37,13 +45,15 @@ EXTRAPOLATED = 1.0
 class ComparedReadings:
     """Readings and expected readings (T, A) of an episode, the steps (T,) that have both, and their model.
 
-    Readings of angles are within half a turn of the expected ones.
+    Readings of angles are within half a turn of the expected ones. outliers: (T,) steps with readings that are not
+    compared, since they are isolated, as some of the record are.
     """
 
     measured: Array
     expected: Array
     present: Mask
     model: ReadingModel
+    outliers: Mask
 
     @property
     def readings(self) -> Array:
@@ -184,11 +194,13 @@ class ReadingModel:
         key: observation key of the sensor, or ``CONTROL``.
         of_channels: models of the A channels that the labels explain (``EXPLAINED``).
         of_weak_channels: models of other channels, which they explain in part (``WEAKLY_EXPLAINED``).
+        outliers: share of the readings of the record that are isolated, such as false detections, and left out.
     """
 
     key: str
     of_channels: tuple[ChannelModel, ...]
     of_weak_channels: tuple[ChannelModel, ...] = ()
+    outliers: float = 0.0
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -227,19 +239,21 @@ class ReadingModel:
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
         weak = [model.to_json() for model in self.of_weak_channels]
-        own = {"key": self.key, "of_channels": [model.to_json() for model in self.of_channels]}
+        own: dict[str, Any] = {"key": self.key, "of_channels": [model.to_json() for model in self.of_channels]}
+        own |= {"outliers": self.outliers} if self.outliers else {}
         return own | ({"of_weak_channels": weak} if weak else {})
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReadingModel:
         """Inverse of ``to_json``. Raises ValueError for arrays of different sizes."""
         models = (value["of_channels"], value.get("of_weak_channels", ()))
-        return cls(str(value["key"]), *(tuple(map(ChannelModel.from_json, of)) for of in models))
+        strong, weak = (tuple(map(ChannelModel.from_json, of)) for of in models)
+        return cls(str(value["key"]), strong, weak, float(value.get("outliers", 0.0)))
 
     def with_weak_channels(self) -> ReadingModel:
         """The model with all channels that the labels explain at least in part, in their order."""
         both = sorted((*self.of_channels, *self.of_weak_channels), key=lambda model: model.index)
-        return ReadingModel(self.key, tuple(both))
+        return ReadingModel(self.key, tuple(both), outliers=self.outliers)
 
     def is_complete(self, episode: Episode) -> bool:
         """Whether all channels have models, of the state and controls at one step: neither of changes nor contact."""
@@ -276,7 +290,11 @@ class ReadingModel:
         """
         readings, present = readings_of(episode, self.key)[:, self.channels], steps_of(episode, self.key)
         expected = self.expected(episode)
-        return ComparedReadings(readings, expected, present & np.isfinite(expected).all(1), self)
+        present &= np.isfinite(expected).all(1)
+        outliers = np.zeros_like(present)
+        if self.outliers:
+            outliers[present] = isolated(self.relative((readings - expected)[present])).any(1)
+        return ComparedReadings(readings, expected, present & ~outliers, self, outliers)
 
     def unknown_steps(self, episode: Episode) -> tuple[int, int]:
         """Numbers of the steps with readings: at states that the record does not have, and all."""

@@ -59,6 +59,12 @@ NEAR_TURN = 1.0
 OTHER_JUMPS = 0.02
 """Largest share of steps in which an angle that wraps around turns by a quarter of a turn or more."""
 
+NEIGHBOURS = 8
+"""Errors on each side with which an error is compared."""
+
+ISOLATED = 6.0
+"""Smallest distance of an isolated error from the median of its neighbours, in standard deviations of normal ones."""
+
 NORMAL_MAD = 0.6745
 """Median absolute deviation of the standard normal distribution."""
 
@@ -140,6 +146,23 @@ def noise_level(values: Array, present: Mask | None = None) -> Array:
     spread = np.sqrt(1.0 + weight**2 + (1.0 - weight) ** 2)
     result: Array = np.median(np.abs(distance / spread), axis=0) / NORMAL_MAD
     return result
+
+
+def isolated(errors: Array) -> Mask:
+    """(T, A): errors (T, A) far from those of their neighbours (``ISOLATED``), such as those of false detections.
+
+    Far compared with the variation of the neighbours and with the usual one: a bias, a drift and a noisy stretch are
+    not isolated. None of too few errors.
+    """
+    if len(errors) <= NEIGHBOURS:
+        return np.zeros(errors.shape, dtype=bool)
+    padded = np.pad(errors, ((NEIGHBOURS, NEIGHBOURS), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1, axis=0)  # (T, A, window)
+    middle = np.median(windows, axis=-1)
+    distance = np.abs(errors - middle)
+    near = np.median(np.abs(windows - middle[..., None]), axis=-1)
+    usual = np.median(distance, axis=0)
+    return np.asarray((distance > ISOLATED / NORMAL_MAD * np.maximum(near, usual)) & (usual > 0.0))
 
 
 def repeats(values: NDArray[np.generic], held: int = 0) -> Mask:

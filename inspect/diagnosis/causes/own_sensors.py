@@ -31,6 +31,7 @@ DELAYED = (
     "roughness",
     "reading gain",
     "reading noise",
+    "reading outliers",
     "reading scatter",
     "inverted",
     "exchanged",
@@ -113,8 +114,10 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     """
     of = partial(_patterns, key)
     delays = ("reading lag", "reading lag scatter")
-    scaled = of(*BIASED, "reading drift", *delays, "change", "size", "noise", "reading noise", "reading scatter")
-    noise = (Symptom(of("noise")), Symptom(of("roughness", "reading noise"), optional=True))
+    noises = ("noise", "reading noise", "reading outliers")
+    scaled = of(*BIASED, "reading drift", *delays, "change", "size", *noises, "reading scatter")
+    outliers = Symptom(of("reading outliers"))
+    noise = (Symptom(of("noise"), otherwise=(outliers,)), Symptom(of("roughness", "reading noise"), optional=True))
     bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
     drift = (Symptom(of("reading drift"), 0),)
     slope = (Symptom(of("reading gain"), 0), Symptom(of("reading ratio"), 0))
@@ -135,7 +138,7 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
             action,
             f"{undo}drop {modality}",
             lowers=of("stuck") if mechanism == "noise" else "",
-            raises=of("reading noise", "noise") if mechanism in ("bias", "drift") else "",
+            raises=of(*noises) if mechanism in ("bias", "drift") else "",
             prior=SLOW if mechanism == "drift" else 0.0,
         )
         for mechanism, words, symptoms, changed, action, undo in entries

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -80,7 +81,8 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     The others are those at this lag. ``reading bias``: mean error relative to the noise. ``reading drift``: change of
     the error over the episode, likewise. ``reading gain``: slope of the readings on the expected ones. ``reading
     noise``: standard deviation from this line, relative to the noise. ``reading ratio``: gain without a bias, if it
-    explains the errors as well as a bias, and else nearly 1; not of angles.
+    explains the errors as well as a bias, and else nearly 1; not of angles. ``reading outliers``: share of isolated
+    readings, which the others leave out; of sensors with such readings in the record.
     ``inverted``: half the log-ratio of the mean square error to that with the opposite sign, 0 unless the readings then
     fit (``FITS``), hardly worse than with biases (``SIMPLER``). ``exchanged``: likewise, of the errors of two channels
     to those with these channels exchanged, whatever their signs, for the best other channel; or of one channel to those
@@ -92,8 +94,11 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
             continue
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)
+        read = compared.present | compared.outliers
         is_short = delay == 0.0 and _is_own_arrangement(errors)
         values[f"reading lag/{model.key}/all"] = _short_delay(compared) if is_short else delay
+        if model.outliers:
+            values[f"reading outliers/{model.key}/all"] = float(compared.outliers.sum() / max(read.sum(), 1))
         whole = 0 if np.isnan(delay) else int(delay)
         line = _line(*compared.pairs(whole), compared.steps(whole) / len(episode), model.gain_spreads)
         least, biased = errors.min(0), compared.errors_with_biases(whole)
@@ -122,6 +127,19 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
 def is_expected(model: ReadingModel, episode: Episode) -> bool:
     """Whether an episode has labels and the sensor of a model."""
     return model.key in (*episode.observations, CONTROL) and bool(np.isfinite(episode.states).all())
+
+
+def without_outliers(episode: Episode, models: Sequence[ReadingModel]) -> Episode:
+    """The episode with interpolated readings instead of isolated ones, of sensors with such ones in the record."""
+    observations = dict(episode.observations)
+    for model in (model for model in models if model.outliers and is_expected(model, episode) and model.key != CONTROL):
+        outliers = model.compare(episode).outliers
+        others, steps = np.flatnonzero(episode.present(model.key) & ~outliers), np.flatnonzero(outliers)
+        if len(others) and len(steps):
+            readings = observations[model.key].astype(np.float64)
+            readings[steps] = np.stack([np.interp(steps, others, x[others]) for x in readings.T], axis=1)
+            observations[model.key] = readings
+    return replace(episode, observations=observations)
 
 
 def without_explained(row: Mapping[str, float]) -> dict[str, float]:

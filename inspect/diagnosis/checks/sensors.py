@@ -22,7 +22,7 @@ from beliefscope.inspect.diagnosis.checks.images import (
     motion_statistics,
 )
 from beliefscope.inspect.diagnosis.checks.label_shift import label_shift_statistics
-from beliefscope.inspect.diagnosis.checks.readings import biased_interval, reading_statistics
+from beliefscope.inspect.diagnosis.checks.readings import biased_interval, reading_statistics, without_outliers
 from beliefscope.inspect.diagnosis.checks.vectors import (
     angle_channels,
     axis_index,
@@ -61,10 +61,10 @@ def sensor_statistics(
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
     values |= {f"absent/{key}/all": float(1.0 - episode.present(key).mean()) for key in episode.task.masks}
+    values |= reading_statistics(episode, readings) | label_shift_statistics(episode, readings)
+    episode = without_outliers(episode, readings)  # a window of few readings has their noise
     values |= vector_statistics(episode) | law_statistics(episode)
-    values |= contact_distance_statistics(episode, reference)
-    values |= window_statistics(episode, reference) | reading_statistics(episode, readings)
-    values |= label_shift_statistics(episode, readings)
+    values |= contact_distance_statistics(episode, reference) | window_statistics(episode, reference)
     # A flag that is stuck from a step in contact has the readings of one that is inverted from there.
     ambiguous = contact_changes(episode) == 1
     return {name: np.nan if ambiguous and name.startswith("opposition/") else value for name, value in values.items()}
