@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.statistics.reference_images import CONTACT
 from beliefscope.inspect.statistics.signals import Array
 
 Indices = NDArray[np.intp]
@@ -30,6 +29,9 @@ ZOOMS, ZOOM = 7, 0.35
 DEGREES = (2, 3)
 """Degrees of polynomials in the state and the controls."""
 
+MAX_FLAGS = 3
+"""Largest number of boolean covariates whose steps have features of their own."""
+
 MAX_TERMS = 200
 """Largest number of terms of a polynomial."""
 
@@ -38,7 +40,9 @@ SEARCHED = 400
 
 
 def features(episode: Episode, with_controls: bool) -> tuple[Array, list[Indices]]:
-    """(T, F): the state, its first and second changes by step, all in the body frame, and all of them in contact.
+    """(T, F): the state, its first and second changes by step, all in the body frame, and all of them with each flag.
+
+    Flags are contact and other boolean covariates, such as a firm grip, but not those of absent readings.
 
     Angles that wrap have their cosine and sine as well, rotations are their matrices. Angles among the controls, such
     as a measured heading, also turn vectors into the body frame. Changes are zero where they are unknown, at the first
@@ -52,11 +56,16 @@ def features(episode: Episode, with_controls: bool) -> tuple[Array, list[Indices
     vectors = np.concatenate([others, change, second], axis=1)
     in_frames = (frames[:, :, None] * vectors[:, None]).reshape(len(states), -1)
     all_ = np.concatenate([others, frames, change, second, in_frames], axis=1)
-    if CONTACT in task.covariates:
-        contact = np.asarray(episode.contact, dtype=np.float64)[:, None]
-        all_ = np.concatenate([all_, contact, contact * all_], axis=1)
+    flags = [np.nan_to_num(episode.covariate(name).astype(np.float64))[:, None] for name in _flags(task)]
+    all_ = np.concatenate([all_, *(part for flag in flags for part in (flag, flag * all_))], axis=1)
     index, state = np.arange(all_.shape[1]), others.shape[1] + frames.shape[1]
     return all_, [index[:state], index[: state + 2 * states.shape[1]], index]
+
+
+def _flags(task: Task) -> list[str]:
+    """Names of boolean covariates, at most ``MAX_FLAGS``, without the masks of sensors."""
+    flags = (name for name, covariate in task.covariates.items() if covariate.kind == "boolean")
+    return [name for name in flags if name not in task.masks.values()][:MAX_FLAGS]
 
 
 def monomials(episode: Episode, with_controls: bool, degree: int) -> Array:

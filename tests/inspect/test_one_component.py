@@ -262,6 +262,7 @@ def test_phases_of_failures_are_groups_of_declared_covariates(runs: list[Trace])
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_recording_report_export_and_page(runs: list[Trace], tmp_path: Path) -> None:
     run, filter_ = runs[0], checkpoint(task())
     maps = MapEngine(filter_, run).maps(range(0, 200, 50), size=41)

@@ -116,6 +116,7 @@ def episode_of(data: Dataset, index: int, steps: int) -> Episode:
     )
 
 
+@pytest.mark.long
 def test_swapping_checkpoints_changes_signs() -> None:
     forward, backward = comparison(True), comparison(False)
     assert len(forward.differences) == len(backward.differences) > 0

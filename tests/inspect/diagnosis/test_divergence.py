@@ -182,6 +182,7 @@ def test_restarts_are_named_in_comparisons_and_errors() -> None:
     assert errors_of([failing, right]).verdict.startswith(f"{text}1 of 2 runs. ")
 
 
+@pytest.mark.long
 def test_episodes_in_which_a_filter_fails_at_once_are_left_out() -> None:
     """The cart of episode 23 is farther from the origin than all others."""
     episodes = {seed: drive(seed) for seed in range(20, 26)}

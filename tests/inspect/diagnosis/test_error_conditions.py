@@ -91,6 +91,7 @@ def test_no_condition_without_reason(filter_: Cart, name: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_next_action_names_the_condition() -> None:
     result = diagnose(loaded(ForwardOnly()), {seed: drive(seed) for seed in EPISODES}, profile=profile())
     assert result.causes[0].cause.name.startswith("dynamics.")

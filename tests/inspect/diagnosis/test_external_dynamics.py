@@ -110,6 +110,7 @@ def test_a_faulty_sensor_is_not_broken_dynamics() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_units_of_groups_may_have_a_slash() -> None:
     task = replace(TASK, name="fast_cart", covariates={"speed": bs.Covariate("continuous", cuts=(0.4,), unit="m/s")})
     episodes = [drive(seed) for seed in range(16)]

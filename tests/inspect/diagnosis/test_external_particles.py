@@ -228,7 +228,7 @@ def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
         (Particles(powers={"far": 0.0}), "weights.ignores_likelihood"),
         pytest.param(Particles(powers={"far": 2.0}), "weights.repeats_likelihood", marks=pytest.mark.long),
         (Particles(resample=False), "resampling.off"),
-        (Particles(best_only=True), "particles.deprived"),
+        pytest.param(Particles(best_only=True), "particles.deprived", marks=pytest.mark.long),
         (Particles(weighted=False), "estimate.mean"),
         pytest.param(Particles(keeps_weights=False), "weights.lost", marks=pytest.mark.long),
         pytest.param(Particles(offset=0.1), "measurement.near.function", marks=pytest.mark.long),
@@ -253,7 +253,10 @@ def noisy(readings: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "cause", "headline"),
-    [(stuck, "near.stuck", "Sensor near stuck from step 11 (1.1 s),"), (noisy, "near.noise", "Sensor near noisy")],
+    [
+        (stuck, "near.stuck", "Sensor near stuck from step 11 (1.1 s),"),
+        pytest.param(noisy, "near.noise", "Sensor near noisy", marks=pytest.mark.long),
+    ],
 )
 def test_a_sensor_of_a_users_task_has_causes(
     change: Callable[[np.ndarray], np.ndarray], cause: str, headline: str

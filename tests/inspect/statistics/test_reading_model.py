@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beliefscope.datasets.covariate import CONTACT
+from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task, rotation
 from beliefscope.inspect.diagnosis.checks.readings import (
@@ -19,6 +19,7 @@ from beliefscope.inspect.diagnosis.checks.readings import (
     modelled_sensors,
     reading_statistics,
 )
+from beliefscope.inspect.statistics.reading_features import features
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.signals import wrapped
@@ -373,3 +374,15 @@ def test_a_heading_among_the_controls_turns_readings_into_the_body_frame() -> No
     assert [(m.key, m.channels) for m in fit_reading_models(episodes, ["odometry"])] == [("odometry", (0, 1))]
     unknown = replace(task, channels={})
     assert fit_reading_models([replace(e, task=unknown) for e in episodes], ["odometry"]) == ()
+
+
+def test_any_boolean_covariate_has_readings_of_its_own() -> None:
+    """A firm grip as contact does: the features are equal, and the masks of absent readings have none."""
+    task = replace(PLANE, covariates={"firm": Covariate("boolean")})
+    masked = replace(task, masks={"gps": "firm"})
+    flag = (np.arange(STEPS) % 40 < 20).astype(np.float32)
+    touched = features(replace(NEW, contact=flag > 0.5), False)[0]
+    firm, present = (features(replace(NEW, task=t, covariates={"firm": flag}), False)[0] for t in (task, masked))
+    assert np.array_equal(firm, touched)
+    assert np.array_equal(firm[:, : present.shape[1]], present)
+    assert firm.shape[1] == 2 * present.shape[1] + 1

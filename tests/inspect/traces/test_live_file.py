@@ -156,6 +156,7 @@ def test_truncation_at_every_byte(short: Trace, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("run", ["crossmodal-pf"], indirect=True)
+@pytest.mark.long
 def test_every_damaged_byte_is_detected(short: Trace, tmp_path: Path) -> None:
     """A file with one modified byte is refused or gives fewer steps, never other numbers."""
     path = tmp_path / "run.live"

@@ -205,6 +205,7 @@ def test_a_small_gain_explains_only_larger_measurement_noise(t: float, explained
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_predicted_changes_that_are_all_too_small_are_not_broken() -> None:
     record = profile()
     result = diagnose(of_cart(Cart(gain=0.6)), {seed: drive(seed) for seed in range(20, 30)}, profile=record)

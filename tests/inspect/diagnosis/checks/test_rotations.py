@@ -140,6 +140,7 @@ def test_dynamics_of_rotations_have_the_slopes_and_the_noise_of_their_axes(gain:
         assert values[f"process noise/{axis}/all"] == pytest.approx(DT * GYRO, rel=0.01)
 
 
+@pytest.mark.long
 def test_an_expected_reading_that_is_turned_moves_the_particles() -> None:
     """About the vertical axis of the world; not with the right one, up to the noise of the readings."""
     right, turned = (

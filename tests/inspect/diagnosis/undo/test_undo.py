@@ -96,7 +96,7 @@ def inverted(filter_: Any) -> None:
         pytest.param("crossmodal-ekf", overconfident, "rescale image", marks=pytest.mark.long),
         pytest.param("crossmodal-ekf", noisy, "rescale process noise", marks=pytest.mark.long),
         pytest.param("crossmodal-pf", noisy, "rescale process noise", marks=pytest.mark.long),
-        ("crossmodal-ekf", inverted, "invert beta"),
+        pytest.param("crossmodal-ekf", inverted, "invert beta", marks=pytest.mark.long),
         pytest.param("crossmodal-pf", inverted, "invert beta", marks=pytest.mark.long),
     ],
 )
