@@ -44,6 +44,7 @@ from beliefscope.inspect.diagnosis.wrong_noise import too_small
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.statistic_kinds import channel_of, label_of, sensor_of
+from beliefscope.inspect.statistics.innovations import prediction
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -133,8 +134,8 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
 def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
     """What the diagnosis cannot judge: sensors without statistics, and statistics that the episodes or the record lack.
 
-    Also whether the length of the episodes causes deviations, if it is not that of the record (``LENGTHS``), and
-    sensors at states that the record does not have.
+    Also whether the length of the episodes causes deviations, if it is not that of the record (``LENGTHS``), sensors at
+    states that the record does not have, and what an external filter that reports no predictions does not show.
 
     Episodes of contact only lack those of free motion, for example, and records of earlier versions those of new kinds.
 
@@ -150,7 +151,7 @@ def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
         if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
     ]
     outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
-    parts = _other_lengths(case), _extrapolated(case), sensors, _unexpected(case)
+    parts = _other_lengths(case), _extrapolated(case), sensors, _unexpected(case), _unreported(case)
     return [*chain.from_iterable(parts)] + _likelihoods(case) + absent + (outdated if new else [])
 
 
@@ -170,9 +171,16 @@ def _extrapolated(case: Case) -> list[str]:
 
 def _unexpected(case: Case) -> list[str]:
     """Sensors whose readings no model expects, so that channels may be exchanged or inverted without a deviation."""
-    task, models = case.inputs.checkpoint.task, {model.key for model in case.profile.readings}
-    keys = [key for key in modelled_sensors(task) if key not in models and models]
+    task, models = case.inputs.checkpoint.task, {model.key for model in case.profile.readings if model.channels}
+    keys = [key for key in modelled_sensors(task) if key not in models and case.profile.readings]
     return [f"exchanged and inverted channels of {display_name(key)}" for key in keys]
+
+
+def _unreported(case: Case) -> list[str]:
+    """What predictions would show of an external filter."""
+    if not isinstance(case.inputs.checkpoint, ExternalFilter) or prediction(case.traces[0]) is not None:
+        return []
+    return ["dynamics and process noise, since the filter reports no predicted_mean and predicted_covariance"]
 
 
 def _likelihoods(case: Case) -> list[str]:

@@ -172,25 +172,27 @@ def _of_changes(
 ) -> dict[str, float]:
     """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,).
 
-    are_exact: whether predictions start at true states, so that they have no noise. The bias is then what a slope on
-        the predicted changes does not explain: that on the true ones decreases with the process noise, and its
-        intercept depends on the speed.
+    are_exact: whether predictions start at true states, so that they have no noise. Bias and spread are then what a
+        slope on the predicted changes does not explain: that on the true ones decreases with the process noise, so that
+        its intercept depends on the speed and what it leaves on the variation of the motion.
     """
     moved = _moved(change, std)
     centred, around = residual - residual.mean(0), change - change.mean(0)
     excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
-    bias = residual.mean(0) - excess * change.mean(0)
+    bias, spread = residual.mean(0) - excess * change.mean(0), (centred - excess * around).std(0)
     if are_exact:
         predicted = residual + change
-        spread = np.square(predicted - predicted.mean(0)).sum(0)
-        slope = (centred * predicted).sum(0) / np.maximum(spread, 1e-12)
-        varies = moved & (spread > PREDICTED * np.square(around).sum(0))
+        distance = predicted - predicted.mean(0)
+        power = np.square(distance).sum(0)
+        slope = (centred * distance).sum(0) / np.maximum(power, 1e-12)
+        varies = moved & (power > PREDICTED * np.square(around).sum(0))
         bias = np.where(varies, residual.mean(0) - slope * predicted.mean(0), bias)
+        spread = (centred - slope * distance).std(0)
     columns = {
         "dynamics bias": bias,
         "dynamics error": np.sqrt(np.square(residual).mean(0)),
         "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
-        "dynamics spread": (centred - excess * around).std(0),
+        "dynamics spread": spread,
     }
     return _by_component(task, columns | dict(more))
 

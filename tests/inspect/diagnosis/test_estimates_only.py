@@ -47,6 +47,7 @@ def test_the_fault_of_a_filter_without_visible_equations_is_named(filter_: Netwo
     episodes = {seed: drive(seed) for seed in range(20, 26)}
     result = diagnose(loaded(filter_), episodes, profile=profile())
     assert [c.cause.name for c in result.causes[:1]] == ([cause] if cause else [])
+    assert any("reports no predicted_mean" in text for text in result.unmeasured)
     if cause.startswith("filter."):
         assert "version of the healthy record" in result.causes[0].next
 
@@ -57,3 +58,4 @@ def test_a_filter_that_reports_predictions_has_the_causes_of_its_equations() -> 
     assert "belief variance//all" not in record.statistics
     result = diagnose(loaded(Cart(weight=0.85, gain=0.3)), {s: drive(s) for s in range(20, 26)}, profile=record)
     assert not any(c.cause.name.startswith("filter.") for c in result.causes)
+    assert not any("predicted_mean" in text for text in result.unmeasured)
