@@ -95,6 +95,7 @@ def test_figures_of_the_paper(run: Run, folder: Path) -> None:
         assert not (folder / "invalid.svg").exists()
 
 
+@pytest.mark.long
 def test_counterfactual_outputs_agree(run: Run, folder: Path) -> None:
     """Text, JSON, figure and trace agree, and the trace contains the intervention."""
     line = "counterfactual door --filter crossmodal-pf --particles 50 --from 40 --to 60"
@@ -167,6 +168,7 @@ def test_all_notations_of_faults_are_equal(run: Run, folder: Path) -> None:
     assert unimodal["rmse"] != faulty["rmse"]
 
 
+@pytest.mark.long
 def test_skip_bad(run: Run, folder: Path) -> None:
     line = f"trace {EKF} --data shape.h5 -o some.trace"
     assert run(line)[0] == 2
@@ -202,6 +204,7 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert "--faults force_bias=5,blackout=0.4" in hardened["command"]
 
 
+@pytest.mark.long
 def test_inspect_reports_applicable_diagnostics_and_reasons(run: Run, folder: Path) -> None:
     for episode in (9, 19):
         assert run(f"trace {EKF} --episode {episode} -o {episode}.trace")[0] == 0

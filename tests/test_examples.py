@@ -83,6 +83,7 @@ def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {path.stem for path in tmp_path.glob("*.pdf")} == {"weights", "consistency", "errors", "particles"}
 
 
+@pytest.mark.long
 def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = example("02_counterfactual.py", tmp_path / "what.svg", capsys)
     blackout, trusted, _ = re.findall(r"during the intervention: ([\d.]+) -> ([\d.]+) cm", output)
@@ -202,6 +203,7 @@ def test_invalid_tasks_are_rejected(
     assert before == TASKS
 
 
+@pytest.mark.long
 def test_study_of_a_user_task_without_images(folder: Path, tmp_path: Path) -> None:
     script, data = tmp_path / "sound.py", tmp_path / "sound.h5"
     script.write_text(

@@ -137,6 +137,7 @@ def test_record(run: bs.Trace, tmp_path: Path) -> None:
     assert path.stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_representations(run: bs.Trace) -> None:
     assert repr(run) == "<Trace: crossmodal-ekf over 100 steps of door episode 9, seed 0, blackout=0.4>"
     diagnosis = bs.diagnose("door/crossmodal-ekf", "door", [9, 19, 29], faults="image_frozen:from=40")

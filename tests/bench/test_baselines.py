@@ -37,6 +37,7 @@ def test_learned_baselines_recognise_the_cases_they_were_fitted_to(folders: list
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_first_alarm(folders: list[Path]) -> None:
     assert first_alarm(load_case(folders[2]))["causes"][0]["cause"].startswith("weights.")
 

@@ -136,6 +136,7 @@ def test_model_causes_change_their_module_only(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_kalman_filter_causes(originals: dict[str, Checkpoint], episodes: list[Episode]) -> None:
     original = originals["crossmodal-ekf"]
     std = original.filter.statistics.mean_std("state")[1].numpy()
@@ -169,6 +170,7 @@ def test_kalman_filter_causes(originals: dict[str, Checkpoint], episodes: list[E
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_particle_filter_causes(originals: dict[str, Checkpoint], episodes: list[Episode]) -> None:
     original = originals["crossmodal-pf"]
 
@@ -213,6 +215,7 @@ def test_effect_of_nothing_is_invisible(originals: dict[str, Checkpoint], episod
     assert effect["visible"]
 
 
+@pytest.mark.long
 def test_a_case_is_a_function_of_its_specification(tmp_path: Path) -> None:
     causes = (planted("force.noise", 3), planted("model.image.bias", 3))
     spec = Spec("push", "crossmodal-ekf", causes, seed=1001, episodes=1, steps=40)

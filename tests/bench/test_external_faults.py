@@ -49,6 +49,7 @@ def inputs(episode: bs.Episode) -> Mapping[str, np.ndarray]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_filter_is_consistent_and_each_fault_of_it_changes_its_estimates(task: ModuleType) -> None:
     episode = task.simulate(4, steps=50)  # the headings pass pi
 

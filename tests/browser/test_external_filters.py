@@ -72,6 +72,7 @@ def serve_boats(start_server: Any, folder: Path, name: str, steps: int = 1000) -
     return str(start_server(*options, "--filter", f"{folder}/boats.py:{name}").url)
 
 
+@pytest.mark.long
 def test_reported_innovations_are_charts_and_rows_of_the_step(
     open_page: Any, start_server: Any, tmp_path: Path
 ) -> None:

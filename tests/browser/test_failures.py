@@ -132,6 +132,7 @@ def test_episodes_are_sorted_and_opened(open_page: Any) -> None:
     assert row.get_attribute("class") == "here"
 
 
+@pytest.mark.long
 def test_episodes_are_listed_before_the_search(open_page: Any) -> None:
     page = open_page("?tab=failures&list=episodes&filter=image-ekf&among=all")
     page.until("() => document.querySelector('#failures').dataset.state === 'absent'")

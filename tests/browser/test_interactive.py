@@ -61,6 +61,7 @@ def far_off(*, observations: dict[str, NDArray[np.float32]], controls: NDArray[n
     return mean, np.broadcast_to(np.eye(2, dtype=np.float32) * 1e-4, (*mean.shape, 2))
 
 
+@pytest.mark.long
 def test_an_estimate_outside_of_the_map_is_named(context: Any, tmp_path: Path) -> None:
     """An external filter without updates by modality has one row of values."""
     checkpoint = bs.load_filter(far_off, "push", name="far")

@@ -73,6 +73,7 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
         page.page.reload()  # the run is then no longer followed
 
 
+@pytest.mark.long
 def test_link_to_a_live_run_opens_it_when_it_starts(open_page: Any, request: pytest.FixtureRequest) -> None:
     page = open_page("?task=door&data=live:go")
     page.until("() => /“go” has not started/.test(document.querySelector('#messages').textContent)")

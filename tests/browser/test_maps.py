@@ -129,6 +129,7 @@ def check_probe(page: Any, expected: LikelihoodMap) -> None:
     assert page.page.locator("#maps-readout").is_hidden()
 
 
+@pytest.mark.long
 def test_other_components_are_selected_in_the_menu(open_page: Any, engine: MapEngine) -> None:
     page = open_page(f"{LINK}&map=posterior")
     page.page.locator("#maps-view").click()
@@ -149,6 +150,7 @@ def test_other_components_are_selected_in_the_menu(open_page: Any, engine: MapEn
     )
 
 
+@pytest.mark.long
 def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
     open_page: Any, expected: LikelihoodMap
 ) -> None:

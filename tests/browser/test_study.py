@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 READY = "() => document.querySelector('#study').dataset.state === 'ready'"
 LABELS = "(all) => all.map((a) => [a.getAttribute('aria-label'), a.hasAttribute('href')])"
 
 
+@pytest.mark.long
 def test_bar_opens_the_largest_error(open_page: Any) -> None:
     page = open_page("?tab=study&step=40", size=(1440, 900))
     page.until(READY)

@@ -153,6 +153,7 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     third.until(f"() => ({titles})().join() === 'Effective,Hinge,Particles'")
 
 
+@pytest.mark.long
 def test_readings_are_charts_that_a_diagnosis_offers(open_page: Any) -> None:
     page = open_page(LINK + "&faults=force_bias%3D5&tab=diagnosis", size=(1280, 720))
     titles = "() => [...document.querySelectorAll('#tracks h3')].map((title) => title.textContent)"
@@ -249,6 +250,7 @@ def test_event_marks_and_comparison_run(open_page: Any) -> None:
     assert len(legend(page, 1)["fused"]) == 1
 
 
+@pytest.mark.long
 def test_export_has_the_displayed_charts_steps_and_values(open_page: Any, tmp_path: Path) -> None:
     page = open_page(
         LINK + "&window=20-60&charts=estimate,track,readings/force&track=error&component=angle&time=seconds"

@@ -63,6 +63,7 @@ def address(installed: Path, tmp_path: Path) -> Iterator[str]:
     assert server.wait(60) == 0
 
 
+@pytest.mark.long
 def test_wheel_contains_all_modules_and_data(wheel: Path, tree: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     data = ("page", "samples", "pretrained")

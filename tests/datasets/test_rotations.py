@@ -129,6 +129,7 @@ def test_definition_main_error_and_refusals() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_recorded_attitude_filter_is_consistent(tmp_path: Path) -> None:
     example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "attitude.py"))
     traces = []

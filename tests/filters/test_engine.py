@@ -36,6 +36,7 @@ def test_progress_counts_items_of_blocks() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_processes_report_whole_blocks() -> None:
     shares: list[float] = []
     results = sorted(run_blocks(squares, [[1, 2, 3], [4]], workers=2, progress=shares.append))

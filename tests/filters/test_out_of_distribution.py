@@ -97,6 +97,7 @@ def test_injected_faults_are_no_difference_of_the_data(checkpoint: Checkpoint, f
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_moved_frame(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
     """A single episode suffices for the warning; the alignment finds the offset without knowing it."""
     planted = np.array([0.52, -0.3])

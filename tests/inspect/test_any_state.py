@@ -87,6 +87,7 @@ def test_every_diagnostic_is_computed_or_refused_with_a_reason(runs: list[Trace]
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_recording_report_and_page(runs: list[Trace], tmp_path: Path) -> None:
     run = read_recording(write_recording(runs[0], tmp_path / "run.rrd"))
     assert run.task == TASK

@@ -218,6 +218,7 @@ def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = load_checkpoint(pretrained_path("door", "crossmodal-pf"))
     whole = trace(checkpoint, episode, particles=2000)

@@ -72,6 +72,7 @@ def test_maps_equal_those_of_the_engine(run_: Trace, page: Path) -> None:
     assert maps["reach"] == pytest.approx([100.0 * run_.task.map_half_width] * 2)
 
 
+@pytest.mark.long
 def test_causes_have_titles_and_are_preliminary(tmp_path: Path) -> None:
     checkpoint, faults = load_checkpoint(pretrained_path("door", "crossmodal-ekf")), Faults.parse("image_noise")
     with open_dataset(sample_path("door")) as data:

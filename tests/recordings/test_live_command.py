@@ -53,6 +53,7 @@ def test_external_filter(run: Run, assert_same: Compare, tmp_path: Path) -> None
     assert arrays_of(expected)
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_complete_files(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "beliefscope", "live", "door", "--filter", "crossmodal-ekf", "--json", "-"]
     command += ["--rate", "1", "--workspace", str(tmp_path)]  # the run lasts much longer than the test

@@ -155,6 +155,7 @@ def test_provenance_of_checkpoints(sweep: Path) -> None:
     ]
 
 
+@pytest.mark.long
 def test_external_filters_run_beside_checkpoints(inputs: Inputs, tmp_path: Path, run: Run) -> None:
     """Their errors are those of the evaluation. Code that a table names is not executed."""
     external = "examples/04_own_filter.py:build"

@@ -94,6 +94,7 @@ def wait_for_trace(client: TestClient, query: dict[str, str]) -> Any:
     return reply
 
 
+@pytest.mark.long
 def test_the_smallest_repair_is_that_of_the_command(server: TestClient, settings: Settings) -> None:
     url, faults = "/api/repair/push/crossmodal-ekf/9", "image_occluded=14:from=40:to=60"
     assert server.get(url, params={"faults": faults}).json() == {"job": None}
@@ -148,6 +149,7 @@ def failing():
 """Filters of a task; the Jacobian of one is wrong, and one fails after 15 steps."""
 
 
+@pytest.mark.long
 def test_a_run_of_a_filter_that_fails_has_restarts(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
     (tmp_path / "boats.py").write_text(BOATS)
     source = f"{tmp_path}/boats.py"
@@ -173,6 +175,7 @@ def test_a_run_of_a_filter_that_fails_has_restarts(tmp_path: Path, open_client: 
     assert header["failure"] == {"failure": reason, "restarts": [15, 30]}
 
 
+@pytest.mark.long
 def test_a_filter_without_a_healthy_record_is_diagnosed_after_its_measurement(
     tmp_path: Path, open_client: Callable[..., TestClient]
 ) -> None:

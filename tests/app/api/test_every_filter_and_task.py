@@ -80,11 +80,12 @@ def map_layers(client: TestClient, task: Task) -> list[str] | None:
 @pytest.mark.parametrize(
     ("name", "layers", "present", "absent"),
     [
-        (
+        pytest.param(
             "feature-ekf",
             ["image+haptics", "fused"],
             "estimate_sigma",
             "weights effective_weights effective_sample_size",
+            marks=pytest.mark.long,
         ),
         pytest.param(
             "image-pf",
@@ -109,7 +110,13 @@ def map_layers(client: TestClient, task: Task) -> list[str] | None:
             "effective_sample_size",
             marks=pytest.mark.long,
         ),
-        ("information-pf", ["image", "haptics", "fused"], "effective_weights weights effective_sample_size", ""),
+        pytest.param(
+            "information-pf",
+            ["image", "haptics", "fused"],
+            "effective_weights weights effective_sample_size",
+            "",
+            marks=pytest.mark.long,
+        ),
         ("lstm", None, "estimate_mean", "estimate_sigma modality_mean modality_sigma weights effective_weights"),
     ],
 )

@@ -103,6 +103,7 @@ def test_checkpoints_are_added_to_the_catalog_once(
         assert client.get("/api/experiments/none").status_code == 404
 
 
+@pytest.mark.long
 def test_names_of_checkpoints_are_valid_in_another_server(
     settings: Settings, sweep: Path, open_client: Callable[..., TestClient], tmp_path: Path
 ) -> None:

@@ -57,6 +57,7 @@ def test_invalid_requests(shared_client: TestClient, shared_trace_url: str, part
     assert message in response.json()["error"]
 
 
+@pytest.mark.long
 def test_the_server_loads_matplotlib_only_to_draw() -> None:
     """In a process of its own: this one may have drawn before."""
     code = "import sys, beliefscope.app.server.main; assert 'matplotlib' not in sys.modules"

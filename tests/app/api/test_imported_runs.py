@@ -59,6 +59,7 @@ def finished(client: TestClient, url: str, query: dict[str, str]) -> Response:
     return answer
 
 
+@pytest.mark.long
 def test_diagnostics_of_all_runs_of_a_filter(imported: Settings, open_client: Callable[..., TestClient]) -> None:
     with open_client(imported) as client:
         listed = client.get("/api/live").json()["runs"]

@@ -19,6 +19,7 @@ TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 OPTIONS = {"events": [7, 30], "title": "Two events"}
 
 
+@pytest.mark.long
 def test_report_is_written_downloaded_deleted_and_restored(settings: Settings) -> None:
     app = create_app(settings, warm=False)
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:

@@ -21,6 +21,7 @@ def listed(client: TestClient) -> dict[str, dict[str, Any]]:
     return {r["name"]: r for r in recordings}
 
 
+@pytest.mark.long
 def test_recording_with_maps_is_a_job(client: TestClient, trace_url: str) -> None:
     body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "maps": 20}
     response = client.post(URL, json=body)

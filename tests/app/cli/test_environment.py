@@ -59,7 +59,7 @@ except SystemExit:
 @pytest.mark.parametrize(
     ("given", "threads", "used"),
     [
-        (None, "__import__('torch').get_num_threads()", 1),
+        pytest.param(None, "__import__('torch').get_num_threads()", 1, marks=pytest.mark.long),
         ("2", "os.environ['OMP_NUM_THREADS']", 2),  # PyTorch reads it
     ],
     ids=["default", "set by the user"],

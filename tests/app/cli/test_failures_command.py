@@ -110,7 +110,7 @@ class Failing:
 """A filter that fails in a step."""
 
 
-@pytest.mark.parametrize(("steps", "workers"), [(20, 1), (3, 1), (20, 2)])
+@pytest.mark.parametrize(("steps", "workers"), [(20, 1), (3, 1), pytest.param(20, 2, marks=pytest.mark.long)])
 def test_an_error_of_a_failing_filter_names_the_command_that_finds_its_cause(
     run: Run, tmp_path: Path, steps: int, workers: int
 ) -> None:

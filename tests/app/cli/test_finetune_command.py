@@ -33,6 +33,7 @@ def test_training_episodes_of_a_field_task_are_simulated(
     assert load_checkpoint(output).healthy_profile is not None
 
 
+@pytest.mark.long
 def test_events_of_other_data_need_no_training_episodes(
     run: Run, tmp_path: Path, short_episodes: Callable[..., list[Episode]]
 ) -> None:

@@ -91,9 +91,9 @@ def diagnose(run: Run, recordings: Path) -> Callable[[str], str]:
 @pytest.mark.parametrize(
     ("name", "headline"),
     [
-        ("again", "Healthy: "),
+        pytest.param("again", "Healthy: ", marks=pytest.mark.long),
         ("biased", "Sensor beacon biased, "),
-        ("sure", "Covariance of the filter too small, "),
+        pytest.param("sure", "Covariance of the filter too small, ", marks=pytest.mark.long),
         ("wrong", "Filter changed, while its readings show no fault, "),
     ],
 )
@@ -111,6 +111,7 @@ def test_recorded_runs_need_healthy_ones(run: Run, diagnose: Callable[[str], str
     assert "recorded runs are diagnosed as they are" in error
 
 
+@pytest.mark.long
 def test_recorded_runs_are_diagnosed_in_python(diagnose: Callable[[str], str], recordings: Path) -> None:
     headline = diagnose("biased")
     diagnosis = bs.diagnose_runs(str(recordings / "biased"), recordings / "clean")

@@ -120,6 +120,7 @@ def test_requests_survive_json(settings: Settings) -> None:
     store.close()
 
 
+@pytest.mark.long
 def test_the_worker_imports_no_web_or_viewer_packages() -> None:
     code = "import sys, beliefscope.app.runs.trace_worker; print([m for m in sys.argv[1:] if m in sys.modules])"
     packages = ["fastapi", "starlette", "uvicorn", "viser", "rerun", "matplotlib", "beliefscope.app.runs.trace_store"]

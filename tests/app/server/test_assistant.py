@@ -53,6 +53,7 @@ def test_answers_agree_with_the_trace(assistant: Assistant) -> None:
     assert assistant.figure(**RUN, step=50).startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_failures_and_diagnosis(assistant: Assistant) -> None:
     answer = assistant.failures("door", "crossmodal-ekf", top=3)
     assert len(answer["events"]) == 3

@@ -215,6 +215,7 @@ def test_close_ends_all_threads() -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.long
 def test_views_end_with_the_server(address: str) -> None:
     for _ in range(2):
         view = open_view(address)
@@ -265,6 +266,7 @@ async def test_idle_views_are_replaced_at_the_limit(settings: Settings) -> None:
     assert len(views) == 0
 
 
+@pytest.mark.long
 def test_concurrent_requests_do_not_exceed_the_limit(settings: Settings) -> None:
     async def scenario() -> None:
         views = Views(TraceStore(settings), limit=2)

@@ -52,6 +52,7 @@ def test_endless_file_is_rejected_in_time(valid: Path, monkeypatch: pytest.Monke
         assert len(data[0])
 
 
+@pytest.mark.long
 def test_endless_file_among_others(tmp_path: Path, valid: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
     paths = [tmp_path / f"{name}.h5" for name in "abcd"]

@@ -144,6 +144,7 @@ def test_stitching_is_a_rigid_motion(folder: Path) -> None:
         begin += len(push)
 
 
+@pytest.mark.long
 def test_folder_as_a_dataset(folder: Path, tmp_path: Path) -> None:
     with open_dataset(folder) as data:
         assert [s.split for s in data.summaries] == ["train"] * 200 + ["val"] * 50

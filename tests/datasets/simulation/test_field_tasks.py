@@ -172,6 +172,7 @@ def test_replay_has_the_object_of_the_episode(task: Task, episode: Episode) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_pushes_reach_the_puck_and_nudges_move_it() -> None:
     episodes = [simulate_push_field(11, index, 200) for index in range(4)]
     contact = np.concatenate([episode.contact for episode in episodes])

@@ -175,6 +175,7 @@ print((mapped() - before) / 5)
 
 @pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the memory of other C libraries")
+@pytest.mark.long
 def test_encoder_of_a_new_process_uses_its_memory_again() -> None:
     output = subprocess.run([sys.executable, "-c", PAGES], check=True, capture_output=True, text=True, timeout=120)
     # Its feature maps have 1,200 pages of 4 KiB, all mapped again in every call without ``keep_freed_memory``.

@@ -52,6 +52,7 @@ def test_the_fault_of_a_filter_without_visible_equations_is_named(filter_: Netwo
         assert "version of the healthy record" in result.causes[0].next
 
 
+@pytest.mark.long
 def test_a_filter_that_reports_predictions_has_the_causes_of_its_equations() -> None:
     checkpoint = loaded(Cart(weight=0.85))
     record = profile_of(checkpoint, [drive(seed) for seed in range(12)], "cart")

@@ -57,6 +57,7 @@ def of_mirrored_positions() -> Conventions:
     return conventions(traces(MIRRORED), filter_())
 
 
+@pytest.mark.long
 def test_a_planted_sign_is_the_first_finding_and_its_share_that_of_the_clean_runs() -> None:
     result = of_mirrored_positions()
     change, error = result.relevant_removals[0]

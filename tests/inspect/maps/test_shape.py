@@ -109,6 +109,7 @@ def test_rotation_and_shift_change_only_the_centre() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_interval_of_the_median_covers_over_trajectories() -> None:
     """Trajectory effects: 95 % intervals of 300 simulated surveys. An interval over independent steps covers 30 %."""
     rng = np.random.default_rng(0)

@@ -134,6 +134,7 @@ def test_invalid_scores(traces: list[Trace]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_runs_of_a_data_set(traces: list[Trace]) -> None:
     checkpoint = load_checkpoint(pretrained_path("push-field", "information-ekf"))
     shares: list[float] = []

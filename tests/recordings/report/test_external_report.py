@@ -84,6 +84,7 @@ def test_texts_name_the_quantities_of_the_run(run: Trace, filter_: bs.Checkpoint
     assert "estimates, covariance, innovations." in text
 
 
+@pytest.mark.long
 def test_episodes_are_in_order_and_the_caption_names_what_is_drawn(
     run: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -282,6 +282,7 @@ def test_captions_of_scenes_name_what_is_drawn(run_: Trace) -> None:
     assert "the true and the estimated position. Right" in scene_caption(plain, free, True)
 
 
+@pytest.mark.long
 def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     content = compose([new_trace("ekf", steps=80)], None, steps=[(0, 50)])
     assert set(content.results) >= {"consistency", "weights"}

@@ -46,6 +46,7 @@ def case(name: str, index: int, faults: str) -> tuple[Episode, Trace, float]:
     ],
 )
 @pytest.mark.parametrize("restorable", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.long
 def test_no_shorter_repair_exists(name: str, index: int, faults: str, restorable: bool) -> None:
     clean, run, bound = case(name, index, faults)
     checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
