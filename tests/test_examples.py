@@ -108,6 +108,7 @@ def test_example_is_short() -> None:
     assert len(EXAMPLE.read_text().splitlines()) < 60
 
 
+@pytest.mark.long
 def test_user_task_on_the_command_line(folder: Path) -> None:
     measured = result("evaluate", SPEC, "--filter", folder / "own.safetensors", "--data", folder / "own.h5")
     assert set(measured["rmse"]) == {"x_cm", "y_cm", "position_cm"}

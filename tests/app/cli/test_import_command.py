@@ -93,7 +93,9 @@ def test_a_data_set_is_converted_by_the_name_of_its_own_task(run: Run, log: Path
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error:std")
-@pytest.mark.parametrize("name", [pytest.param("unimodal-ekf", marks=pytest.mark.long), "unimodal-pf", "lstm"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.long) for name in ("unimodal-ekf", "unimodal-pf")), "lstm"]
+)
 def test_a_filter_is_trained_on_a_log_without_controls(run: Run, log: Path, name: str) -> None:
     data, checkpoint = log.with_name("data.h5"), log.with_name("filter.safetensors")
     log.with_name("map.toml").write_text(MAP.replace('control = "t"\n', ""))

@@ -140,7 +140,6 @@ def test_killed_study_resumes_to_the_same_results(data: Path, finished: Path, tm
         assert first_run == resumed
 
 
-@pytest.mark.long
 def test_tables_contain_the_results_of_the_cells(finished: Path) -> None:
     with (finished / "table.csv").open() as file:
         table = list(csv.DictReader(file))
@@ -303,7 +302,6 @@ def test_unusable_data_is_invalid_input(data: Path, tmp_path: Path, capsys: pyte
     assert "first: door/lstm/seed0: " + str(damaged) in capsys.readouterr().err
 
 
-@pytest.mark.long
 def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -> None:
     locked = cell(data, "lstm")
     lock = locked.path(tmp_path, "").with_name(".seed0.lock")
