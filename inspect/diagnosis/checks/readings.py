@@ -36,6 +36,9 @@ SIMPLER = 2.0
 SURELY = 4.0
 """Smallest number of standard errors of a slope."""
 
+LEAST_GAIN = 0.1
+"""Smallest gain by which the noise is divided."""
+
 BLOCKS = 10
 """Number of parts of an episode that are taken as independent of each other."""
 
@@ -205,8 +208,9 @@ def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict
     They are those of a line through the expected readings, and, if there is a drift, the times; NaN for too few steps.
     Noise changes slopes as well: gains are shrunk towards 1 if their standard errors exceed the spread (A,) of healthy
     ones, but little if they differ from 1 by far more than ``SURELY`` of them (positive-part James-Stein estimator).
-    The noise is that before the gain. The ratio is a gain without a bias, which is known even if the expected readings
-    hardly vary. It is shrunk towards 1 by the likelihood ratio of a bias, and of the drift, to it.
+    The noise is that before the gain, unless this is tiny (``LEAST_GAIN``): such readings do not follow. The ratio is a
+    gain without a bias, which is known even if the expected readings hardly vary. It is shrunk towards 1 by the
+    likelihood ratio of a bias, and of the drift, to it.
     """
     if len(readings) < MIN_STEPS:
         return dict.fromkeys(("bias", "drift", "gain", "noise", "ratio"), np.full(readings.shape[1], np.nan))
@@ -219,7 +223,8 @@ def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict
     error = np.maximum(np.maximum(rest / np.sqrt(power), _clustered(x * (y - slope * x)) / power), 1e-12)
     sure = 1.0 - np.square(SURELY * error / np.maximum(np.abs(slope - 1.0), 1e-12))
     share = np.maximum(np.minimum(np.square(spread / error), 1.0), sure)
-    before = np.where(sure > 0.0, np.maximum(np.abs(slope), 1e-3), np.maximum(slope, 1.0))
+    is_gain = (sure > 0.0) & (np.abs(slope) > LEAST_GAIN)
+    before = np.where(is_gain, np.abs(slope), np.maximum(slope, 1.0))
     errors, gain = readings - expected, 1.0 + share * (slope - 1.0)
     ratio = (expected * errors).sum(0) / np.maximum(np.square(expected).sum(0), 1e-24)
     others = errors - drifted

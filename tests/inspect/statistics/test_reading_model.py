@@ -376,6 +376,15 @@ def test_a_heading_among_the_controls_turns_readings_into_the_body_frame() -> No
     assert fit_reading_models([replace(e, task=unknown) for e in episodes], ["odometry"]) == ()
 
 
+def test_readings_that_do_not_follow_have_no_larger_noise() -> None:
+    """A gain is divided out of the noise, but not one of nearly zero."""
+    (model, _), rng = models(), np.random.default_rng(5)
+    for gain in (0.02, -0.02):
+        readings = gain * NEW.observations["gps"] + rng.normal(0.0, NOISE, (STEPS, 2))
+        values = reading_statistics(with_readings(NEW, "gps", readings), [model])
+        assert values["reading noise/gps x/all"] == pytest.approx(1.0, abs=0.2)
+
+
 def test_any_boolean_covariate_has_readings_of_its_own() -> None:
     """A firm grip as contact does: the features are equal, and the masks of absent readings have none."""
     task = replace(PLANE, covariates={"firm": Covariate("boolean")})
