@@ -97,10 +97,10 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
             continue
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)
-        read = compared.present | compared.outliers
         is_short = delay == 0.0 and _is_own_arrangement(errors)
         values[f"reading lag/{model.key}/all"] = _short_delay(compared) if is_short else delay
         if model.outliers:
+            read = compared.present | compared.outliers
             values[f"reading outliers/{model.key}/all"] = float(compared.outliers.sum() / max(read.sum(), 1))
         whole = 0 if np.isnan(delay) else int(delay)
         line = _line(*compared.pairs(whole), compared.steps(whole) / len(episode), model.gain_spreads)
@@ -134,15 +134,15 @@ def is_expected(model: ReadingModel, episode: Episode) -> bool:
 
 def without_outliers(episode: Episode, models: Sequence[ReadingModel]) -> Episode:
     """The episode with interpolated readings instead of isolated ones, of sensors with such ones in the record."""
-    observations = dict(episode.observations)
+    changed = {}
     for model in (model for model in models if model.outliers and is_expected(model, episode) and model.key != CONTROL):
         outliers = model.compare(episode).outliers
         others, steps = np.flatnonzero(episode.present(model.key) & ~outliers), np.flatnonzero(outliers)
         if len(others) and len(steps):
-            readings = observations[model.key].astype(np.float64)
+            readings = episode.observations[model.key].astype(np.float64)
             readings[steps] = np.stack([np.interp(steps, others, x[others]) for x in readings.T], axis=1)
-            observations[model.key] = readings
-    return replace(episode, observations=observations)
+            changed[model.key] = readings
+    return replace(episode, observations={**episode.observations, **changed}) if changed else episode
 
 
 def without_explained(row: Mapping[str, float]) -> dict[str, float]:
