@@ -30,6 +30,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.diagnostics import weight_audit
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
 from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
@@ -81,6 +82,7 @@ def compose(
     links_note: str = "",
     commands: tuple[str, ...] = (),
     quantity: Quantity | None = None,
+    profile: HealthyProfile | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Report:
     """Compute the contents of a report, including the diagnosis and every applicable diagnostic.
@@ -94,10 +96,11 @@ def compose(
         links_note: how to open permalinks, or why there are none.
         commands: command lines that reproduce the report.
         quantity: of the maps; by default the first one that the filter has.
+        profile: healthy record of the diagnosis; by default that of the checkpoint.
     """
     first, main = traces[0], traces[0].task.main_error.name
     options = {name: {"quantity": quantity} if "quantity" in e.options else {} for name, e in DIAGNOSTICS.items()}
-    diagnosis = report_diagnosis(traces, checkpoint, link, lambda share: progress(0.5 * share))
+    diagnosis = report_diagnosis(traces, checkpoint, profile, link, lambda share: progress(0.5 * share))
     results, reasons = run_diagnostics(traces, checkpoint, options, slow, lambda share: progress(0.5 + 0.4 * share))
     titles = {name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results}
     reasons = {DIAGNOSTICS[name].title: reason for name, reason in reasons.items()}

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
 
 
@@ -28,15 +30,18 @@ class ReportedDiagnosis:
 def report_diagnosis(
     traces: Sequence[Trace],
     checkpoint: Checkpoint | None,
+    profile: HealthyProfile | None,
     link: Callable[[int, int], str],
     progress: Callable[[float], None],
 ) -> ReportedDiagnosis:
-    """Diagnose the runs of the traces, which must have the healthy profile of their filter.
+    """Diagnose the runs of the traces.
 
     Args:
+        checkpoint: of the filter; without it no cause is undone.
+        profile: healthy record; by default that of the checkpoint.
         link: (index of a trace, step) -> permalink.
     """
-    if checkpoint is None:
+    if checkpoint is None and profile is None:
         return ReportedDiagnosis(None, "the filter's checkpoint is not available")
     indices = [trace.episode_index for trace in traces]
     if len(set(indices)) < len(indices):
@@ -44,9 +49,12 @@ def report_diagnosis(
     if any(trace.settings.get("edits") or trace.settings.get("standalone") for trace in traces):
         return ReportedDiagnosis(None, "interventions changed the run")
     first = traces[0]
+    filter_ = checkpoint or UnavailableFilter(first.filter, first.checkpoint_hash, first.task)
     try:
         particles = int(first.settings.get("particles", 300))
-        result = diagnose_traces(checkpoint, traces, seed=first.seed, particles=particles, progress=progress)
+        result = diagnose_traces(
+            filter_, traces, seed=first.seed, particles=particles, profile=profile, progress=progress
+        )
     except BadInput as error:
         return ReportedDiagnosis(None, str(error))
     deviations = () if result.state == "healthy" else result.deviations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.recordings.report.sections import number_text, text_columns
@@ -31,6 +32,8 @@ SPECIAL = {
 }
 """Character -> LaTeX; backticks mark commands on the page."""
 
+NUMBER = re.compile(r"-?[0-9.]+(e[-+][0-9]+)?")
+
 _TRANSLATION = str.maketrans(SPECIAL)
 
 
@@ -57,7 +60,10 @@ def _cell(value: Value) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "--"
     if isinstance(value, float) and math.isfinite(value):
-        digits, _, exponent = number_text(value).partition("e")
+        text = number_text(value)
+        if not NUMBER.fullmatch(text):  # a probability that is displayed as words
+            return _escaped(text)
+        digits, _, exponent = text.partition("e")
         return f"${digits} \\cdot 10^{{{int(exponent)}}}$" if exponent else f"${digits}$"
     return f"${value}$" if type(value) is int else _escaped(str(value))
 

@@ -2,18 +2,16 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from beliefscope.app.cli import console, options as opt
+from beliefscope.app.cli.healthy_records import record_for_runs, record_of_data
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
-    from beliefscope.datasets.episode import Episode
     from beliefscope.filters.checkpoint import Checkpoint
-    from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,9 @@ def _of_filter(options: Options) -> console.Result:
         failed = None if options.repair is None else data[options.repair]
     if options.profile_from is None:
         _check_record(correct, options.data, held_out if faults else 0)
-    profile = _profile(correct, options, episodes.values())
+    profile = record_of_data(
+        correct, options.profile_from, episodes.values(), options.alarm_rate, injected=bool(options.faults)
+    )
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
@@ -163,35 +163,20 @@ def _of_recordings(options: Options) -> console.Result:
     """The diagnosis of recorded runs, with a healthy record of other ones or of the filter, which may run for it."""
     from beliefscope.app.workspace.healthy_records import record_path
     from beliefscope.app.workspace.json_files import write_record
-    from beliefscope.filters.external.unavailable import UnavailableFilter
-    from beliefscope.filters.names import is_run
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
     from beliefscope.inspect.diagnostics.views import Table
-    from beliefscope.inspect.healthy import overlap_warning, recorded_profile
-    from beliefscope.recordings.open_trace import recorded_runs, runs_by_file
-    from beliefscope.recordings.recorded_diagnosis import comparable
+    from beliefscope.recordings.open_trace import runs_by_file
 
-    healthy, opened = options.profile_from, runs_by_file(Path(options.task))
+    opened = runs_by_file(Path(options.task))
     files, traces = {trace.episode_index: file for file, trace in opened.items()}, list(opened.values())
-    clean = recorded_runs(healthy) if healthy and is_run(str(healthy)) else []
-    places = [options.task] * len(traces) + [str(healthy)] * len(clean)
-    traces, clean, checkpoint = comparable(traces, clean, places, options.filter)
     if options.episode is not None:
         traces = [trace for trace in traces if trace.episode_index == options.episode]
         if not traces:
             raise BadInput(f"{options.task} has no run of episode {options.episode}")
-    if clean and (warning := overlap_warning((t.episode for t in clean), (t.episode for t in traces))):
-        console.note(f"Warning: {warning}")
-    if clean:
-        with console.progress("Measuring the healthy record") as advance:
-            profile = recorded_profile(checkpoint, clean, str(healthy), advance)
-    elif isinstance(checkpoint, UnavailableFilter):
-        raise BadInput(
-            "recorded runs need a healthy record: give a folder of at least 10 recorded runs without a fault, "
-            "--profile-from DIR, or the filter of the runs, --filter"
-        )
-    else:
-        profile = _profile(checkpoint, options, [trace.episode for trace in traces])
+    places = [options.task] * len(traces)
+    traces, checkpoint, profile = record_for_runs(
+        traces, places, options.filter, options.profile_from, options.alarm_rate
+    )
     if options.workspace is not None:
         opt.check_workspace(options.workspace)
         write_record(profile.to_json(), record_path(options.workspace, checkpoint))  # where the page finds it
@@ -224,27 +209,3 @@ def _check_record(checkpoint: Checkpoint, data: Path | None, clean: int) -> None
         source = str(data or sample_path(checkpoint.task)) if clean >= MIN_HEALTHY else "CLEAN.h5"
         command = shlex.join(["beliefscope", *sys.argv[1:], "--profile-from", source])
         raise BadInput(f"{reason}; measure it on clean data with {MIN_HEALTHY} or more held-out episodes: {command}")
-
-
-def _profile(checkpoint: Checkpoint, options: Options, diagnosed: Collection[Episode]) -> HealthyProfile:
-    """The healthy record of a filter, or of its runs over the held-out episodes of ``--profile-from``.
-
-    Raises BadInput, before the runs, if these are too few for the diagnosis. Warns if some are ``diagnosed``, without
-    injected faults: a fault that the record has as well does not show.
-    """
-    from beliefscope.datasets.store import open_dataset
-    from beliefscope.inspect.diagnosis.case import checked_alarm_rate
-    from beliefscope.inspect.diagnosis.diagnose import required_profile
-    from beliefscope.inspect.healthy import overlap_warning, profile_of
-
-    clean = options.profile_from
-    if clean is None:
-        return required_profile(checkpoint)
-    with open_dataset(clean) as data, console.progress("Measuring the healthy record") as advance:
-        indices = data.held_out()
-        checked_alarm_rate(len(indices), len(diagnosed), options.alarm_rate, len(data))
-        advance(0.0)
-        episodes = [data[index] for index in indices]
-        if warning := overlap_warning(episodes, () if options.faults else diagnosed):
-            console.note(f"Warning: {warning}")
-        return profile_of(checkpoint, episodes, str(clean), progress=advance, indices=indices)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console, options as opt
+from beliefscope.app.cli.healthy_records import record_for_runs
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 
@@ -31,6 +32,12 @@ def report(
     filter: str = opt.TRACE_FILTER,
     task: str = opt.TASK_OF_FILES,
     data: Path | None = None,
+    profile_from: Path | None = opt.option(
+        "DATA|DIR",
+        "Healthy record of the diagnosis: clean data, whose held-out episodes the filter runs over, or a folder of "
+        "healthy runs. Default: the record of the filter.",
+        None,
+    ),
     quantity: opt.Quantity | None = None,
     every: bool = opt.flag("Include slow diagnostics.", "--all"),
     url: str = opt.option("ADDRESS", "Address of the dashboard, for permalinks.", URL),
@@ -47,6 +54,7 @@ def report(
       beliefscope report run.trace
       beliefscope report runs/*.trace -o report --title "Doors, 40 % image blackout" --pdf
       beliefscope report run.trace --event 35 --event 68 --all
+      beliefscope report traces/today --profile-from traces/healthy
     """
     from beliefscope.inspect.catalog import reason_text
     from beliefscope.inspect.maps.map_engine import no_maps
@@ -64,14 +72,17 @@ def report(
         raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
     opened, checkpoint = open_traces(files, filter, task)
     pairs = sorted(zip(files, opened, strict=True), key=lambda pair: pair[1].episode_index)
-    files, traces = [file for file, _ in pairs], [trace for _, trace in pairs]
+    files, traces, profile = [file for file, _ in pairs], [trace for _, trace in pairs], None
+    if profile_from is not None:
+        traces, _, profile = record_for_runs(traces, [str(file) for file in files], filter, profile_from)
     if quantity and checkpoint is not None and (reason := no_maps(checkpoint, traces[0], quantity)):
         raise BadInput(reason)
     steps = [parse_event(text, traces) for text in events or ()]
     link, links_note = _permalinks(traces, checkpoint, filter, data, url)
     commands = [trace_command(trace, file.name, filter, data) for file, trace in zip(files, traces, strict=True)]
     map_option = ["--map", quantity] if quantity else []
-    source = [*map_option, *(["--filter", filter] if filter else []), *(["--data", str(data)] if data else [])]
+    named = {"--filter": filter, "--data": data, "--profile-from": profile_from}
+    source = [*map_option, *(word for name, value in named.items() if value for word in (name, str(value)))]
     commands.append(report_command([file.name for file in files], events or (), every, title, *source))
     with console.progress("Reporting") as advance:
         content = compose(
@@ -85,10 +96,12 @@ def report(
             links_note=links_note,
             commands=tuple(commands),
             quantity=quantity,
+            profile=profile,
             progress=lambda fraction: advance(0.6 * fraction),
         )
         document = write_report(content, output, chromium, lambda fraction: advance(0.6 + 0.4 * fraction))
-    lines = [f"{content.titles[name][0]}: {verdict}" for name, verdict in document["diagnostics"].items()]
+    lines = [f"Diagnosis: {headline}"] if (headline := document["diagnosis"]) else []
+    lines += [f"{content.titles[name][0]}: {verdict}" for name, verdict in document["diagnostics"].items()]
     lines += [f"{title}: {reason_text(reason)}" for title, reason in document["not_made"].items()]
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
     lines.append(f"{output / 'report.html'} ({len(document['files'])} files, {size / 1e6:.1f} MB)")

@@ -111,6 +111,18 @@ def test_recorded_runs_need_healthy_ones(run: Run, diagnose: Callable[[str], str
     assert "recorded runs are diagnosed as they are" in error
 
 
+def test_a_report_of_recorded_runs_has_their_diagnosis(
+    run: Run, diagnose: Callable[[str], str], recordings: Path, tmp_path: Path
+) -> None:
+    headline, folders = diagnose("biased"), (recordings / "biased", recordings / "clean")
+    code, text, error = run("report", folders[0], "--profile-from", folders[1], "-o", tmp_path / "report")
+    assert code == 0, error
+    assert text.startswith(f"Diagnosis: {headline}")
+    manifest = json.loads((tmp_path / "report" / "manifest.json").read_text())
+    assert manifest["diagnosis"] == headline
+    assert f"--profile-from {folders[1]}" in manifest["commands"][-1]
+
+
 @pytest.mark.long
 def test_recorded_runs_are_diagnosed_in_python(diagnose: Callable[[str], str], recordings: Path) -> None:
     headline = diagnose("biased")

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from beliefscope.inspect.diagnosis.cause import Probability
 from beliefscope.inspect.diagnostics.views import Table
 from beliefscope.recordings.report.latex import latex_table
 
@@ -51,6 +52,8 @@ def test_any_text_is_valid() -> None:
         (1234.5, "$1234$"),
         (1.2e-9, r"$1.20 \cdot 10^{-9}$"),
         (-7, "$-7$"),
+        (Probability(0.5), "$0.50$"),
+        (Probability(0.999), "above 0.99"),
         (True, "True"),
         (float("nan"), "--"),
         (None, "--"),

@@ -302,13 +302,13 @@ def test_the_diagnosis_is_that_of_the_traces_and_links_to_its_moment(checkpoint:
         frozen = trace(checkpoint, data[EPISODE], EPISODE, faults=faults)
         expected = diagnose(checkpoint, {EPISODE: faults.apply(data[EPISODE], 0)})
     link: Callable[[int, int], str] = "{}:{}".format
-    result = report_diagnosis([frozen], checkpoint, link, lambda share: None)
+    result = report_diagnosis([frozen], checkpoint, None, link, lambda share: None)
     assert result.result is not None
     assert result.result.headline == expected.headline
     assert result.link == "0:6"
     edited = replace(frozen, settings={**frozen.settings, "edits": [{"from": 0, "to": 5}]})
     for traces, reason in (([edited], "interventions"), ([frozen, frozen], "several traces")):
-        refused = report_diagnosis(traces, checkpoint, link, lambda share: None)
+        refused = report_diagnosis(traces, checkpoint, None, link, lambda share: None)
         assert refused.result is None
         assert reason in refused.reason
 
