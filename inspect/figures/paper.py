@@ -238,7 +238,9 @@ def weights_figure(trace: Trace) -> Figure:
     """
     weights = trace.weights if trace.effective_weights is None else trace.effective_weights
     if weights is None:
-        raise BadInput(f"no weights to draw: {weight_audit.why_not(trace)}")
+        raise BadInput(
+            f"no weights to draw: {weight_audit.why_not(trace)}", "the figure `timeline` draws the estimates"
+        )
     task = trace.task
     component_wise = weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.app.cli.healthy_records import record_for_runs, record_of_data
+from beliefscope.app.cli.recorded_runs import FORMS, TaskOrRecordedRuns
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(opt.Runs):
+class Options(TaskOrRecordedRuns):
     """Options of a diagnosis, which also takes recorded runs, by their path in place of the task."""
 
     task: Annotated[
@@ -23,7 +24,7 @@ class Options(opt.Runs):
         opt.argument(
             "TASK|RUN.trace|DIR",
             "Task: a built-in one such as door, or your own as FILE.py:NAME; the name is enough if --data or a "
-            "checkpoint contains the definition. Or a recorded run (.trace, .live or .rrd), or a folder of them.",
+            f"checkpoint contains the definition. Or {FORMS}, or a folder of them.",
         ),
     ]
     filter: str = ""
@@ -58,23 +59,6 @@ class Options(opt.Runs):
     )
     workers: int = 1
     engine: opt.Engine = "local"
-
-    def __post_init__(self) -> None:
-        """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
-        if not self.is_recorded:
-            from beliefscope.filters.names import RUNS
-
-            if not self.filter and Path(self.task).is_dir():
-                raise BadInput(f"{self.task} has no recorded runs, files that end in {', '.join(RUNS)}")
-            if not self.filter:
-                raise BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
-            super().__post_init__()
-
-    @property
-    def is_recorded(self) -> bool:
-        from beliefscope.filters.names import is_run  # imports NumPy
-
-        return self.data is None and is_run(self.task)
 
 
 def diagnose(options: Options) -> console.Result:

@@ -1,11 +1,57 @@
-from collections.abc import Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from beliefscope.app.cli import console, options as opt
+from beliefscope.app.cli.recorded_runs import FORMS, TaskOrRecordedRuns
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
+
+if TYPE_CHECKING:
+    from beliefscope.datasets.episode import Episode
+    from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.inspect.trace import Trace
+
+
+@dataclass(frozen=True)
+class DrawnRun(TaskOrRecordedRuns, opt.Run):
+    """Options of the run that a figure shows: of a filter over an episode, or a recorded one."""
+
+    task: Annotated[
+        str,
+        opt.argument(
+            "TASK|RUN",
+            "Task: a built-in one such as door, or your own as FILE.py:NAME; the name is enough if --data or a "
+            f"checkpoint contains the definition. Or {FORMS}.",
+        ),
+    ]
+    filter: str = ""
+
+    def traced(self, check: Callable[[Episode, int], object]) -> tuple[Checkpoint, Trace]:
+        """The filter, which may be unavailable if the run is recorded, and the trace of the run.
+
+        check: called with the episode and its index, before the filter runs.
+        """
+        from beliefscope.filters.external.unavailable import UnavailableFilter
+        from beliefscope.inspect.traces.provenance import checkpoint_of
+        from beliefscope.recordings.open_trace import open_trace
+
+        if not self.is_recorded:
+            checkpoint, faults = self.open()
+            episode, index = self.read_episode(checkpoint.task)
+            check(episode, index)
+            return checkpoint, self.over(checkpoint, episode, index, faults)
+        if self.faults or self.episode is not None:
+            raise BadInput("a recorded run is drawn as it is, without --faults and --episode")
+        if Path(self.task).is_dir():
+            raise BadInput(f"{self.task} is a folder; give one of its runs")
+        trace = open_trace(Path(self.task))
+        check(trace.episode, trace.episode_index)
+        recorded = checkpoint_of([trace], [Path(self.task)], self.filter)
+        return recorded or UnavailableFilter(trace.filter, trace.checkpoint_hash, trace.task), trace
 
 
 @dataclass(frozen=True)
@@ -37,7 +83,7 @@ class TimelineOptions:
 def figure(
     *,
     kind: Literal["maps", "weights", "timeline"] = opt.argument("maps|weights|timeline", "Kind of figure."),
-    run: opt.Run,
+    run: DrawnRun,
     output: Path = opt.output_file(
         "FIGURE", "Output figure: .svg, .pdf or .png; of a timeline also its values, .csv.", default=...
     ),
@@ -54,6 +100,8 @@ def figure(
 ) -> console.Result:
     """Draw a figure for a paper from a filter run.
 
+    The run is over an episode, or a recorded one, such as that of an imported log.
+
     maps: likelihood or posterior of each modality around the true position, in free motion and in contact. For a task
     without contact, the maps are at one step; for a state with one map component, they are curves.
     weights: estimates of each modality and of the fused filter over time, with the fusion weights below and contact
@@ -67,6 +115,7 @@ def figure(
       beliefscope figure weights push --filter crossmodal-ekf --episode 9 -o weights.pdf
       beliefscope figure timeline door --filter crossmodal-ekf --faults blackout=0.4 --window 20-60 -o timeline.pdf
       beliefscope figure timeline door --filter crossmodal-pf --chart error --chart particles -o timeline.csv
+      beliefscope figure timeline traces/today/run_0.trace --chart estimate --chart innovation -o timeline.pdf
     """
     from beliefscope.inspect.diagnostics import plotting
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
@@ -82,12 +131,14 @@ def figure(
     if kind != "timeline":
         _refuse("timeline", {"chart": view.charts} | {k: v for k, v in vars(view).items() if k != "charts"})
     shown = View(**vars(view) | {"charts": tuple(view.charts or DEFAULT_CHARTS)})
-    checkpoint, faults = run.open()
-    if view.component:
-        checkpoint.task.index(view.component)
-    episode, index = run.read_episode(checkpoint.task)
-    selection = paper.steps_by_contact(episode, index, steps or ()) if kind == "maps" else {}
-    trace = run.over(checkpoint, episode, index, faults)
+
+    def map_steps(episode: Episode, index: int) -> dict[bool, int]:
+        if view.component:
+            episode.task.index(view.component)
+        return paper.steps_by_contact(episode, index, steps or ()) if kind == "maps" else {}
+
+    checkpoint, trace = run.traced(map_steps)
+    selection = map_steps(trace.episode, trace.episode_index)
     extra: dict[str, Any] = {}
     if kind == "maps":
         if reason := no_maps(checkpoint, trace, quantity):

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.app.cli.healthy_records import record_for_runs
@@ -12,6 +12,7 @@ from beliefscope.recordings.report.command_lines import report_command, serve_co
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
+    from beliefscope.recordings.report.sections import Report
 
 URL = "http://127.0.0.1:8000"
 """Default address of ``beliefscope serve``."""
@@ -56,7 +57,6 @@ def report(
       beliefscope report run.trace --event 35 --event 68 --all
       beliefscope report traces/today --profile-from traces/healthy
     """
-    from beliefscope.inspect.catalog import reason_text
     from beliefscope.inspect.maps.map_engine import no_maps
     from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
@@ -67,9 +67,7 @@ def report(
     chromium = browser() if pdf else None
     if not url.startswith(("http://", "https://")):
         raise BadInput(f"--url {url!r} is not an address such as {URL}")
-    files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
-    if not files:
-        raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
+    files = _files(paths)
     opened, checkpoint = open_traces(files, filter, task)
     pairs = sorted(zip(files, opened, strict=True), key=lambda pair: pair[1].episode_index)
     files, traces, profile = [file for file, _ in pairs], [trace for _, trace in pairs], None
@@ -80,9 +78,8 @@ def report(
     steps = [parse_event(text, traces) for text in events or ()]
     link, links_note = _permalinks(traces, checkpoint, filter, data, url)
     commands = [trace_command(trace, file.name, filter, data) for file, trace in zip(files, traces, strict=True)]
-    map_option = ["--map", quantity] if quantity else []
-    named = {"--filter": filter, "--data": data, "--profile-from": profile_from}
-    source = [*map_option, *(word for name, value in named.items() if value for word in (name, str(value)))]
+    named = {"--map": quantity, "--filter": filter, "--data": data, "--profile-from": profile_from}
+    source = [word for name, value in named.items() if value for word in (name, str(value))]
     commands.append(report_command([file.name for file in files], events or (), every, title, *source))
     with console.progress("Reporting") as advance:
         content = compose(
@@ -100,6 +97,21 @@ def report(
             progress=lambda fraction: advance(0.6 * fraction),
         )
         document = write_report(content, output, chromium, lambda fraction: advance(0.6 + 0.4 * fraction))
+    return _result(document, content, output)
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    """The traces, and those in folders. Raises BadInput if there are none."""
+    files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
+    if not files:
+        raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
+    return files
+
+
+def _result(document: dict[str, Any], content: Report, output: Path) -> console.Result:
+    """Diagnosis, verdicts and missing parts of a report, and the size of its folder. document: its manifest."""
+    from beliefscope.inspect.catalog import reason_text
+
     lines = [f"Diagnosis: {headline}"] if (headline := document["diagnosis"]) else []
     lines += [f"{content.titles[name][0]}: {verdict}" for name, verdict in document["diagnostics"].items()]
     lines += [f"{title}: {reason_text(reason)}" for title, reason in document["not_made"].items()]

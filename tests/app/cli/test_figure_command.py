@@ -50,3 +50,22 @@ def test_the_timeline_as_a_figure_and_as_values(run: Callable[..., Any], tmp_pat
     assert (header.split(",")[4], len(rows)) == ("angle_error_fused_deg", 5)
     assert run(*arguments, "--beta", "--seconds", "-o", tmp_path / "timeline.pdf")[0] == 0
     assert (tmp_path / "timeline.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.slow
+def test_a_recorded_run_has_the_figures_of_the_run(run: Callable[..., Any], tmp_path: Path) -> None:
+    selection = ("door", "--filter", "crossmodal-ekf", "--episode", 9)
+    assert run("trace", *selection, "-o", tmp_path / "run.trace")[0] == 0
+    assert run("figure", "timeline", *selection, "-o", tmp_path / "timeline.csv")[0] == 0
+    code, text, _ = run("figure", "timeline", tmp_path / "run.trace", "-o", tmp_path / "recorded.csv")
+    assert (code, "crossmodal-ekf over 100 steps of door episode 9" in text) == (0, True)
+    assert (tmp_path / "recorded.csv").read_bytes() == (tmp_path / "timeline.csv").read_bytes()
+    assert run("figure", "maps", tmp_path / "run.trace", "--step", 20, "-o", tmp_path / "maps.png")[0] == 0
+    for arguments, message in (
+        ((tmp_path / "run.trace", "--faults", "blackout=0.4"), "a recorded run is drawn as it is"),
+        ((tmp_path,), "is a folder; give one of its runs"),
+        ((tmp_path / "run.trace", "--filter", "image-ekf"), "not from 'image-ekf'"),
+        (("door",), "--filter is missing"),
+    ):
+        code, _, error = run("figure", "weights", *arguments, "-o", tmp_path / "weights.png")
+        assert (code, message in error) == (2, True), error
