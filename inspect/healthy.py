@@ -68,7 +68,8 @@ def sensor_record(
     folds = []
     for fold in range(FOLDS):
         group = [episode for i, episode in enumerate(episodes) if i % FOLDS != fold]
-        own = [m.with_noise_of(by_channels.get((m.key, m.channels), m)) for m in fit_reading_models(group, keys)]
+        of_group = fit_reading_models(group, [model.key for model in models], models)
+        own = [m.with_noise_of(by_channels.get((m.key, m.channels), m)) for m in of_group]
         folds.append((reference or measure_reference(group), own))
         report((fold + 2) / parts)
     rows = []

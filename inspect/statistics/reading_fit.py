@@ -67,11 +67,17 @@ Fit = tuple[Array, Array, list[Array]]
 """Coefficients (F, C) and constants (C,) of columns, and their predictions (S, C) for each episode."""
 
 
-def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tuple[ReadingModel, ...]:
+def fit_reading_models(
+    episodes: Sequence[Episode], keys: Sequence[str], whole: Sequence[ReadingModel] = ()
+) -> tuple[ReadingModel, ...]:
     """Models of the vector sensors whose readings depend on the labels; none for too few labelled episodes.
 
     Each half of the episodes decides which channels the model of the other half explains, and by which features.
+
+    Args:
+        whole: models of all episodes if these are some of them: isolated readings are left out as there.
     """
+    limits = {model.key: 1.0 if model.outliers else 0.0 for model in whole}
     episodes = [episode for episode in episodes if np.isfinite(episode.states).all()]
     if len(episodes) < MIN_EPISODES or not keys:
         return ()
@@ -88,7 +94,7 @@ def fit_reading_models(episodes: Sequence[Episode], keys: Sequence[str]) -> tupl
         ]
         options = _options(episodes, key)
         fits = _fit(rows, groups, options) if len(rows) >= MIN_EPISODES else []
-        rows, fits, outliers = _without_outliers(rows, fits, groups, options)
+        rows, fits, outliers = _without_outliers(rows, fits, groups, options, limits.get(key, FEW))
         strong, weak = (
             tuple(fitted.model(rows) for fitted in fits if low < fitted.explained(rows) <= high)
             for low, high in ((EXPLAINED, 1.0), (WEAKLY_EXPLAINED, EXPLAINED))
@@ -256,14 +262,14 @@ def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Opti
 
 
 def _without_outliers(
-    rows: list[Rows], fits: list[_Fitted], groups: Sequence[Indices], options: Sequence[Option]
+    rows: list[Rows], fits: list[_Fitted], groups: Sequence[Indices], options: Sequence[Option], limit: float
 ) -> tuple[list[Rows], list[_Fitted], float]:
     """The rows and fits without isolated readings, whose errors would hide what the others depend on, and their share.
 
-    The same ones, and 0, if no reading is isolated, or if many are (``FEW``).
+    The same ones, and 0, if no reading is isolated, or a share above the ``limit`` is.
     """
     every, before = sum(len(row.readings) for row in rows), (rows, fits, 0.0)
-    for _ in range(PASSES):
+    for _ in range(PASSES if limit else 0):
         errors = [np.stack(of_channels, axis=1) for of_channels in zip(*(fit.errors for fit in fits), strict=True)]
         left_out = [isolated(error).any(axis=1) for error in errors]
         if not any(steps.any() for steps in left_out):
@@ -271,7 +277,7 @@ def _without_outliers(
         rows = [row.part(np.logical_not(steps)) for row, steps in zip(rows, left_out, strict=True)]
         fits = _fit(rows, groups, options)
     share = 1.0 - sum(len(row.readings) for row in rows) / max(every, 1)
-    return (rows, fits, share) if 0.0 < share <= FEW else before
+    return (rows, fits, share) if 0.0 < share <= limit else before
 
 
 def _landmark_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option]) -> Iterator[_Fitted]:

@@ -20,11 +20,11 @@ SHARE = 0.03
 FAR = 20.0  # m
 
 
-def detected(episode: Episode, seed: int, share: float = SHARE) -> Episode:
+def detected(episode: Episode, seed: int, share: float = SHARE, far: float = FAR) -> Episode:
     """GPS positions with false ones at some steps, anywhere."""
     rng = np.random.default_rng(seed)
     readings, steps = episode.observations["gps"].copy(), rng.random(STEPS) < share
-    readings[steps] += rng.uniform(-FAR, FAR, (steps.sum(), 2))
+    readings[steps] += rng.uniform(-far, far, (steps.sum(), 2))
     return with_readings(episode, "gps", readings)
 
 
@@ -92,3 +92,15 @@ def test_isolated_errors_do_not_depend_on_scale_offset_and_slope(scale: float) -
     assert np.argwhere(found).tolist() == [[20, 1], [100, 1], [199, 1]]
     assert not isolated(np.zeros((200, 1))).any()
     assert not isolated(errors[:8]).any()
+
+
+@pytest.mark.parametrize(("shares", "expected"), [((0.25, 0.04), 0.0), ((0.15, 0.0), 0.15)])
+def test_some_episodes_leave_readings_out_as_all_do(shares: tuple[float, float], expected: float) -> None:
+    """Otherwise the statistics of the record, from models of some episodes, would not be those of new episodes."""
+    half = len(EPISODES) // 2
+    episodes = [detected(e, seed, shares[seed >= half], far=1.0) for seed, e in enumerate(EPISODES)]
+    part = episodes[half:] if expected == 0.0 else episodes[:half]
+    whole, alone = fit_reading_models(episodes, ["gps"]), fit_reading_models(part, ["gps"])
+    assert (whole[0].outliers > 0.0) == (expected > 0.0) != (alone[0].outliers > 0.0)
+    (model,) = fit_reading_models(part, ["gps"], whole)
+    assert model.outliers == pytest.approx(expected, abs=0.03)
