@@ -96,18 +96,23 @@ NO_ANGLES = Angles()
 """Of a state without wrapping angles."""
 
 
+def jumping_angles(episodes: Sequence[Episode]) -> dict[str, int]:
+    """Angles that jump by more than half a turn although their component does not wrap -> number of episodes."""
+    numbers = {}
+    for i, component in enumerate(episodes[0].task.components if episodes else ()):
+        if component.unit == "rad" and not (component.rotation or component.wraps):
+            numbers[component.name] = sum((np.abs(np.diff(e.states[:, i])) > np.pi).any() for e in episodes)
+    return {name: int(number) for name, number in numbers.items() if number}
+
+
 def wrapping_warning(episodes: Sequence[Episode]) -> str | None:
-    """One line about training angles that jump by more than half a turn although their component does not wrap."""
+    """One line about ``jumping_angles`` of the training episodes."""
     training = [episode for episode in episodes if episode.split == "train"]
-    lines = []
-    for i, component in enumerate(training[0].task.components if training else ()):
-        if component.unit != "rad" or component.rotation or component.wraps:
-            continue
-        jumps = sum(bool((np.abs(np.diff(episode.states[:, i])) > np.pi).any()) for episode in training)
-        if jumps:
-            lines.append(f"{display_name(component.name)} wraps around in {jumps} of {len(training)} training episodes")
-    if not lines:
+    jumps = jumping_angles(training)
+    if not jumps:
         return None
+    episodes_text = f"of {len(training)} training episodes"
+    lines = [f"{display_name(name)} wraps around in {number} {episodes_text}" for name, number in jumps.items()]
     return (
         f"{'; '.join(lines)}. The filter learns a number that jumps, so that its errors will be large: declare the "
         "component with wraps=True (docs/data.md)"

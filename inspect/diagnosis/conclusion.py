@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
 
 from beliefscope.datasets.task import display_name
-from beliefscope.datasets.text import percent
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import (
     ALARM_RATE,
@@ -32,19 +29,23 @@ from beliefscope.inspect.diagnosis.cause import (
     probability_text,
 )
 from beliefscope.inspect.diagnosis.causes.external_filters import EFFECTS, LATE
-from beliefscope.inspect.diagnosis.checks.readings import is_expected, modelled_sensors, without_explained
 from beliefscope.inspect.diagnosis.checks.sensors import covers_episode
 from beliefscope.inspect.diagnosis.error_conditions import error_condition
 from beliefscope.inspect.diagnosis.largest_error import largest_error
 from beliefscope.inspect.diagnosis.laws import defect_of, turned_text
 from beliefscope.inspect.diagnosis.next_action import CONVENTIONS, is_unused, next_action, search_action
 from beliefscope.inspect.diagnosis.scoring import Explanation, probabilities
+from beliefscope.inspect.diagnosis.unmeasured import (
+    missing_statistics,
+    sensor_statistic_names,
+    statistics_by_subject,
+    unmeasured,
+)
 from beliefscope.inspect.diagnosis.visibility import Effect, is_visible
 from beliefscope.inspect.diagnosis.wrong_noise import too_small
-from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.diagnostics.statistic_kinds import channel_of, label_of, sensor_of
-from beliefscope.inspect.statistics.innovations import prediction
+from beliefscope.inspect.diagnostics.statistic_kinds import channel_of
 
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
@@ -72,12 +73,6 @@ WRONG_NEES = 10.0
 
 BY_MODALITY = (LATE.name, "weights.ignores_likelihood", "weights.repeats_likelihood")
 """Causes that concern some modalities, which their names do not tell."""
-
-LENGTHS = 1.5
-"""Largest ratio of the number of steps of an episode to those of the record that is not mentioned."""
-
-EXTRAPOLATED = 0.05
-"""Largest share of a sensor's steps with states that the record does not have that is not mentioned."""
 
 
 def healthy(case: Case) -> Diagnosis:
@@ -114,112 +109,6 @@ def _nees(profile: HealthyProfile) -> float:
 
 def _is_miscalibrated(nees: float) -> bool:
     return not 1 / MAX_NEES <= nees <= MAX_NEES
-
-
-def statistics_by_subject(case: Case) -> dict[str, int]:
-    """Number of compared statistics about each sensor, the controls, the labels, the models and the filter."""
-    of_sensors = _of_sensors(case)
-
-    def subject(statistic: str) -> str:
-        kind, about, _ = statistic.split("/")
-        if statistic in of_sensors or about == "labels":
-            return sensor_of(about, case.inputs.checkpoint.task.observations)[0]
-        return "models" if kind.startswith(("module", "dynamics", "process noise")) else "filter"
-
-    numbers = Counter(subject(deviation.statistic) for deviation in case.deviations)
-    order = [*case.inputs.checkpoint.task.observations, "control", "labels", "models", "filter"]
-    return {name: numbers[name] for name in dict.fromkeys([*order, *numbers]) if numbers[name]}
-
-
-def unmeasured(case: Case, numbers: Mapping[str, int], new: int) -> list[str]:
-    """What the diagnosis cannot judge: sensors without statistics, and statistics that the episodes or the record lack.
-
-    Also whether the length of the episodes causes deviations, if it is not that of the record (``LENGTHS``), sensors at
-    states that the record does not have, and what an external filter that reports no predictions does not show.
-
-    Episodes of contact only lack those of free motion, for example, and records of earlier versions those of new kinds.
-
-    Args:
-        numbers: of ``statistics_by_subject``.
-        new: of ``missing_statistics``.
-    """
-    sensors = [display_name(key) for key in case.inputs.checkpoint.task.observations if key not in numbers]
-    of_sensors, compared = _of_sensors(case), case.by_statistic
-    absent = [
-        label_of(name, case.inputs.checkpoint.task)
-        for name, values in case.profile.statistics.items()
-        if name in of_sensors and name not in compared and np.isfinite(values).sum() >= MIN_HEALTHY
-    ]
-    outdated = [f"statistics that the healthy record of an earlier version lacks ({new}): measure it again"]
-    parts = _other_lengths(case), _extrapolated(case), sensors, _unexpected(case), _unreported(case)
-    return [*chain.from_iterable(parts)] + _likelihoods(case) + absent + (outdated if new else [])
-
-
-def _extrapolated(case: Case) -> list[str]:
-    """Sensors with a considerable share of steps (``EXTRAPOLATED``) whose states the record does not have."""
-    result = []
-    for model in (model for model in case.profile.readings if model.channels):
-        counts = [model.unknown_steps(trace.episode) for trace in case.traces if is_expected(model, trace.episode)]
-        unknown, total = (sum(values) for values in zip((0, 0), *counts, strict=True))
-        if unknown > EXTRAPOLATED * total:
-            share = percent(unknown / total)
-            result.append(
-                f"{display_name(model.key)} at {share} of its steps, with states that the record does not have"
-            )
-    return result
-
-
-def _unexpected(case: Case) -> list[str]:
-    """Sensors whose readings no model expects, so that channels may be exchanged or inverted without a deviation."""
-    task, models = case.inputs.checkpoint.task, {model.key for model in case.profile.readings if model.channels}
-    keys = [key for key in modelled_sensors(task) if key not in models and case.profile.readings]
-    return [f"exchanged and inverted channels of {display_name(key)}" for key in keys]
-
-
-def _unreported(case: Case) -> list[str]:
-    """What predictions would show of an external filter."""
-    if not isinstance(case.inputs.checkpoint, ExternalFilter) or prediction(case.traces[0]) is not None:
-        return []
-    return ["dynamics and process noise, since the filter reports no predicted_mean and predicted_covariance"]
-
-
-def _likelihoods(case: Case) -> list[str]:
-    """Likelihoods of an external particle filter that cannot be judged, since no model expects the readings."""
-    trace, checkpoint = case.traces[0], case.inputs.checkpoint
-    if trace.log_likelihood is None or not isinstance(checkpoint, ExternalFilter):
-        return []
-    known, result = case.by_statistic, []
-    for name in (name for name in trace.modalities if f"measurement noise/{name}/all" not in known):
-        noise = "" if f"likelihood width/{name}/all" in known else "measurement noise and "
-        result.append(f"{noise}measurement function of {display_name(name)}")
-    return result
-
-
-def _other_lengths(case: Case) -> list[str]:
-    """Episodes that are longer or shorter than those of the record."""
-    if case.profile.steps is None:
-        return []
-    low, high = case.profile.steps
-    lengths = [len(trace) for trace in case.traces if not low / LENGTHS <= len(trace) <= high * LENGTHS]
-    if not lengths:
-        return []
-    own, healthy = (
-        f"{a} steps" if a == b else f"{a} to {b} steps" for a, b in ((min(lengths), max(lengths)), (low, high))
-    )
-    return [f"statistics that depend on the length: episodes have {own}, those of the healthy record {healthy}"]
-
-
-def missing_statistics(case: Case) -> int:
-    """Number of statistics of kinds that the healthy record does not have, since an earlier version measured it."""
-    kinds = {name.partition("/")[0] for name in case.profile.statistics}
-    finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}
-    models = () if case.profile.readings else (n for n in case.profile.statistics if n.startswith("reading "))
-    return sum(name.partition("/")[0] not in kinds for name in finite) + len([*models])
-
-
-def _of_sensors(case: Case) -> set[str]:
-    """Compared statistics that are about sensors and controls only."""
-    return {name for row in case.sensors for name in without_explained(row)}
 
 
 def conclude(
@@ -282,7 +171,7 @@ def sensor_about(case: Case, statistic: str) -> str:
 
     The subject of a statistic may start with the modality: ``haptics force x``.
     """
-    if statistic not in _of_sensors(case):
+    if statistic not in sensor_statistic_names(case):
         return ""
     subject = f" {statistic.split('/')[1]} "
     keys = [key for key in (*case.inputs.checkpoint.task.observations, "control") if f" {key} " in subject]
@@ -301,14 +190,14 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     """
     if not candidates or not candidates[0].evidence or candidates[0].probability < SHOWN:
         sure = bool(candidates) and candidates[0].probability >= SURE
-        of_sensors = [alarm for alarm in case.alarms if alarm.statistic in _of_sensors(case)]
+        of_sensors = [alarm for alarm in case.alarms if alarm.statistic in sensor_statistic_names(case)]
         symptom = (of_sensors or case.alarms)[0].text  # a faulty sensor changes the belief as well
         action = search_action(
             case.inputs.checkpoint, count, any(s.startswith(("nis/", "particles/")) for s in case.by_statistic)
         )
         return f"{'Fault of unknown cause' if sure else 'No cause stands out'}: {symptom}; try: {action}"
-    first = candidates[0]
-    similar = [c for c in candidates[1:3] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
+    first, *others = (candidate for candidate in candidates if candidate.evidence)
+    similar = [c for c in others[:2] if c.probability >= max(SHOWN, COMPARABLE * first.probability)]
     if similar and (first.probability < SURE or _are_equal(first, similar[0])):
         *titles, last = (first.cause.title, *(_lower(c.cause.title) for c in similar))
         if _are_alike([first, *similar]):
@@ -319,7 +208,7 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"
     where = channels_text(case, first.cause) + _when(case, first) + where
     text = f"{title}{where}, probability {probability_text(first.probability)}"
-    if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
+    if others and (second := others[0]).probability >= SURE:
         text += f"; and {_lower(second.cause.title)}, probability {probability_text(second.probability)}"
     if masked:
         text += "; the filter is unaffected" if is_known else "; the errors of the filter are in the healthy range"

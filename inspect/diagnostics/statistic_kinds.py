@@ -142,11 +142,16 @@ LEVER = 0.1
 ADJUSTED = "adjusted"
 """Phase of statistics of modules that are adjusted for the readings of the episode."""
 
+EXPECTED, EXPECTED_EXTREME = "expected", "expected extreme"
+"""Phases of the noise around the expected readings, of the episode and of its noisiest window."""
+
 PHASES = {
     "all": ("", ""),
     ADJUSTED: ("", ", given the readings"),
     "extreme": ("most extreme ", " over 20 steps"),
     "range": ("range of the ", " over windows of 20 steps"),
+    EXPECTED: ("", " around the expected readings"),
+    EXPECTED_EXTREME: ("most extreme ", " around the expected readings over 20 steps"),
 }
 """Phase of a statistic -> how its label begins and ends; others are phases of the task."""
 

@@ -292,7 +292,9 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"innovation.{modality}.turns",
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
-            f"{model_of(modality)}|{FILTER}",
+            # A turn moves the state, at which the updates with other sensors and the next step then are.
+            f"{JACOBIANS}|{DYNAMICS}|innovation spread/*|innovation offset/*|measurement function/*"
+            "|measurement noise/*",
             "Wrap differences of angles to -180 to 180 degrees.",
         ),
         Cause(

@@ -118,8 +118,9 @@ def _changed_readings(key: str, modality: str) -> list[Cause]:
     scaled = of(*BIASED, "reading drift", *delays, "change", "size", *noises, "reading scatter")
     outliers = Symptom(of("reading outliers"))
     noise = (Symptom(of("noise"), otherwise=(outliers,)), Symptom(of("roughness", "reading noise"), optional=True))
-    bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0),)),)
-    drift = (Symptom(of("reading drift"), 0),)
+    line = Symptom(of("drift"), 0)  # of channels without expected readings: a bias in the course of the episode as well
+    bias = (Symptom(of("level"), 0, otherwise=(Symptom(of("reading bias"), 0), line)),)
+    drift = (Symptom(of("reading drift"), 0, otherwise=(line,)),)
     slope = (Symptom(of("reading gain"), 0), Symptom(of("reading ratio"), 0))
     gain = (Symptom(of("size"), 0, otherwise=slope), Symptom(of("noise"), 0, otherwise=slope))
     rough = f"{scaled}|{of('roughness')}"

@@ -9,7 +9,9 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task, axis_name
+from beliefscope.inspect.diagnosis.checks.reading_noise import delayed, noise_around_expected
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, commands_hand
+from beliefscope.inspect.diagnostics.statistic_kinds import EXPECTED
 from beliefscope.inspect.statistics.reading_features import CONTROL, FIRST_CHANGES
 from beliefscope.inspect.statistics.reading_model import (
     ComparedReadings,
@@ -55,7 +57,8 @@ CLEARLY = 0.5
 """Largest ratio of the squares that a bias in an interval leaves to those of a drift or a gain."""
 
 EXPLAINED = ("level", "drift", "size", "roughness")
-"""Kinds of statistics that another healthy motion changes: the level of readings, and their standard deviation."""
+"""Kinds of statistics that another healthy motion changes: the level of readings, and their standard deviation. It also
+changes the noise of all readings, but not that around the expected ones."""
 
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
@@ -112,6 +115,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         others = np.delete(all_readings, model.channels, axis=1)
         replaced = _evidence(own, compared.errors(whole, others).min((0, 1), initial=np.inf), FITS, biased)
         count = all_readings.shape[1]
+        values |= noise_around_expected(compared, whole, count) if model.key != CONTROL else {}
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
             values[f"reading bias/{axis}/all"] = float(line["bias"][i] / model.noise[i])
@@ -145,13 +149,30 @@ def without_outliers(episode: Episode, models: Sequence[ReadingModel]) -> Episod
     return replace(episode, observations={**episode.observations, **changed}) if changed else episode
 
 
+def with_errors(episode: Episode, models: Sequence[ReadingModel]) -> Episode:
+    """The episode with errors in place of the readings that models expect, interpolated at other steps."""
+    changed = {}
+    for model in (m for m in models if m.channels and is_expected(m, episode) and m.key != CONTROL):
+        compared = model.compare(episode)
+        delay, _ = delayed_errors(compared, episode.dt)
+        errors, known = delayed(compared, 0 if np.isnan(delay) else int(delay))
+        if known.any():
+            readings, steps = episode.observations[model.key].astype(np.float64), np.flatnonzero(known)
+            filled = [np.interp(np.arange(len(episode)), steps, error[steps]) for error in errors.T]
+            readings[:, model.channels] = np.stack(filled, axis=1)
+            changed[model.key] = readings
+    return replace(episode, observations={**episode.observations, **changed}) if changed else episode
+
+
 def without_explained(row: Mapping[str, float]) -> dict[str, float]:
     """Statistics without those of channels that the labels explain (``EXPLAINED``): their errors count instead."""
     return {name: value for name, value in row.items() if not _is_explained(name, row)}
 
 
 def _is_explained(statistic: str, row: Mapping[str, float]) -> bool:
-    kind, subject, _ = statistic.split("/")
+    kind, subject, phase = statistic.split("/")
+    if kind == "noise":
+        return not phase.startswith(EXPECTED) and f"noise/{subject}/{EXPECTED}" in row
     return kind in EXPLAINED and f"reading bias/{subject}/all" in row
 
 

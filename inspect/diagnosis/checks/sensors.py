@@ -22,7 +22,12 @@ from beliefscope.inspect.diagnosis.checks.images import (
     motion_statistics,
 )
 from beliefscope.inspect.diagnosis.checks.label_shift import label_shift_statistics
-from beliefscope.inspect.diagnosis.checks.readings import biased_interval, reading_statistics, without_outliers
+from beliefscope.inspect.diagnosis.checks.readings import (
+    biased_interval,
+    reading_statistics,
+    with_errors,
+    without_outliers,
+)
 from beliefscope.inspect.diagnosis.checks.vectors import (
     angle_channels,
     axis_index,
@@ -40,7 +45,7 @@ from beliefscope.inspect.diagnosis.checks.windows import (
     window_statistics,
     window_values,
 )
-from beliefscope.inspect.diagnostics.statistic_kinds import sensor_of
+from beliefscope.inspect.diagnostics.statistic_kinds import EXPECTED, EXPECTED_EXTREME, sensor_of
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys, with_gray_images
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
@@ -112,6 +117,8 @@ def localise(
         return (int(steps[0]), int(steps[-1])) if len(steps) else None
     if kind == "level":
         return biased_steps(episode, key, axis_index(axis))
+    if phase in (EXPECTED, EXPECTED_EXTREME):
+        episode = with_errors(episode, models)
     sizes = _sizes(kind, key, axis, episode, reference)
     if sizes is not None:
         return _interval(sizes, kind)
