@@ -67,6 +67,11 @@ KINDS = {
     "likelihood offset": ("offset of the particles by the likelihood, in their standard deviations,", False, 0.05),
     "likelihood width": ("width of the likelihood{of} at true states", True, 0.05),
     "innovation spread": ("standard deviation of the innovations at true states", True, 0.02),
+    "innovation drift": (
+        "change of the innovations at true states over the episode, in their standard deviations,",
+        False,
+        0.1,
+    ),
     "innovation offset": ("mean of the innovations at true states, in their standard deviations,", False, 0.05),
     "ancestors": ("share of particles with offspring", False, 0.01),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),

@@ -11,7 +11,7 @@ FILTER = (
 WEIGHTS = f"beta logit/*|beta spread/*|beta contact/*|{FILTER}"
 """Fusion weights."""
 
-MODEL_KINDS = ("likelihood offset", "likelihood width", "innovation offset", "innovation spread")
+MODEL_KINDS = ("likelihood offset", "likelihood width", "innovation offset", "innovation drift", "innovation spread")
 """Kinds of statistics of the measurement models of external filters, at true states."""
 
 MODELS = "|".join(f"{kind}/*" for kind in MODEL_KINDS)

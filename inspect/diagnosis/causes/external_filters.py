@@ -160,7 +160,8 @@ def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str],
     if has_true_starts:
         cause = _with_true_starts(cause)
     if cause.component in inputs:
-        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|innovation offset/*|innovation spread/*")
+        at_truth = "|".join(f"innovation {kind}/*" for kind in ("offset", "drift", "spread"))
+        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|{at_truth}")
     if (modality := images.get(cause.component)) is not None:
         noise = f"measurement noise//*|measurement noise/{modality}/*"
         cause = replace(cause, consequences=f"{cause.consequences}|{noise}")
@@ -293,8 +294,8 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             f"Innovations of {name} not wrapped",
             (Symptom(f"innovation turns/{modality}/*"),),
             # A turn moves the state, at which the updates with other sensors and the next step then are.
-            f"{JACOBIANS}|{DYNAMICS}|innovation spread/*|innovation offset/*|measurement function/*"
-            "|measurement noise/*",
+            f"{JACOBIANS}|{DYNAMICS}|innovation spread/*|innovation offset/*|innovation drift/*"
+            "|measurement function/*|measurement noise/*",
             "Wrap differences of angles to -180 to 180 degrees.",
         ),
         Cause(

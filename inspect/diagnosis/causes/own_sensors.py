@@ -212,7 +212,7 @@ def _moved_cameras(task: Task) -> tuple[Cause, ...]:
             changed = f"object match/*|occlusion/{key}/*|brightness/{key}/*|sharpness/{key}/*|{_downstream(modality)}"
             title = "Camera moved" if key in ("image", "camera") else f"Camera {display_name(key)} moved"
             symptoms = (
-                Symptom(OBJECT, 0),
+                Symptom(OBJECT, 0, otherwise=(Symptom(f"innovation drift/{modality} *", 0),)),
                 Symptom(f"module bias/*{modality}*", 0, 0.5, unmeasured=(offset_of(modality),), optional=True),
                 Symptom("module bias/*", 0, 0.3, "alone", optional=True),
             )

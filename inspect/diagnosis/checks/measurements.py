@@ -173,8 +173,9 @@ def _innovations_at_truth(trace: Trace) -> dict[str, float]:
     """``KIND/SUBJECT/all`` -> value, of the innovations of steps from true states.
 
     ``innovation spread``, by channel: their standard deviation. ``innovation offset``, by channel: their mean relative
-    to it. ``innovation turns``, by modality: share of steps with about a full turn in a channel, also of networks, but
-    not in units other than rad.
+    to it. ``innovation drift``, by channel: the change of a line through them over the episode, relative to their
+    distance from it, as of a sensor that moves. ``innovation turns``, by modality: share of steps with about a full
+    turn in a channel, also of networks, but not in units other than rad.
     """
     if trace.innovation is None:
         return {}
@@ -184,11 +185,14 @@ def _innovations_at_truth(trace: Trace) -> dict[str, float]:
         at = np.isfinite(trace.innovation[:, k]).any(-1) & ~absent(trace, modality)
         if at.sum() < MIN_STEPS:
             continue
-        nu = trace.innovation[at, k].astype(np.float64)
+        nu, times = trace.innovation[at, k].astype(np.float64), np.flatnonzero(at) / len(at)
         for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
             spread = max(float(nu[:, i].std()), 1e-12)
             values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
             values[f"innovation spread/{modality} {names[k][i]}/all"] = spread
+            slope, level = np.polyfit(times, nu[:, i], 1)
+            rest = max(float((nu[:, i] - slope * times - level).std()), 1e-12)
+            values[f"innovation drift/{modality} {names[k][i]}/all"] = float(slope) / rest
         channels = [channel_of(f"{modality} {name}", trace.task) for name in names[k]]
         metric = [channel is not None and channel[1].unit not in ("", "1", "rad") for channel in channels]
         turns = (_turned(column) for column, skipped in zip(nu.T, metric, strict=False) if not skipped)

@@ -267,6 +267,11 @@ def test_innovations_at_true_states_show_offsets_and_differences_that_are_not_wr
     expected = np.nanmean(own) / np.nanstd(own)
     assert values["innovation offset/radar radar x/all"] == pytest.approx(expected, rel=1e-5)
     assert values["innovation spread/radar radar x/all"] == pytest.approx(np.nanstd(own), rel=1e-5)
+    assert abs(values["innovation drift/radar radar x/all"]) < 1.0
+    ramp = np.linspace(0.0, 0.4, len(nu))[:, None, None]
+    moved = measurement_model_statistics(trace, [], replace(trace, innovation=(nu + ramp).astype(np.float32)))
+    change = moved["innovation drift/radar radar x/all"] - values["innovation drift/radar radar x/all"]
+    assert change == pytest.approx(0.4 / np.nanstd(own), rel=0.1)  # the line through the few readings also varies
     assert values["innovation turns/radar/all"] == 0.0
     assert values["innovation turns/compass/all"] == pytest.approx(0.1, abs=0.01)
     other = measurement_model_statistics(trace, [], replace(trace))  # the innovations of the run, not at true states
