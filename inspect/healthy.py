@@ -64,12 +64,12 @@ def sensor_record(
     report, parts = progress or (lambda share: None), FOLDS + 2
     images, models = reference or measure_reference(episodes), fit_reading_models(episodes, keys)
     report(1 / parts)
-    by_channels = {(model.key, model.channels): model for model in models}
+    by_key = {model.key: model for model in models}
     folds = []
     for fold in range(FOLDS):
         group = [episode for i, episode in enumerate(episodes) if i % FOLDS != fold]
         of_group = fit_reading_models(group, [model.key for model in models], models)
-        own = [m.with_noise_of(by_channels.get((m.key, m.channels), m)) for m in of_group]
+        own = [model.with_noise_of(by_key[model.key]) for model in of_group]
         folds.append((reference or measure_reference(group), own))
         report((fold + 2) / parts)
     rows = []

@@ -75,9 +75,10 @@ def fit_reading_models(
     Each half of the episodes decides which channels the model of the other half explains, and by which features.
 
     Args:
-        whole: models of all episodes if these are some of them: isolated readings are left out as there.
+        whole: models of all episodes if these are some of them: the same channels have models, and isolated readings
+            are left out as there.
     """
-    limits = {model.key: 1.0 if model.outliers else 0.0 for model in whole}
+    of_all = {model.key: model for model in whole}
     episodes = [episode for episode in episodes if np.isfinite(episode.states).all()]
     if len(episodes) < MIN_EPISODES or not keys:
         return ()
@@ -94,14 +95,24 @@ def fit_reading_models(
         ]
         options = _options(episodes, key)
         fits = _fit(rows, groups, options) if len(rows) >= MIN_EPISODES else []
-        rows, fits, outliers = _without_outliers(rows, fits, groups, options, limits.get(key, FEW))
-        strong, weak = (
-            tuple(fitted.model(rows) for fitted in fits if low < fitted.explained(rows) <= high)
-            for low, high in ((EXPLAINED, 1.0), (WEAKLY_EXPLAINED, EXPLAINED))
-        )
+        same = of_all.get(key)
+        limit = FEW if same is None else float(same.outliers > 0.0)
+        rows, fits, outliers = _without_outliers(rows, fits, groups, options, limit)
+        strong, weak = (tuple(fit.model(rows) for fit in chosen) for chosen in _chosen(fits, rows, same))
         if strong or weak:
             result.append(ReadingModel(key, strong, weak, outliers))
     return tuple(result)
+
+
+def _chosen(
+    fits: Sequence[_Fitted], rows: Sequence[Rows], same: ReadingModel | None
+) -> tuple[Sequence[_Fitted], Sequence[_Fitted]]:
+    """Fits to the channels that the labels explain, and to those that they explain in part, or those of a model."""
+    if same is not None:
+        strong, weak = set(same.channels), {model.index for model in same.of_weak_channels}
+        return [f for f in fits if f.option.channel in strong], [f for f in fits if f.option.channel in weak]
+    explained = [(fit, fit.explained(rows)) for fit in fits]
+    return [f for f, e in explained if e > EXPLAINED], [f for f, e in explained if WEAKLY_EXPLAINED < e <= EXPLAINED]
 
 
 class Rows:
