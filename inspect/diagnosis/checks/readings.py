@@ -50,6 +50,9 @@ EDGES = 151
 AS_GOOD = 0.9
 """Ratio of the squares that a drift leaves to those of a gain from which the latter is as good."""
 
+ALIKE = (0.1, 1.5)
+"""Likelihood ratios of a ramp to an interval between which either may be the case."""
+
 ONSETS = 20
 """Number of times, evenly spaced, at which a drift may begin."""
 
@@ -260,7 +263,8 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
     A gain and a bias in an interval also change errors over time. The slope is shrunk by the likelihood ratio of the
     better of these to a ramp from some step on, for ``BLOCKS`` pairs of independent errors. The part is that of the
     ramp, if it leaves less than a gain, which has fewer parameters (``AS_GOOD``), or of the interval, which has more
-    than both, if it leaves clearly less (``CLEARLY``).
+    than both, if it leaves clearly less (``CLEARLY``). The slope is NaN if a ramp and an interval both explain most of
+    the errors, and about as well (``ALIKE``): a few late readings do not show which of them it is.
     """
     time = times[:, None]
     power = np.square(errors).sum(0)
@@ -272,7 +276,10 @@ def _drift(expected: Array, errors: Array, times: Array) -> tuple[Array, Array]:
     by_ramp, by_interval, by_gain = left[0], left[1], AS_GOOD * left[2]
     is_interval = by_interval < CLEARLY * np.minimum(by_ramp, by_gain)
     part = np.where(is_interval, interval, np.where(by_ramp < by_gain, ramp, 0.0))
-    return slope * np.minimum(np.minimum(by_interval, by_gain) / by_ramp, 1.0) ** BLOCKS, part
+    ratio = (by_interval / by_ramp) ** BLOCKS
+    is_either = (np.maximum(by_ramp, by_interval) < CLEARLY * power) & (ratio > ALIKE[0]) & (ratio < ALIKE[1])
+    shrunk = slope * np.minimum(np.minimum(by_interval, by_gain) / by_ramp, 1.0) ** BLOCKS
+    return np.where(is_either, np.nan, shrunk), part
 
 
 def _ramp(errors: Array, times: Array) -> Array:
