@@ -11,7 +11,7 @@ FORMS = "a recorded run (.trace, .live or .rrd)"
 
 
 class TaskOrRecordedRuns(opt.Runs):
-    """Options of which ``task`` may be the path of recorded runs; ``filter`` is then not needed."""
+    """Options whose ``task`` may be the path of recorded runs, which need no ``filter``."""
 
     def __post_init__(self) -> None:
         """As ``Runs``; raises BadInput without a filter that runs over the episodes."""

@@ -107,7 +107,7 @@ def fit_reading_models(
 def _chosen(
     fits: Sequence[_Fitted], rows: Sequence[Rows], same: ReadingModel | None
 ) -> tuple[Sequence[_Fitted], Sequence[_Fitted]]:
-    """Fits to the channels that the labels explain, and to those that they explain in part, or those of a model."""
+    """Fits to the channels that the labels explain, and to those explained in part, or to the channels of a model."""
     if same is not None:
         strong, weak = set(same.channels), {model.index for model in same.of_weak_channels}
         return [f for f in fits if f.option.channel in strong], [f for f in fits if f.option.channel in weak]
