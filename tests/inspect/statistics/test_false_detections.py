@@ -104,3 +104,14 @@ def test_some_episodes_leave_readings_out_as_all_do(shares: tuple[float, float],
     assert (whole[0].outliers > 0.0) == (expected > 0.0) != (alone[0].outliers > 0.0)
     (model,) = fit_reading_models(part, ["gps"], whole)
     assert model.outliers == pytest.approx(expected, abs=0.03)
+
+
+def test_some_episodes_have_models_of_the_channels_of_all() -> None:
+    """Also where their own labels explain a channel: otherwise, statistics would be of some episodes only."""
+    (gps, _), episodes = models(), EPISODES[:6]
+    part = replace(gps, of_channels=gps.of_channels[:1], of_weak_channels=gps.of_channels[1:])
+    (same,) = fit_reading_models(episodes, ["gps"], [part])
+    assert (same.channels, [weak.index for weak in same.of_weak_channels]) == ((0,), [1])
+    (alone,) = fit_reading_models(episodes, ["gps"])
+    assert alone.channels == (0, 1)
+    assert same.expected(NEW)[:, 0] == pytest.approx(alone.expected(NEW)[:, 0])

@@ -85,17 +85,6 @@ def test_only_sensors_that_the_labels_explain_have_a_model() -> None:
     assert len(fit_reading_models([*EPISODES, *unlabelled], ["gps"])) == 1
 
 
-def test_some_episodes_have_models_of_the_channels_of_all() -> None:
-    """Also where their own labels explain a channel: otherwise, statistics would be of some episodes only."""
-    (gps, _), episodes = models(), EPISODES[:6]
-    part = replace(gps, of_channels=gps.of_channels[:1], of_weak_channels=gps.of_channels[1:])
-    (same,) = fit_reading_models(episodes, ["gps"], [part])
-    assert (same.channels, [weak.index for weak in same.of_weak_channels]) == ((0,), [1])
-    (alone,) = fit_reading_models(episodes, ["gps"])
-    assert alone.channels == (0, 1)
-    assert same.expected(NEW)[:, 0] == pytest.approx(alone.expected(NEW)[:, 0])
-
-
 @pytest.mark.parametrize("model", [0, 1], ids=["gps", "odometry"], indirect=True)
 def test_expected_readings_of_new_episodes_are_the_noise_free_ones(model: ReadingModel) -> None:
     compared = model.compare(NEW)
