@@ -15,7 +15,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import Case
 from beliefscope.inspect.diagnosis.checks.readings import is_expected, modelled_sensors, without_explained
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
-from beliefscope.inspect.diagnostics.statistic_kinds import label_of, sensor_of
+from beliefscope.inspect.diagnostics.statistic_kinds import EXPECTED, label_of, sensor_of
 from beliefscope.inspect.statistics.innovations import prediction
 
 LENGTHS = 1.5
@@ -135,7 +135,13 @@ def _other_lengths(case: Case) -> list[str]:
 
 def missing_statistics(case: Case) -> int:
     """Number of statistics of kinds that the healthy record does not have, since an earlier version measured it."""
-    kinds = {name.partition("/")[0] for name in case.profile.statistics}
+
+    def kind(statistic: str) -> tuple[str, bool]:
+        """Also whether it is around expected readings."""
+        name, _, phase = statistic.split("/")
+        return name, phase.startswith(EXPECTED)
+
+    kinds = {kind(name) for name in case.profile.statistics}
     finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}
     models = () if case.profile.readings else (n for n in case.profile.statistics if n.startswith("reading "))
-    return sum(name.partition("/")[0] not in kinds for name in finite) + len([*models])
+    return sum(kind(name) not in kinds for name in finite) + len([*models])

@@ -178,13 +178,12 @@ def test_sensors_without_statistics_are_named() -> None:
     assert result.unmeasured[-1] == statistic
     assert result.tables()[-1].rows[-1] == (statistic,)
     assert not result.to_json()["outdated"]
-    newer = [{**row, "opposed/control x/all": 1.0} for row in rows]
-    document = healthy(compared(inputs, runs(), newer, sensed, record, 0.05)).to_json()
-    assert document["outdated"]
-    assert (
-        document["unmeasured"][-1]
-        == "statistics that the healthy record of an earlier version lacks (1): measure it again"
-    )
+    for name in ("opposed/control x/all", "noise/torque x/expected"):
+        newer = [{**row, name: 1.0} for row in rows]
+        document = healthy(compared(inputs, runs(), newer, sensed, record, 0.05)).to_json()
+        assert document["outdated"]
+        text = "statistics that the healthy record of an earlier version lacks (1): measure it again"
+        assert document["unmeasured"][-1] == text
 
 
 def test_episodes_of_another_length_than_those_of_the_record_are_mentioned() -> None:
