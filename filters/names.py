@@ -45,6 +45,8 @@ def filter_names(task: Task) -> dict[str, tuple[str, tuple[str, ...]]]:
         "all": [("+".join(each),)],
         "one": [(modality,) for modality in each],
     }
+    if not each:  # a log without sensors
+        return {}
     return {key.format(modality=names[0]): (key, names) for key, kind in MODELS.items() for names in models[kind]}
 
 

@@ -196,6 +196,7 @@ def _moments(errors: Array, groups: Mask, where: list[int]) -> Array:
     return np.concatenate([products[where].sum(0, keepdims=True), products])
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # a few steps can be combined without an error
 def _phase(name: str, moments: Array, steps: NDArray[np.int64], members: list[int]) -> PhaseEfficiency:
     """Efficiency in a phase. Args: moments (R, 1 + n, G, 1 + K, 1 + K), steps (R, G), members: groups of the phase."""
     has = steps[:, members].any(-1)

@@ -186,6 +186,8 @@ def _visible(window: str, steps: int) -> tuple[float, float]:
     match = re.fullmatch(WINDOW, window or f"0-{last}")
     assert match is not None
     first, end = float(match[1]), min(float(match[2]), last)
-    if first >= end:
+    if first == end:
+        raise BadInput(f"window {window!r} has one step: a line needs two")
+    if first > end:
         raise BadInput(f"window {window!r} has no steps: the run has steps 0 to {steps - 1}")
     return first, end

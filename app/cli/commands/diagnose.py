@@ -50,7 +50,10 @@ class Options(TaskOrRecordedRuns):
         "NAME|CHECKPOINT|FILE.py:FUNCTION", "Filter that runs over --profile-from. Default: --filter.", None
     )
     repair: int | None = opt.option(
-        "I", "Also find the smallest repair of the largest failure of this episode.", None, parser=opt.integer(0)
+        "I",
+        "Also find the smallest repair of the largest failure of this episode; not of external filters.",
+        None,
+        parser=opt.integer(0),
     )
     workspace: Path | None = opt.option(
         "DIR",
@@ -105,10 +108,12 @@ def _of_filter(options: Options) -> console.Result:
     """The diagnosis of a filter that runs over episodes."""
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
-    from beliefscope.inspect.diagnosis.undo.repair import healthy_bound, smallest_repair
+    from beliefscope.inspect.diagnosis.undo.repair import check_repairable, healthy_bound, smallest_repair
     from beliefscope.inspect.trace import trace
 
     checkpoint, faults = options.open()
+    if options.repair is not None:
+        check_repairable(checkpoint)
     correct = checkpoint if options.profile_filter is None else open_filter(checkpoint.task, options.profile_filter)
     base = None if options.base is None else open_filter(checkpoint.task, str(options.base))
     with options.episodes(checkpoint.task) as data:

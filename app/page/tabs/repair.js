@@ -51,7 +51,8 @@ export class Repair {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     const isLive = trace.selection.data.startsWith('live:'); // of no data set, which a search needs
-    this.#host.hidden = isLive || Boolean(trace.header.no_diagnosis);
+    const { kind, no_diagnosis } = trace.header;
+    this.#host.hidden = isLive || kind === 'external' || Boolean(no_diagnosis); // no steps without a sensor
     if (this.#host.hidden) return;
     this.#results.load(this.#key, api.repairUrl(trace.selection), signal);
   }

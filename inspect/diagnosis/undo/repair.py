@@ -22,6 +22,7 @@ from beliefscope.datasets.text import plural
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.statistics.measures import Array, main_error, wrapped
@@ -175,6 +176,12 @@ class Candidates:
         return evidence if present.all() else evidence.select_models(present)
 
 
+def check_repairable(checkpoint: Checkpoint) -> None:
+    """Raise BadInput for an external filter, whose steps cannot be replayed without a sensor."""
+    if isinstance(checkpoint, ExternalFilter):
+        raise BadInput(f"external filter {checkpoint.name!r} has no smallest repair: its sensors cannot be dropped")
+
+
 def smallest_repair(
     checkpoint: Checkpoint, trace: Trace, bound: float, clean: Episode | None = None, max_replays: int = MAX_REPLAYS
 ) -> Repair | None:
@@ -188,8 +195,10 @@ def smallest_repair(
     Args:
         clean: the episode without sensor faults; modalities can be restored from it.
 
-    Raises BadInput for a trace of another checkpoint, and for a filter without single sensors to repair.
+    Raises BadInput for a trace of another checkpoint, for an external filter, and for one without single sensors to
+    repair.
     """
+    check_repairable(checkpoint)
     failure = largest_failure(trace, bound)
     if failure is None:
         return None

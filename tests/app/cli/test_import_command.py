@@ -189,3 +189,18 @@ def test_a_folder_of_logs_of_messages_becomes_a_folder_of_traces(run: Run, tmp_p
     lines = [line.partition(" (")[0] for line in out.splitlines()]
     assert lines == [str(output / "run_2.trace"), str(output / "run_10.trace"), "2 of 2 files imported"]
     assert "[sensors]" in run("import --guess", tmp_path / "logs")[1]
+
+
+def test_a_log_of_estimates_only_has_figures_and_diagnostics(run: Run, tmp_path: Path) -> None:
+    """Without sensors, there are no filters of this project for its task."""
+    x = np.sin(0.1 * np.arange(STEPS))
+    rows = np.column_stack([x, x + 0.01, np.full(STEPS, 0.02)])
+    np.savetxt(tmp_path / "bare.csv", rows, delimiter=",", header="x,x_hat,x_std", comments="")
+    _, mapping, _ = run("import", tmp_path / "bare.csv", "--guess")
+    (tmp_path / "map.toml").write_text(mapping)
+    trace = tmp_path / "bare.trace"
+    assert run("import", tmp_path / "bare.csv", "--map", tmp_path / "map.toml", "-o", trace)[0] == 0
+    assert load_trace(trace).task.modalities == {}
+    for line in (("inspect", trace), ("figure", "timeline", trace, "-o", tmp_path / "timeline.csv")):
+        code, _, error = run(*line)
+        assert code == 0, error

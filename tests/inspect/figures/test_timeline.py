@@ -126,6 +126,7 @@ def test_charts_without_values_are_named(ekf: Trace, pf: Trace) -> None:
         ({"group": "rain"}, "group 'rain' of steps does not exist. Available: contact"),
         ({"window": "20"}, "window '20' is not FIRST-LAST, such as 20-60"),
         ({"window": "-5-20"}, "window '-5-20' is not FIRST-LAST"),
+        ({"window": "50-50"}, "window '50-50' has one step: a line needs two"),
         ({"window": "60-20"}, "window '60-20' has no steps: the run has steps 0 to 99"),
         ({"window": "200-300"}, "window '200-300' has no steps: the run has steps 0 to 99"),
     ],
