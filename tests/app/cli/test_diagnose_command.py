@@ -55,9 +55,3 @@ def test_a_small_record_has_no_low_alarm_rate(run: Run, tmp_path: Path) -> None:
     code, _, error = run(line)
     assert code == 2
     assert "needs 49; diagnose several episodes, or use a rate of 0.077 or more" in error
-
-
-def test_external_filters_have_no_repair(run: Run) -> None:
-    code, output, error = run(f"diagnose door --filter {OWN} --repair 9 --profile-from missing.h5")
-    assert (code, output) == (2, "")
-    assert "has no smallest repair: its sensors cannot be dropped" in error
