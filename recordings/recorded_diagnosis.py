@@ -8,12 +8,11 @@ from pathlib import Path
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
 from beliefscope.inspect.healthy import overlap_warning, recorded_profile
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.provenance import checkpoint_of
+from beliefscope.inspect.traces.provenance import checkpoint_of, unavailable_filter
 from beliefscope.recordings.open_trace import of_one_task, recorded_runs, with_distinct_indices
 
 Runs = str | Path | Sequence[Trace]
@@ -52,7 +51,7 @@ def comparable(
     first, version = traces[0], traces[0].checkpoint_hash
     checkpoint = checkpoint_of(traces, [Path(place) for place in places[: len(traces)]], filter_)
     if checkpoint is None or (clean and clean[0].checkpoint_hash != version):
-        checkpoint = UnavailableFilter(first.filter, version, first.task)
+        checkpoint = unavailable_filter(first)
     return traces, clean, checkpoint
 
 

@@ -15,7 +15,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.case import Case
 from beliefscope.inspect.diagnosis.checks.readings import is_expected, modelled_sensors, without_explained
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
-from beliefscope.inspect.diagnostics.statistic_kinds import EXPECTED, label_of, sensor_of
+from beliefscope.inspect.diagnostics.statistic_kinds import AROUND_EXPECTED, label_of, sensor_of
 from beliefscope.inspect.statistics.innovations import prediction
 
 LENGTHS = 1.5
@@ -139,7 +139,7 @@ def missing_statistics(case: Case) -> int:
     def kind(statistic: str) -> tuple[str, bool]:
         """Also whether it is around expected readings."""
         name, _, phase = statistic.split("/")
-        return name, phase.startswith(EXPECTED)
+        return name, phase in AROUND_EXPECTED
 
     kinds = {kind(name) for name in case.profile.statistics}
     finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}

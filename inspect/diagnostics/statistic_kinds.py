@@ -148,6 +148,7 @@ ADJUSTED = "adjusted"
 """Phase of statistics of modules that are adjusted for the readings of the episode."""
 
 EXPECTED, EXPECTED_EXTREME = "expected", "expected extreme"
+AROUND_EXPECTED = (EXPECTED, EXPECTED_EXTREME)
 """Phases of the noise around the expected readings, of the episode and of its noisiest window."""
 
 PHASES = {

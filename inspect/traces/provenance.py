@@ -9,6 +9,7 @@ from typing import Any
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
+from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.filters.names import is_code
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.traces.data import Trace
@@ -53,6 +54,11 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
     except BadInput:
         return None
     return checkpoint if checkpoint.hash == first.checkpoint_hash else None
+
+
+def unavailable_filter(trace: Trace) -> UnavailableFilter:
+    """Stands for the filter of a trace without a checkpoint."""
+    return UnavailableFilter(trace.filter, trace.checkpoint_hash, trace.task)
 
 
 def reproducible(traces: Sequence[Trace], data: Path | None) -> set[int]:

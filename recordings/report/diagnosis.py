@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.provenance import unavailable_filter
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def report_diagnosis(
     if any(trace.settings.get("edits") or trace.settings.get("standalone") for trace in traces):
         return ReportedDiagnosis(None, "interventions changed the run")
     first = traces[0]
-    filter_ = checkpoint or UnavailableFilter(first.filter, first.checkpoint_hash, first.task)
+    filter_ = checkpoint or unavailable_filter(first)
     try:
         particles = int(first.settings.get("particles", 300))
         result = diagnose_traces(

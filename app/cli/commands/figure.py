@@ -35,8 +35,7 @@ class DrawnRun(TaskOrRecordedRuns, opt.Run):
 
         check: called with the episode and its index, before the filter runs.
         """
-        from beliefscope.filters.external.unavailable import UnavailableFilter
-        from beliefscope.inspect.traces.provenance import checkpoint_of
+        from beliefscope.inspect.traces.provenance import checkpoint_of, unavailable_filter
         from beliefscope.recordings.open_trace import open_trace
 
         if not self.is_recorded:
@@ -51,7 +50,7 @@ class DrawnRun(TaskOrRecordedRuns, opt.Run):
         trace = open_trace(Path(self.task))
         check(trace.episode, trace.episode_index)
         recorded = checkpoint_of([trace], [Path(self.task)], self.filter)
-        return recorded or UnavailableFilter(trace.filter, trace.checkpoint_hash, trace.task), trace
+        return recorded or unavailable_filter(trace), trace
 
 
 @dataclass(frozen=True)

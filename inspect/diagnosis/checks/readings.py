@@ -11,7 +11,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task, axis_name
 from beliefscope.inspect.diagnosis.checks.reading_noise import delayed, noise_around_expected
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, commands_hand
-from beliefscope.inspect.diagnostics.statistic_kinds import EXPECTED
+from beliefscope.inspect.diagnostics.statistic_kinds import AROUND_EXPECTED, EXPECTED
 from beliefscope.inspect.statistics.reading_features import CONTROL, FIRST_CHANGES
 from beliefscope.inspect.statistics.reading_model import (
     ComparedReadings,
@@ -175,7 +175,7 @@ def without_explained(row: Mapping[str, float]) -> dict[str, float]:
 def _is_explained(statistic: str, row: Mapping[str, float]) -> bool:
     kind, subject, phase = statistic.split("/")
     if kind == "noise":
-        return not phase.startswith(EXPECTED) and f"noise/{subject}/{EXPECTED}" in row
+        return phase not in AROUND_EXPECTED and f"noise/{subject}/{EXPECTED}" in row
     return kind in EXPLAINED and f"reading bias/{subject}/all" in row
 
 

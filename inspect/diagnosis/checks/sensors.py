@@ -45,7 +45,7 @@ from beliefscope.inspect.diagnosis.checks.windows import (
     window_statistics,
     window_values,
 )
-from beliefscope.inspect.diagnostics.statistic_kinds import EXPECTED, EXPECTED_EXTREME, sensor_of
+from beliefscope.inspect.diagnostics.statistic_kinds import AROUND_EXPECTED, sensor_of
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys, with_gray_images
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
@@ -117,8 +117,8 @@ def localise(
         return (int(steps[0]), int(steps[-1])) if len(steps) else None
     if kind == "level":
         return biased_steps(episode, key, axis_index(axis))
-    if phase in (EXPECTED, EXPECTED_EXTREME):
-        episode = with_errors(episode, models)
+    if phase in AROUND_EXPECTED:
+        episode = with_errors(episode, [model for model in models if model.key == key])
     sizes = _sizes(kind, key, axis, episode, reference)
     if sizes is not None:
         return _interval(sizes, kind)
