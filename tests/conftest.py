@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -51,10 +52,20 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the browser tests and orders the files: browser, slow, others. Parallel processes then finish together."""
+    """Marks tests, and orders the files: browser, slow, others. Parallel processes then finish together.
+
+    Browser tests are marked as such, and variants of a test beyond the number in its marker ``first`` as ``long``.
+    """
+    variants: Counter[str] = Counter()
     for item in items:
         if item.path.parent.name == "browser":
             item.add_marker("browser")
+        first = item.get_closest_marker("first")
+        if first is not None and item.get_closest_marker("long") is None:
+            function = item.nodeid.partition("[")[0]
+            variants[function] += 1
+            if variants[function] > first.args[0]:
+                item.add_marker("long")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: 0 if item.get_closest_marker("browser") else 1 if item.path in slow else 2)
 

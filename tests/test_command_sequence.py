@@ -123,6 +123,7 @@ def test_counterfactual_outputs_agree(run: Run, folder: Path) -> None:
     ]
 
 
+@pytest.mark.long
 def test_all_faults_can_be_combined(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
     faults = json.loads(run("faults --json -")[1])

@@ -92,6 +92,7 @@ def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (tmp_path / "what.svg").read_text().startswith("<?xml")
 
 
+@pytest.mark.long
 def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     output = example("05_live.py", tmp_path, capsys)
@@ -120,6 +121,7 @@ def test_user_task_on_the_command_line(folder: Path) -> None:
     assert (folder / "own.rrd").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_user_task_in_the_server(folder: Path, tmp_path: Path) -> None:
     store = TraceStore(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
     try:

@@ -116,6 +116,7 @@ def test_label_causes_change_the_states_only(episodes: list[Episode]) -> None:
         assert changed.observations is episodes[0].observations
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_model_causes_change_their_module_only(
     name: str, originals: dict[str, Checkpoint], episodes: list[Episode]

@@ -78,6 +78,7 @@ def test_each_fault_of_the_data_changes_the_episode(task: ModuleType) -> None:
         assert ("labels" in changed) == name.startswith("labels")
 
 
+@pytest.mark.first(3)
 def test_accepted_causes_are_in_the_catalog_and_counted(task: ModuleType) -> None:
     for name, fault in task.FAULTS.items():
         accepted = [c for c in causes_in(bs.load_filter(task.make(name))) if re.fullmatch(fault.accepted, c.name)]

@@ -68,6 +68,7 @@ def test_index_by_content_is_valid_at_any_time_and_only_for_the_content(path: Pa
     assert read_index(path) is None
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("task", ["door", "push", "door-field", "push-field"])
 def test_included_files_have_an_index(task: str, tmp_path: Path) -> None:
     copied = tmp_path / "set.h5"
@@ -76,6 +77,7 @@ def test_included_files_have_an_index(task: str, tmp_path: Path) -> None:
         assert read_index(sample_path(task)) == (data.summaries, data.hash)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize(
     "change",
     [

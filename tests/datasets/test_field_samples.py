@@ -38,6 +38,7 @@ def test_every_episode_has_all_ingredients(episodes: list[Episode]) -> None:
     assert all(e.contact.any() for e in episodes)
 
 
+@pytest.mark.first(1)
 def test_simulation_reproduces_the_samples(episodes: list[Episode]) -> None:
     """Approximately, because processors round differently."""
     simulate = episodes[0].task.simulate

@@ -201,6 +201,7 @@ def test_points_of_scans_and_clouds(run: Trace, tmp_path: Path) -> None:
     assert drawn == {"/points/cloud": 7 * T - 1, "/points/scan": int(present.sum())}
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_recording_live_file_export_and_report(run: Trace, tmp_path: Path) -> None:
     stored = read_recording(write_recording(run, tmp_path / "run.rrd"))

@@ -106,6 +106,7 @@ def test_a_fused_heading_does_not_depend_on_the_turns_of_the_modalities() -> Non
     torch.testing.assert_close(ANGLES.difference(moved.mean, fused), torch.zeros(1, 3, dtype=torch.float64))
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("name", filters_of(ROBOT))
 def test_estimates_do_not_depend_on_the_turn_of_the_start(name: str) -> None:
     filter_, batch = build(architecture(ROBOT, name)), batch_of(np.linspace(2.0, 5.0, 8))

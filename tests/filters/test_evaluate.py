@@ -135,6 +135,7 @@ def test_stay_is_the_distance_from_the_start() -> None:
         assert rmse["angle_deg"] == pytest.approx(math.degrees(math.sqrt((moved**2).mean())), rel=1e-4)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-ekf", "image-ekf", "crossmodal-pf"])
 def test_dynamics_uses_no_observation(name: str) -> None:
     """Other images change the filter, but not the filter with all observations masked; nor does the fusion."""

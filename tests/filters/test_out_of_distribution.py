@@ -119,6 +119,7 @@ def test_moved_frame(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
     assert same == fresh[:5]
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 def test_offset_that_is_not_constant(checkpoint: Checkpoint, fresh: list[Episode]) -> None:
     moved = [move(checkpoint.task, episode, np.array([0.4 + 0.3 * i, 0.0]), []) for i, episode in enumerate(fresh[:5])]
@@ -126,6 +127,7 @@ def test_offset_that_is_not_constant(checkpoint: Checkpoint, fresh: list[Episode
         align(checkpoint, moved)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_pretrained_summaries_are_of_the_sample_sets() -> None:
     """As printed by the function that writes the record of new checkpoints, and available to every simulated filter."""

@@ -68,6 +68,7 @@ def test_record_has_the_training_command(name: str) -> None:
     assert {"seed", "metrics", "versions", "seconds"} <= record.keys()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("faults", ["", pytest.param("blackout=0.8", marks=pytest.mark.long)])
 def test_accuracy(checkpoint: Checkpoint, held_out: list[Episode], faults: str) -> None:
     """As recorded, and with fusion no worse than the better modality; with blackouts better for the moving angle."""
@@ -84,6 +85,7 @@ def test_accuracy(checkpoint: Checkpoint, held_out: list[Episode], faults: str) 
         assert fused["position_cm"] < 1.05 * single["position_cm"]
 
 
+@pytest.mark.first(1)
 def test_blackout_reduces_the_weight_of_the_image(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
     """For the moving angle; the EKF's belief keeps earlier information on the hinge, which does not move."""
     traces = [trace(checkpoint, e, particles=50, faults=Faults.parse("blackout=0.5")) for e in held_out[:6]]

@@ -21,6 +21,7 @@ SLOW = ("study", "mit-hdf5", "mit-json", "recording", "log-rerun")
 """Readers whose files need a training or rendering, or that can crash the process."""
 
 
+@pytest.mark.first(10)
 @pytest.mark.parametrize("name", [name for name in file_readers.READERS if name not in SLOW])
 def test_reader_raises_only_bad_input(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if name in file_readers.HDF5:  # without the probe, only truncated and edited files are safe to read

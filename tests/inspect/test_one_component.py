@@ -185,6 +185,7 @@ def test_numbers_do_not_depend_on_the_unit_of_the_state(unit: str, display: tupl
             assert row[1:] == pytest.approx(same[1:], rel=1e-3, abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_every_diagnostic_is_computed_or_refused_with_a_reason(runs: list[Trace]) -> None:
     results, reasons = run_diagnostics(runs, checkpoint(task()), {name: {} for name in DIAGNOSTICS}, True)

@@ -101,6 +101,7 @@ def test_bank_without_feedback_updates_are_standalone(episode: Episode) -> None:
         np.testing.assert_allclose(result.estimate_mean, run.modality_mean[:, k], atol=1e-5)
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     "name", ["crossmodal-ekf", "crossmodal-pf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"]
 )
@@ -119,6 +120,7 @@ def test_other_observations_and_weights_have_no_effect(name: str, episode: Episo
         np.testing.assert_allclose(result.modality_mean[:, 0], result.estimate_mean, atol=1e-6)
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_haptics_update_of_the_door_is_not_the_haptics_filter(name: str) -> None:

@@ -54,6 +54,7 @@ def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(pretrained_path("door", request.param))
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 def test_runs_over_one_episode_use_one_thread(checkpoint: Checkpoint, traced: Trace, episode: Episode) -> None:
     before = torch.get_num_threads()
@@ -202,6 +203,7 @@ def test_names_of_an_earlier_version(traced: Trace) -> None:
     np.testing.assert_array_equal(loaded.effective_weights, traced.effective_weights)
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door-field/information-ekf", "push-field/information-ekf"])
 def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,6 +251,7 @@ def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, mo
         trace(checkpoint, episode, particles_kept=0)
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door/crossmodal-pf", "push-field/information-ekf"])
 def test_trace_in_parts_has_the_same_bytes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,6 +43,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
     return trace(checkpoint, episode, particles=40)
 
 
+@pytest.mark.first(5)
 def test_trace_has_the_fields_of_its_kind(checkpoint: Checkpoint, traced: Trace) -> None:
     kind, names = checkpoint.kind, checkpoint.filter.names
     sequence = kind in ("lstm", "transformer")
@@ -63,6 +64,7 @@ def test_trace_has_the_fields_of_its_kind(checkpoint: Checkpoint, traced: Trace)
         np.testing.assert_array_equal(traced.modality_mean[:, 0], traced.estimate_mean)
 
 
+@pytest.mark.first(5)
 def test_maps_and_recording_round_trip(
     checkpoint: Checkpoint, traced: Trace, assert_same: Callable[[Trace, Trace], None], tmp_path: Path
 ) -> None:

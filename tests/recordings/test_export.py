@@ -193,6 +193,7 @@ def command(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.first(1)
 def test_diagnostics_of_an_imported_recording_are_equal(
     run: Trace,
     assert_same: Compare,

@@ -90,6 +90,7 @@ def test_the_page_loads_nothing(page: Path) -> None:
     assert len(text) < 10e6
 
 
+@pytest.mark.long
 def test_text_of_a_trace_cannot_end_the_script(run_: Trace, tmp_path: Path) -> None:
     from dataclasses import replace
 

@@ -86,6 +86,7 @@ def content(path: Path) -> list[tuple[str, dict[str, Any]]]:
     return sorted(rows, key=lambda row: (row[0], sorted(row[1]), str(row[1].get("step"))))
 
 
+@pytest.mark.first(1)
 def test_files_equal_the_trace_and_its_recording(
     checkpoint: Checkpoint, episode: Episode, assert_same: Compare, tmp_path: Path
 ) -> None:

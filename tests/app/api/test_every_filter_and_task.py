@@ -77,6 +77,7 @@ def map_layers(client: TestClient, task: Task) -> list[str] | None:
     return layers
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("name", "layers", "present", "absent"),
     [

@@ -48,6 +48,7 @@ def result(*arguments: object) -> Any:
     return json.loads(out)
 
 
+@pytest.mark.long
 def test_example_is_short_and_calibrated() -> None:
     assert len(EXAMPLE.read_text().splitlines()) < 60
     metrics = result("evaluate", "door", "--filter", SPEC)

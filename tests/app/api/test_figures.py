@@ -16,6 +16,7 @@ pytestmark = pytest.mark.slow
 STARTS = {"svg": b"<?xml", "pdf": b"%PDF", "png": b"\x89PNG"}
 
 
+@pytest.mark.long
 def test_files_of_the_timeline(shared_client: TestClient, shared_trace_url: str) -> None:
     for format, start in STARTS.items():
         response = shared_client.get(f"{shared_trace_url}/timeline.{format}", params={"chart": "error"})

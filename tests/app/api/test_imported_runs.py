@@ -74,6 +74,7 @@ def test_diagnostics_of_all_runs_of_a_filter(imported: Settings, open_client: Ca
     assert max(row[table["columns"].index("episodes")] for row in table["rows"]) == 6
 
 
+@pytest.mark.long
 def test_runs_are_diagnosed_with_a_kept_record(
     run: Run, imported: Settings, open_client: Callable[..., TestClient]
 ) -> None:

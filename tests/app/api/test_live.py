@@ -346,6 +346,7 @@ def poll(client: TestClient, url: str) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.long
 def test_recording_comparison_and_diagnostics(
     client: TestClient, writer: LiveFileWriter, full_trace: Trace, settings: Any
 ) -> None:

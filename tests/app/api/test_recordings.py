@@ -202,6 +202,7 @@ def test_reason_why_a_run_is_not_in_the_catalog(
         assert reason in entry["why_not"]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("content", "message"),
     [

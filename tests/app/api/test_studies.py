@@ -99,6 +99,7 @@ def test_checkpoint_is_added_to_the_catalog_once(
         assert client.post(f"/api/studies/none/door/{FILTER}/0").status_code == 404
 
 
+@pytest.mark.long
 def test_name_of_a_checkpoint_is_valid_in_another_server(
     settings: Settings, folder: Path, open_client: Callable[..., TestClient]
 ) -> None:

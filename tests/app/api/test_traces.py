@@ -216,6 +216,7 @@ def test_first_trace_is_computed_at_startup(settings: Settings, open_client: Ope
             time.sleep(0.05)
 
 
+@pytest.mark.long
 def test_stopped_server_leaves_no_frozen_objects(
     settings: Settings, open_client: OpenClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:

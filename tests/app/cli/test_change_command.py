@@ -56,6 +56,7 @@ def reversed_filters(change: tuple[str, ...]) -> tuple[str, ...]:
     return (change[0], change[2], change[1], *change[3:])
 
 
+@pytest.mark.long
 def test_report_names_filters_and_removed_sensors(
     run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,6 +23,7 @@ COMMAND = [sys.executable, "-m", "beliefscope"]
 INVALID_NAME = os.fsdecode(b"d\xff")  # not valid UTF-8
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
 def test_closed_pipe_prints_nothing(unbuffered: str) -> None:
     reading, writing = os.pipe()
@@ -100,6 +101,7 @@ def test_unencodable_output_is_escaped(tmp_path: Path) -> None:
     assert b"w\\xf6rk sp\\xe4ce d\\udcff/two.h5" in ran.stdout
 
 
+@pytest.mark.long
 def test_files_with_invalid_names_do_not_hide_others(
     settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path
 ) -> None:

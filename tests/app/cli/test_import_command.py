@@ -91,6 +91,7 @@ def test_a_data_set_is_converted_by_the_name_of_its_own_task(run: Run, log: Path
     assert copy.read_bytes() == data.read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error:std")
 @pytest.mark.parametrize(

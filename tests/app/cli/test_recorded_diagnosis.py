@@ -88,6 +88,7 @@ def diagnose(run: Run, recordings: Path) -> Callable[[str], str]:
     return headline
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("name", "headline"),
     [
@@ -101,6 +102,7 @@ def test_a_fault_of_recorded_runs_is_named(diagnose: Callable[[str], str], name:
     assert diagnose(name).startswith(headline)
 
 
+@pytest.mark.long
 def test_recorded_runs_need_healthy_ones(run: Run, diagnose: Callable[[str], str], recordings: Path) -> None:
     diagnose("again")
     code, _, error = run("diagnose", recordings / "again")
@@ -136,6 +138,7 @@ def test_recorded_runs_are_diagnosed_in_python(diagnose: Callable[[str], str], r
         bs.diagnose_runs([], recordings / "clean")
 
 
+@pytest.mark.long
 def test_the_files_of_recorded_runs_are_listed(
     run: Run, diagnose: Callable[[str], str], recordings: Path, tmp_path: Path
 ) -> None:

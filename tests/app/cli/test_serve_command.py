@@ -63,6 +63,7 @@ def request_json(url: str, body: Any = None) -> Any:
         return json.load(answer)
 
 
+@pytest.mark.long
 def test_sigterm_saves_jobs_and_is_logged(tmp_path: Path) -> None:
     workspace = tmp_path / "workspace"
     with served(workspace, "--log-level", "info", "--log-format", "json") as (server, address):

@@ -55,6 +55,7 @@ def test_other_commands_name_a_missing_file_of_a_filter(run: Run, tmp_path: Path
     assert error.startswith(f"error: filter '{path}' does not exist: expected a file and its function, such as ")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_healthy_record_over_a_sample_set_uses_the_images_of_its_camera(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

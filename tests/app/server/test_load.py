@@ -74,6 +74,7 @@ def test_memory_holds_the_newest_traces_not_all_that_were_request_runs(store: Tr
     assert refs[0]() is None
 
 
+@pytest.mark.long
 def test_memory_of_traces_is_limited(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trace_store, "BYTES_IN_MEMORY", 1)
     assert count_alive(request_runs(store, 4)) <= 2
@@ -188,6 +189,7 @@ def test_neighbouring_maps_are_prefetched(client: TestClient) -> None:
             time.sleep(0.01)
 
 
+@pytest.mark.long
 def test_closed_views_are_released(open_client: Callable[..., TestClient], settings: Settings) -> None:
     with open_client(settings) as client:
         views: Views = client.app.state.views  # type: ignore[attr-defined]

@@ -117,6 +117,7 @@ def test_full_disk_is_reported_with_free_space(name: str, run: Trace, tmp_path: 
         subprocess.run(["umount", str(place)], check=True)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.3, 0.98])
 def test_recording_on_a_full_disk(share: float, run: Trace, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"  # Rerun does not support forks

@@ -92,6 +92,7 @@ def test_records_are_regular_files_of_limited_size(workspace: Path) -> None:
 INVALID: tuple[Any, ...] = ([], "[" * 100_000, "\ud800")
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("invalid", INVALID, ids=["list", "nested", "surrogate"])
 def test_invalid_records_are_ignored(workspace: Path, settings: Settings, open_client: Opens, invalid: Any) -> None:
     status = (workspace / "recordings" / "a.rrd").stat()

@@ -103,6 +103,7 @@ write_dataset(path.with_name("later.h5"), DOOR, [episode] * 3)
 """
 
 
+@pytest.mark.long
 def test_full_disk_is_reported_without_a_crash(valid: Path) -> None:
     """The disk is full at the first byte, between episodes, or when the file is closed."""
     before, folder = valid.read_bytes(), valid.parent

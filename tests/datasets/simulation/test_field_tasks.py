@@ -47,6 +47,7 @@ def simulated(task: Task, *without: str, index: int = 0, steps: int = STEPS) -> 
     return task.simulate(7, index, steps, without)
 
 
+@pytest.mark.first(1)
 def test_simulation_is_deterministic_and_motion_does_not_depend_on_the_length(task: Task, episode: Episode) -> None:
     assert simulated(task).digest() == episode.digest()
     assert simulated(task, index=1, steps=9).digest() != simulated(task, steps=9).digest()
@@ -80,6 +81,7 @@ def test_switching_an_ingredient_off_leaves_the_other_draws_unchanged(task: Task
     assert all(rest[other].rng.random() == every[other].rng.random() for other in rest)
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("name", sorted(SENSORS))
 def test_sensor_ingredients_change_their_sensor_and_nothing_else(task: Task, episode: Episode, name: str) -> None:
     other = simulated(task, name)
@@ -90,6 +92,7 @@ def test_sensor_ingredients_change_their_sensor_and_nothing_else(task: Task, epi
     np.testing.assert_array_equal(other.controls, episode.controls)
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 def test_ingredients_of_the_physics_change_the_motion(task: Task) -> None:
     sensors = tuple(SENSORS)

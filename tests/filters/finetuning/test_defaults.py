@@ -26,6 +26,7 @@ FIRST = ("crossmodal-ekf", "feature-pf", "information-ekf", "lstm")
 """Each kind of filter once; the others are tested by ``make check-all`` only."""
 
 
+@pytest.mark.first(10)
 @pytest.mark.parametrize(("task", "name"), FILTERS)
 def test_defaults_train_a_model_of_the_filter_on_a_fault_of_its_sensors(task: str, name: str) -> None:
     filter_ = build(architecture(task, name))
@@ -43,6 +44,7 @@ def test_defaults_train_a_model_of_the_filter_on_a_fault_of_its_sensors(task: st
     assert parse_slices([slice_.name], (), filter_.task) == [slice_]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name",
     [name if name in FIRST else pytest.param(name, marks=pytest.mark.long) for name in filters_of(find_task("door"))],

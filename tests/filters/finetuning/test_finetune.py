@@ -56,6 +56,7 @@ def mix_of(episodes: list[Episode], settings: FineTune, name: str = "crossmodal-
     return Mix.from_shares(filter_.task, filter_.names, settings.shares(), episodes, settings.seed)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("name", "train", "encoders"),
     [
@@ -130,6 +131,7 @@ def test_image_indices_refer_to_distinct_images(episodes: list[Episode]) -> None
     assert torch.equal(steps.observations["haptics"], mix.steps.observations["haptics"])
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("name", "train", "scale", "rate"),
     [
@@ -168,6 +170,7 @@ def test_only_selected_parameters_change(
     assert load_checkpoint(tmp_path / "finetuned.safetensors").record == record
 
 
+@pytest.mark.long
 def test_interrupted_run_resumes_to_the_same_weights(episodes: list[Episode], tmp_path: Path) -> None:
     """Paused before each step, or killed in each step, the result is identical to an uninterrupted run."""
     settings = replace(SMALL, train=("haptics-only", "weights-only"), steps=3, check=2)
@@ -225,6 +228,7 @@ def test_interrupted_run_resumes_to_the_same_weights(episodes: list[Episode], tm
     check_same(run(episodes, settings, partial=partial))
 
 
+@pytest.mark.long
 def test_run_without_improvement_returns_the_base_weights(episodes: list[Episode]) -> None:
     result = run(episodes, replace(SMALL, rate=10.0, steps=20, check=2, patience=3))
     assert (result.record["best_step"], result.record["steps"]) == (0, 6)

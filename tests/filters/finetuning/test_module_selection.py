@@ -44,6 +44,7 @@ class ExternalModule(nn.Module):
         return self.again(self.head(self.plain(self.body(x)))) * self.scale
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("name", filters_of(find_task("door")))
 def test_module_tree_contains_every_parameter_once(name: str) -> None:
     filter_ = door(name)

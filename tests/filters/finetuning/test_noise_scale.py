@@ -24,6 +24,7 @@ def episodes(short_episodes: Callable[..., list[Episode]]) -> list[Episode]:
     return short_episodes("push", range(10), 60)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["image-ekf", "crossmodal-ekf"])
 def test_calibrated_nees_is_1_and_estimates_stay(episodes: list[Episode], name: str) -> None:
     filter_ = copy.deepcopy(load_checkpoint(pretrained_path("push", name)).filter)

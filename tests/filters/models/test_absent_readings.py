@@ -67,6 +67,7 @@ def equal(a: Gaussian, b: Gaussian, at: slice = slice(None)) -> bool:
     return torch.equal(a.mean[at], b.mean[at]) and torch.equal(a.covariance[at], b.covariance[at])
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("name", NAMES)
 def test_repeated_readings_are_not_used(name: str) -> None:
     filter_ = build(architecture(TASK, name))
@@ -85,6 +86,7 @@ def test_repeated_readings_are_not_used(name: str) -> None:
     assert equal(first, used) == (filter_.names == ("radio",))
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("name", NAMES)
 def test_without_any_reading_the_belief_is_predicted(name: str) -> None:
     filter_ = build(architecture(TASK, name))

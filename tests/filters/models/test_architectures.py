@@ -129,6 +129,7 @@ def test_invalid_architectures_are_rejected(change: dict, message: str) -> None:
 # Properties of all filters.
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_flow_through_16_steps_to_every_weight(name: str, window: MakeWindow) -> None:
     filter_, batch = build(architecture("door", name)), window(16, 2)
@@ -164,6 +165,7 @@ def test_order_of_modalities_does_not_matter(name: str, window: MakeWindow) -> N
     torch.testing.assert_close(swapped.covariance, original.covariance, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("k", [0, 1])
 @pytest.mark.parametrize("name", FUSED)

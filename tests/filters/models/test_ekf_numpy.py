@@ -41,6 +41,7 @@ def run(filter_: Filter, evidence: Evidence) -> Rollout:
     return rollout(filter_, evidence, START, torch.Generator(), keep=True)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("absent", [False, True])
 @pytest.mark.parametrize("networks", ["default", "authors"])
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-ekf", "image-ekf"])

@@ -70,6 +70,7 @@ def estimate(filter_: InformationFilter, sequence: Evidence, particles: int) -> 
         torch.set_default_dtype(default)
 
 
+@pytest.mark.first(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("weights", [(0.5, 0.5), (0.8, 0.2)])
 @pytest.mark.parametrize("bias", [1e-4, 0.5])

@@ -131,6 +131,7 @@ def test_stacks_have_equal_outputs_with_and_without_gradients() -> None:
     assert expected.shape == (3, 4, 2)
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("stride", [1, 2])
 def test_encoded_images_have_the_same_bits_in_any_batch(stride: int) -> None:

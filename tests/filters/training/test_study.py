@@ -302,6 +302,7 @@ def test_unusable_data_is_invalid_input(data: Path, tmp_path: Path, capsys: pyte
     assert "first: door/lstm/seed0: " + str(damaged) in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -> None:
     locked = cell(data, "lstm")
     lock = locked.path(tmp_path, "").with_name(".seed0.lock")

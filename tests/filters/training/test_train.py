@@ -41,6 +41,7 @@ def episodes(short_episodes: Callable[..., list[Episode]]) -> list[Episode]:
     return short_episodes("door", (0, 1, 2, 3, VAL), STEPS)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "name", [name if name in (*KINDS[:2], KINDS[-1]) else pytest.param(name, marks=pytest.mark.long) for name in KINDS]
 )
@@ -86,6 +87,7 @@ def make_trainer(episodes: list[Episode]) -> Callable[..., Trainer]:
     return make
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name", [name if name in FIRST else pytest.param(name, marks=pytest.mark.long) for name in NAMES]
 )
@@ -162,6 +164,7 @@ def test_best_validated_weights_are_kept(make_trainer: Callable[..., Trainer]) -
     assert error() <= 1.1 * before
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["crossmodal-pf", "feature-ekf", "lstm"])
 def test_end_to_end_gradients_reach_every_parameter(name: str, make_trainer: Callable[..., Trainer]) -> None:
     trainer = make_trainer(name)

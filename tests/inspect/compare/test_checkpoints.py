@@ -89,6 +89,7 @@ def comparison(forward: bool) -> CheckpointComparison:
         return compare_checkpoints(*pair, {i: episode_of(episodes, i, 60) for i in EPISODES})
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("load", [ekf, pf], ids=["ekf", "pf"])
 def test_filter_is_identical_to_itself(load: Callable[[], Checkpoint], data: Dataset) -> None:
     checkpoint = load()

@@ -31,6 +31,7 @@ def different(run: Trace, other_run: Trace) -> list[str]:
     ]
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("first", [0, 40, 99])
 def test_empty_edit_is_bit_identical(replay: Replay, first: int) -> None:
     assert replay.exact

@@ -76,6 +76,7 @@ def test_tree_matches_the_headers(family: Path) -> None:
     assert "cut.safetensors" in lineage.left_out[0]
 
 
+@pytest.mark.long
 def test_commands_have_the_paths_of_the_base_checkpoints(family: Path) -> None:
     """In any folder, such as an exported one with other names of the files."""
     base = family / "finetuned.safetensors"
@@ -151,6 +152,7 @@ def test_lineage_command(run: Run, family: Path, tmp_path: Path) -> None:
     assert run(f"lineage {family} --export first.safetensors")[0] == 2
 
 
+@pytest.mark.long
 def test_change_command(run: Run, family: Path, tmp_path: Path) -> None:
     finetuned = family / "finetuned.safetensors"
     report, data = tmp_path / "report", tmp_path / "small.h5"

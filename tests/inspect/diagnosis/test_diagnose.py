@@ -77,6 +77,7 @@ def test_clean_episodes_are_healthy() -> None:
     assert "Healthy" in result.headline
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("nees", "start"),
     [
@@ -350,6 +351,7 @@ def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_alarm_rate_of_one_episode_depends_on_the_size_of_the_record() -> None:
     """One of n + 1 episodes is the most unusual one with probability 1 / (n + 1)."""

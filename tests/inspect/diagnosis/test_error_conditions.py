@@ -77,6 +77,7 @@ def test_the_states_with_wrong_innovations_are_named() -> None:
     )
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("filter_", "name"),
     [

@@ -33,6 +33,7 @@ def profile() -> HealthyProfile:
     return profile_of(loaded(Network(weight=0.85)), [drive(seed) for seed in range(12)], "cart")
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("filter_", "cause"),
     [

@@ -77,6 +77,7 @@ def profile() -> HealthyProfile:
     return profile_of(loaded(Cart()), [drive(seed) for seed in range(12)], "cart")
 
 
+@pytest.mark.first(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("filter_", "cause"),
@@ -96,6 +97,7 @@ def test_defects_of_an_external_filter_are_named(filter_: Cart, cause: str) -> N
     assert (result.causes[0].cause.name, result.causes[0].probability > 0.5) == (cause, True)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_healthy_external_filter_is_healthy() -> None:
     assert diagnose(loaded(Cart()), {seed: drive(seed) for seed in range(20, 30)}, profile=profile()).state == "healthy"

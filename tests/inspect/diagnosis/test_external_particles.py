@@ -161,6 +161,7 @@ def test_weights_are_kept_without_resampling() -> None:
         assert values["lost weights//all"] == share
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("offset", [0.0, 0.1, -0.2])
 def test_a_likelihood_with_an_offset_moves_the_particles_around_true_states(offset: float) -> None:
     """As a Kalman update of their mean does; without a model of the readings."""
@@ -220,6 +221,7 @@ def test_likelihoods_of_steps_without_a_reading_are_updates() -> None:
     assert reported_particle_statistics(replace(masked, log_likelihood=flat))["absent updates/far/all"] == 0.0
 
 
+@pytest.mark.first(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "cause"),

@@ -171,6 +171,7 @@ def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
 STILL = as_external(still, "still", WRENCH)
 
 
+@pytest.mark.first(5)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "cause"),

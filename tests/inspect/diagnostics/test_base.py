@@ -104,6 +104,7 @@ def test_views_match_the_trace(results: tuple[Diagnostic, Diagnostic, Trace]) ->
             assert {len(row) for row in table.rows} == {len(table.columns)}, table.title
 
 
+@pytest.mark.first(2)
 def test_figures_are_written(results: tuple[Diagnostic, Diagnostic, Trace], tmp_path: Path) -> None:
     figure = results[0].plot()
     curves = results[0].curves()

@@ -29,6 +29,7 @@ def errors_of(filter_: Boat, every: int = 4) -> tuple[Array, Array, Array]:
     return f, h, np.array([values[f"correction slope/{name}/all"] for name in STD])
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("every", [1, 4])
 @pytest.mark.parametrize("filter_", [Boat(), Boat(separate=True), Boat(radar=5.0), Boat(offset=0.5), Boat(turn=0.6)])
 def test_exact_derivatives_have_no_error_whatever_the_other_defects(filter_: Boat, every: int) -> None:
@@ -278,6 +279,7 @@ class Certain(Boat):
         return values | {"estimate_covariance": self.covariance}
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("filter_", [Boat(), Boat(separate=True), Joint()])
 def test_updates_and_noise_are_those_of_the_filter(filter_: Boat) -> None:
     """Q is the squares of 1 cm, 2 mrad and 0.1 mrad/s per step; one update after another and all at once."""

@@ -57,6 +57,7 @@ class Named(Views):
         return [Curve(name, np.arange(50.0), self.chart) for name in self.names]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("title", "names", "columns"),
     [

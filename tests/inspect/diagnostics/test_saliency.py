@@ -177,6 +177,7 @@ def test_position_of_the_log_likelihood() -> None:
     np.testing.assert_allclose(si(estimate.place).numpy(), replay.original.estimate_mean[VISIBLE], atol=1e-6)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("name", "target"),
     [
@@ -208,6 +209,7 @@ def test_gradients_are_finite_differences(name: str, target: str) -> None:
         assert float((gradient * way).sum()) == pytest.approx(expected, rel=1e-4, abs=1e-8)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("name", "target"),
     [("crossmodal-ekf", "hinge_y"), ("crossmodal-ekf", "beta:image"), ("crossmodal-pf", "hinge_x")],

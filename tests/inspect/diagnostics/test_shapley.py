@@ -222,6 +222,7 @@ def test_duplicate_modalities_have_equal_values() -> None:
     assert abs(result.phases[0].shapley[0, 0]) > 0.01
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["feature-ekf", "feature-pf", "lstm"])
 def test_missing_inputs_of_shared_models_are_neutral(name: str) -> None:
     checkpoint = untrained(name)

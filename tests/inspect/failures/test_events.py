@@ -304,6 +304,7 @@ def test_a_score_that_does_not_apply_is_refused_after_the_first_block() -> None:
     assert max(progress, default=0.0) <= 0.5
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
 def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[int, Episode], name: str) -> None:

@@ -173,6 +173,7 @@ def test_figure_has_one_column_with_axes_units_legend_and_marks(ekf: Trace) -> N
     assert error.get_ylim()[1] > high  # room for the marks
 
 
+@pytest.mark.long
 def test_files_have_embedded_fonts_and_are_reproducible(ekf: Trace) -> None:
     drawn = timeline(ekf, View(("estimate",)))
     pdf = encoded_timeline(drawn, "pdf")

@@ -146,6 +146,7 @@ def test_unavailable_values_are_omitted(run: Trace, tmp_path: Path) -> None:
     assert [line.get_label() for line in belief.lines] == ["fused", "truth"]
 
 
+@pytest.mark.long
 def test_files_are_reproducible(run: Trace, map_: LikelihoodMap, tmp_path: Path) -> None:
     for name in ("a.svg", "b.svg"):
         write_figure(draw_step(run, STEP, map_), tmp_path / name)

@@ -100,6 +100,7 @@ def test_the_order_of_the_covariates_does_not_matter() -> None:
     assert [(c.steps.tolist(), c.p_value) for c in first] == [(c.steps.tolist(), c.p_value) for c in other]
 
 
+@pytest.mark.long
 def test_false_discoveries_with_dependent_steps() -> None:
     """With levels of episodes and slow covariates, tests of single steps would reject nearly every time."""
     reports = []

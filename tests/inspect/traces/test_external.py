@@ -331,6 +331,7 @@ INVALID = {
 }
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("message", INVALID)
 def test_invalid_results_are_refused(episode: Episode, message: str) -> None:
     with pytest.raises(BadInput) as error:

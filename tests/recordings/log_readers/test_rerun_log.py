@@ -129,6 +129,7 @@ def test_wrong_maps_name_the_value(log: Path, tmp_path: Path, old: str, new: str
         read_log(read_columns(log, mapping), mapping, "log")
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("size", [0, 15, 4000])
 def test_damaged_files_are_refused(log: Path, tmp_path: Path, size: int) -> None:
     (tmp_path / "log.rrd").write_bytes(log.read_bytes()[:size])

@@ -65,6 +65,7 @@ def scalars(rows: Mapping[str, list[Any]]) -> NDArray[np.float64]:
     return np.array(rows["Scalars:scalars"], dtype=np.float64)
 
 
+@pytest.mark.first(1)
 def test_curves_equal_the_diagnostic(recorded: Any) -> None:
     run, diagnostics, path = recorded
     rows = stored(path)

@@ -46,6 +46,7 @@ def of_boat(boat: Boat, faulty: bool = False) -> dict[str, float]:
     return dynamics_statistics(bs.trace(checkpoint, [episode]), checkpoint)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("boat", "faulty"), [(Boat(), True), (Boat(radar=0.01), False), (Boat(offset=2.0), False), (Boat(gain=0.1), False)]
 )
@@ -241,6 +242,7 @@ def test_the_noise_of_a_filter_that_has_always_been_overconfident_is_named(
     assert re.match(start, result.headline), result.headline
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("boat", [Boat(turn=-1.0), Boat(gain=-1.0), Boat(offset=2.0)])
 def test_innovations_at_true_states_show_the_measurement_functions_only(boat: Boat) -> None:
     """Whatever the dynamics and updates do: that of the radar's range has an offset of 2 m, with a noise of 0.3 m."""

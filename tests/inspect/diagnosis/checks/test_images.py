@@ -33,6 +33,7 @@ def scene(rng: np.random.Generator, healthy: Reference, shift: tuple[int, int]) 
     return hand, normalised((255.0 * (images - low) / (high - low)).astype(np.uint8))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("shift", [(0, 0), (-2, 4)])
 def test_the_shift_is_that_of_the_largest_correlation_summed_over_the_images(shift: tuple[int, int]) -> None:
     from scipy import signal  # takes a second

@@ -22,6 +22,7 @@ def lags(episode: bs.Episode) -> dict[str, float]:
     return {name.removeprefix("lag/labels ").removesuffix("/all"): value for name, value in values.items()}
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("delay", [0, 1, 3])
 @pytest.mark.parametrize("key", ["radar", "compass"])
 def test_labels_precede_a_late_sensor_by_its_delay(key: str, delay: int) -> None:

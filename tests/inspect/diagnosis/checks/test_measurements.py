@@ -68,6 +68,7 @@ class Scaled(Boat):
         return result
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("filter_", "expected"),
     [(Boat(), True), (Boat(offset=5.0), True), (Scaled(100.0), True), (Scaled(1.0, True), False)],

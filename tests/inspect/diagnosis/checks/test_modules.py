@@ -183,6 +183,7 @@ def test_log_odds_of_the_weights_before_the_bound() -> None:
     assert values["beta spread/image/all"] == pytest.approx(logit.std(), rel=1e-3)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["feature-ekf", "feature-pf", "image-pf", "haptics-ekf"])
 def test_other_filters_have_the_statistics_that_apply(name: str) -> None:
     checkpoint, original = run(name)

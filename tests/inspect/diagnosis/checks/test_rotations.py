@@ -120,6 +120,7 @@ def test_moved_is_the_inverse_of_difference() -> None:
     np.testing.assert_allclose(TASK.difference(TASK.moved(states, change), states), change, atol=1e-9)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("jacobian", [1.0, -1.0])
 def test_jacobians_are_derivatives_by_the_error_in_body_axes(jacobian: float) -> None:
     """With the opposite rotation, F is ``R(angle)`` instead of its transpose, which differs with the angle."""
@@ -130,6 +131,7 @@ def test_jacobians_are_derivatives_by_the_error_in_body_axes(jacobian: float) ->
     assert min(values[f"correction slope/{name}/all"] for name in WORLD) > 0.98
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("gain", [1.0, 2.0])
 def test_dynamics_of_rotations_have_the_slopes_and_the_noise_of_their_axes(gain: float) -> None:
     """From true states, whatever the updates do."""

@@ -53,6 +53,7 @@ def change(task: str, faults: str, statistic: str) -> float:
     return medians(task, faults)[statistic] - medians(task)[statistic]
 
 
+@pytest.mark.first(4)
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
@@ -152,6 +153,7 @@ def test_windows_that_deviate_are_adjacent() -> None:
     assert deviating_windows(np.ones(4)) is None
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
     ("faults", "own"),
@@ -273,6 +275,7 @@ def test_image_shift_is_registered() -> None:
     assert y == pytest.approx(-2.0, abs=0.7)
 
 
+@pytest.mark.first(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "statistic", "steps"),

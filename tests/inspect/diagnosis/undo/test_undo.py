@@ -113,6 +113,7 @@ def test_the_replay_without_a_fault_of_the_model_is_the_original_run(
     assert np.sum(distance[1]) < 0.1 * np.sum(distance[0])
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("action", ["shift image", "rescale image", "restore image", "shift dynamics", "healthy beta"])
 def test_a_base_checkpoint_replaces_modules(action: str) -> None:
     if action == "healthy beta":
@@ -284,6 +285,7 @@ def test_the_last_modality_is_not_dropped() -> None:
     assert undo("drop image", inputs(checkpoint("unimodal-ekf")), {}) is not None
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-pf", "image-ekf"])
 def test_lost_images_are_skipped_step_by_step(name: str) -> None:
