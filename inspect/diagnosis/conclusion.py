@@ -203,7 +203,7 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: 
         if _are_alike([first, *similar]):
             return f"{', '.join(titles)} and {last}, by one cause or by several; try: {first.next}"
         return f"{', '.join(titles)} or {last}, not separable; try: {first.next}"
-    where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
+    where = f" in at least {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {_lower(first.cause.title)}"
     where = channels_text(case, first.cause) + _when(case, first) + where

@@ -58,7 +58,7 @@ class HealthyProfile:
         reference: healthy images; None in records of format 1 and for tasks without images.
         readings: models of the vector sensors of unknown physics; none in records of earlier versions.
         steps: smallest and largest number of steps of the episodes; None in records of earlier versions.
-        task: name of the task of a profile that has just been measured; files belong to a filter.
+        task: name of the task; empty in records of earlier versions.
     """
 
     data: str
@@ -80,6 +80,7 @@ class HealthyProfile:
         reference = None if self.reference is None else self.reference.to_json()
         models = {"readings": [model.to_json() for model in self.readings]} if self.readings else {}
         steps = {"steps": list(self.steps)} if self.steps else {}
+        head |= {"task": self.task} if self.task else {}
         return {**head, **steps, "statistics": rows, "reference": reference, **models}
 
     @classmethod
@@ -100,12 +101,14 @@ class HealthyProfile:
             readings = tuple(map(ReadingModel.from_json, models))
             steps = document.get("steps")
             lengths = None if steps is None else (int(steps[0]), int(steps[1]))
+            task = str(document.get("task", ""))
         except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"the healthy record is malformed: {error!r}") from None
         for name, values in rows.items():
             if values.shape != (count,) or name.count("/") != 2:
                 raise BadInput(f"the healthy record is malformed: {name!r} has {len(values)} values of {count}")
-        return cls(data, count, None if particles is None else int(particles), rows, reference, readings, lengths)
+        particles = None if particles is None else int(particles)
+        return cls(data, count, particles, rows, reference, readings, lengths, task)
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:

@@ -187,9 +187,9 @@ def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
     return np.where((channels > 0) & valid, squared, np.nan), channels
 
 
-def are_extreme(squared: Array, channels: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether squared innovations with numbers of channels are larger than all but ``TAIL`` of a consistent filter."""
-    return np.asarray(chdtrc(np.maximum(channels, 1), squared) < TAIL)
+def are_extreme(squared: Array, channels: NDArray[np.int64], tail: float = TAIL) -> NDArray[np.bool_]:
+    """Whether squared innovations with numbers of channels are larger than all but a share of a consistent filter's."""
+    return np.asarray(chdtrc(np.maximum(channels, 1), squared) < tail)
 
 
 def nis_of(trace: Trace) -> Array | None:

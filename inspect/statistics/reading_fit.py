@@ -75,8 +75,8 @@ def fit_reading_models(
     Each half of the episodes decides which channels the model of the other half explains, and by which features.
 
     Args:
-        whole: models of all episodes if these are some of them: the same channels have models, and isolated readings
-            are left out as there.
+        whole: models of all episodes if these are some of them: the same channels have models, of the same kind of
+            features, and isolated readings are left out as there.
     """
     of_all = {model.key: model for model in whole}
     episodes = [episode for episode in episodes if np.isfinite(episode.states).all()]
@@ -94,10 +94,10 @@ def fit_reading_models(
             if len(steps) // stride >= MIN_STEPS
         ]
         options = _options(episodes, key)
-        fits = _fit(rows, groups, options) if len(rows) >= MIN_EPISODES else []
         same = of_all.get(key)
+        fits = _fit(rows, groups, options, same) if len(rows) >= MIN_EPISODES else []
         limit = FEW if same is None else float(same.outliers > 0.0)
-        rows, fits, outliers = _without_outliers(rows, fits, groups, options, limit)
+        rows, fits, outliers = _without_outliers(rows, fits, groups, options, limit, same)
         strong, weak = (tuple(fit.model(rows) for fit in chosen) for chosen in _chosen(fits, rows, same))
         if strong or weak:
             result.append(ReadingModel(key, strong, weak, outliers))
@@ -202,6 +202,11 @@ class _Fitted:
     errors: Sequence[Array]
     left: float
 
+    @property
+    def kind(self) -> tuple[bool, int]:
+        """As ``ChannelModel.kind``."""
+        return len(self.landmark) > 0, self.degree
+
     def explained(self, rows: Sequence[Rows]) -> float:
         """Share of the variance of the channel within episodes; 0 of a constant."""
         total = self._total(rows)
@@ -245,11 +250,15 @@ def _options(episodes: Sequence[Episode], key: str) -> list[Option]:
     return options
 
 
-def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Option]) -> list[_Fitted]:
+def _fit(
+    rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Option], same: ReadingModel | None = None
+) -> list[_Fitted]:
     """The fit to each channel, by the option and the features that leave the least of it.
 
-    Further features, fitted to noise, would change the expected readings from step to step.
+    Further features, fitted to noise, would change the expected readings from step to step. Fits to channels of a model
+    have its kind of features: a landmark and a polynomial that explain a channel about as well have other errors.
     """
+    kinds = {} if same is None else {m.index: m.kind for m in (*same.of_channels, *same.of_weak_channels)}
     y = [np.concatenate([option.targets(row) for option in options], axis=1) for row in rows]
     stages = [
         *(
@@ -265,15 +274,20 @@ def _fit(rows: Sequence[Rows], groups: Sequence[Indices], options: Sequence[Opti
     best: dict[int, _Fitted] = {}
     for share, fits in stages:
         for channel in {option.channel for option in options}:
-            own = [fitted for fitted in fits if fitted.option.channel == channel]
+            own = [f for f in fits if f.option.channel == channel and kinds.get(channel, f.kind) == f.kind]
             least = min(own, key=lambda fitted: fitted.left, default=None)
             if least is not None and (channel not in best or least.left < share * best[channel].left):
                 best[channel] = least
-    return list(best.values())
+    return [best[channel] for channel in sorted(best)]
 
 
 def _without_outliers(
-    rows: list[Rows], fits: list[_Fitted], groups: Sequence[Indices], options: Sequence[Option], limit: float
+    rows: list[Rows],
+    fits: list[_Fitted],
+    groups: Sequence[Indices],
+    options: Sequence[Option],
+    limit: float,
+    same: ReadingModel | None,
 ) -> tuple[list[Rows], list[_Fitted], float]:
     """The rows and fits without isolated readings, whose errors would hide what the others depend on, and their share.
 
@@ -286,7 +300,7 @@ def _without_outliers(
         if not any(steps.any() for steps in left_out):
             break
         rows = [row.part(np.logical_not(steps)) for row, steps in zip(rows, left_out, strict=True)]
-        fits = _fit(rows, groups, options)
+        fits = _fit(rows, groups, options, same)
     share = 1.0 - sum(len(row.readings) for row in rows) / max(every, 1)
     return (rows, fits, share) if 0.0 < share <= limit else before
 

@@ -147,6 +147,11 @@ class ChannelModel:
     def is_angle(self) -> bool:
         return len(self.constants) > 1
 
+    @property
+    def kind(self) -> tuple[bool, int]:
+        """Kind of the features: whether it is a landmark, and the degree of the monomials."""
+        return len(self.landmark) > 0, self.degree
+
     def expected(self, inputs: Array, states: Array, places: Array) -> Array:
         """(T,) from features (T, F), states (T, n) and positions (T, p); NaN outside of the limits (``EXTRAPOLATED``).
 

@@ -196,7 +196,7 @@ def diagnose(
         profile = profile_from
     else:
         profile = healthy_record(checkpoint, profile_from)
-    if profile is not None and profile.task != checkpoint.task.name:
+    if profile is not None and profile.task not in ("", checkpoint.task.name):
         raise BadInput(
             f"healthy record of task {profile.task}, but {checkpoint.name} is of task {checkpoint.task.name}"
         )

@@ -68,9 +68,6 @@ COVARIANCE = Cause(
 )
 """The update of the mean is correct, that of the covariance is not."""
 
-GATED = -0.2
-"""Prior of missing updates: most gates reject readings because of another fault."""
-
 WEIGHTS = Cause(
     "weights.lost",
     "Particle weights not kept without resampling",
@@ -304,7 +301,6 @@ def _of_updates(modality: str) -> tuple[Cause, ...]:
             (Symptom(f"updates/{modality}/*", -1),),
             f"covariance update/*|measurement noise//*|measurement noise/{modality}/*|{FILTER}",
             "Check the gate of the filter, and when it updates.",
-            prior=GATED,
         ),
         Cause(
             f"updates.{modality}.absent",

@@ -22,6 +22,9 @@ from beliefscope.inspect.trace import Trace
 MIN_STEPS = 10
 """Minimum number of steps of a statistic."""
 
+REJECTABLE = 0.05
+"""Largest probability of innovations, in a consistent filter, that a correct gate rejects."""
+
 SAME = 1e-5
 """Largest change of a belief by no update, relative to its size: beliefs have single precision."""
 
@@ -35,10 +38,10 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     ``innovation bias``, by channel: mean of nu, in standard deviations. ``innovation std``: geometric mean of the
     standard deviations S. ``innovation turns``: share of steps with a nu close to a full turn in a channel
     of angles. ``updates``: share of steps with an accepted innovation that changes the belief, or with one that a
-    correct gate rejects because the filter has lost the state. ``absent updates``: share of the steps without a
-    reading of the modality that have an accepted one. ``measurement noise``: geometric mean of the
-    standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of all
-    modalities, where the measurement noise of some is unknown.
+    correct gate may reject (``REJECTABLE``), such as that of a filter that has lost the state. ``absent updates``:
+    share of the steps without a reading of the modality that have an accepted one. ``measurement noise``: geometric
+    mean of the standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of
+    all modalities, where the measurement noise of some is unknown.
     """
     if trace.innovation is None or (pair := innovations(trace)) is None:
         return {}
@@ -48,12 +51,12 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     deviation = np.sqrt(np.where(used, variance, np.nan))
     accepted = used_channels(trace, np.isfinite(nu), keep)
     squared = None if trace.accepted is None else squared_innovations(trace)
-    extreme = np.zeros(used.shape[:2], bool) if squared is None else are_extreme(*squared)[keep]
+    rejectable = np.zeros(used.shape[:2], bool) if squared is None else are_extreme(*squared, REJECTABLE)[keep]
     values: dict[str, float] = {}
     names = channel_names(trace, pair[0])
     for k, modality in enumerate(trace.modalities):
         updated = np.asarray(accepted[:, k].any(-1))
-        values[f"updates/{modality}/all"] = float((updated | extreme[:, k]).mean())
+        values[f"updates/{modality}/all"] = float((updated | rejectable[:, k]).mean())
         if (without := absent(trace, modality)[keep]).any():
             values[f"absent updates/{modality}/all"] = float(updated[without].mean())
         channels = np.flatnonzero(used[:, k].sum(0) >= MIN_STEPS)
@@ -88,9 +91,10 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
 
     An update has ``det P / det P+ = det S / det R``, whatever the measurement function, and several updates in turn
     have the product of these ratios: the logarithms of the steps are linear equations for those of the modalities. For
-    modalities that are always used together, they only give the mean of all, ``measurement noise//all``. Several
-    updates at once lack the covariances between the measurements in ``det S``: where the filter also reports the
-    single-modality updates from the common prediction, each has an equation of its own.
+    modalities that are always used together, they only give the mean of all, ``measurement noise//all``, at the steps
+    at which all are used: it would change with the share of rejected measurements. Several updates at once lack the
+    covariances between the measurements in ``det S``: where the filter also reports the single-modality updates from
+    the common prediction, each has an equation of its own.
 
     Only of filters that report their prediction and whose beliefs have a covariance of full rank.
 
@@ -117,8 +121,9 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     if keep.sum() < MIN_STEPS:
         return {}
     values = _by_modality(trace.modalities, channels[keep].astype(np.float64), total[keep])
-    if len(values) < (channels[keep] > 0).any(0).sum():
-        values[""] = float(np.mean(total[keep] / channels.sum(-1)[keep]))
+    complete = keep & (channels == np.isfinite(nu).sum(-1).max(0)).all(-1) & (channels > 0).all(-1)
+    if len(values) < (channels[keep] > 0).any(0).sum() and complete.sum() >= MIN_STEPS:
+        values[""] = float(np.mean(total[complete] / channels.sum(-1)[complete]))
     return _deviations(values)
 
 

@@ -142,7 +142,7 @@ def is_expected(model: ReadingModel, episode: Episode) -> bool:
 def without_outliers(episode: Episode, models: Sequence[ReadingModel]) -> Episode:
     """The episode with interpolated readings instead of isolated ones, of sensors with such ones in the record."""
     changed = {}
-    for model in (model for model in models if model.outliers and is_expected(model, episode) and model.key != CONTROL):
+    for model in (m for m in models if m.outliers and m.channels and is_expected(m, episode) and m.key != CONTROL):
         outliers = model.compare(episode).outliers
         others, steps = np.flatnonzero(episode.present(model.key) & ~outliers), np.flatnonzero(outliers)
         if len(others) and len(steps):

@@ -123,9 +123,9 @@ def test_no_alarm_reads_well() -> None:
 
 
 def test_json_round_trip() -> None:
-    reference = replace(profile(trajectories(30, np.random.default_rng(5))), steps=(90, 100))
+    reference = replace(profile(trajectories(30, np.random.default_rng(5))), steps=(90, 100), task="boat")
     again = HealthyProfile.from_json(json.loads(json.dumps(reference.to_json(), allow_nan=False)))
-    assert (again.data, again.steps) == (reference.data, (90, 100))
+    assert (again.data, again.steps, again.task) == (reference.data, (90, 100), "boat")
     for name in NAMES:
         np.testing.assert_allclose(again.statistics[name], reference.statistics[name], rtol=5e-3)
 

@@ -80,6 +80,8 @@ def test_other_episodes_are_unchanged() -> None:
     assert np.array_equal(without_outliers(NEW, [models()[0]]).observations["gps"], NEW.observations["gps"])
     gone = replace(NEW, observations={"odometry": NEW.observations["odometry"]})
     assert without_outliers(gone, [disturbed()]).observations.keys() == {"odometry"}
+    weak = replace(disturbed(), of_channels=(), of_weak_channels=disturbed().of_channels)
+    assert np.array_equal(without_outliers(NEW, [weak]).observations["gps"], NEW.observations["gps"])
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -115,3 +117,13 @@ def test_some_episodes_have_models_of_the_channels_of_all() -> None:
     (alone,) = fit_reading_models(episodes, ["gps"])
     assert alone.channels == (0, 1)
     assert same.expected(NEW)[:, 0] == pytest.approx(alone.expected(NEW)[:, 0])
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_some_episodes_have_the_kind_of_features_of_all(degree: int) -> None:
+    """Features that explain a channel about as well have other errors than those of the record's model."""
+    gps, _ = models()
+    assert gps.of_channels[0].kind == (False, 0)
+    whole = replace(gps, of_channels=(replace(gps.of_channels[0], degree=degree), *gps.of_channels[1:]))
+    (part,) = fit_reading_models(EPISODES[:6], ["gps"], [whole])
+    assert [model.kind for model in part.of_channels] == [(False, degree), (False, 0)]

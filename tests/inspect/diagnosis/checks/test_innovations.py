@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import beliefscope as bs
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.checks.dynamics import external_dynamics_statistics
-from beliefscope.inspect.diagnosis.checks.innovations import innovation_statistics
+from beliefscope.inspect.diagnosis.checks.innovations import REJECTABLE, innovation_statistics, measurement_noise
 from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_statistics
 from beliefscope.inspect.diagnosis.checks.vectors import stuck
 from beliefscope.inspect.diagnosis.diagnose import diagnose
@@ -196,12 +196,46 @@ def test_modalities_that_are_always_used_together_have_a_mean_measurement_noise(
     assert math.prod(shares) == pytest.approx(1.0)
 
 
+def with_gate(whole: Trace, used: float, noise: float) -> Trace:
+    """A trace with a third modality of variance ``noise``, of which a share is used: each halves the squared volume."""
+    accepted = np.random.default_rng(1).random(len(whole)) < used
+    assert whole.innovation is not None
+    assert whole.innovation_covariance is not None
+    assert whole.predicted_mean is not None
+    assert whole.predicted_covariance is not None
+    nu, s = np.full((len(whole), 1, 2), np.nan), np.full((len(whole), 1, 2, 2), np.nan)
+    nu[:, 0, 0], s[:, 0, 0, 0] = 0.1, 2.0 * noise
+    size = np.where(accepted, 0.5, 1.0) ** (1.0 / whole.estimate_covariance.shape[-1])
+    return replace(
+        whole,
+        modalities=(*whole.modalities, "gps"),
+        innovation=np.concatenate([whole.innovation, nu], axis=1),
+        innovation_covariance=np.concatenate([whole.innovation_covariance, s], axis=1),
+        predicted_mean=whole.predicted_mean[:, [0, 1, 1]],
+        predicted_covariance=whole.predicted_covariance[:, [0, 1, 1]],
+        estimate_covariance=whole.estimate_covariance * size[:, None, None],
+        accepted=np.stack([np.ones(len(whole)), np.ones(len(whole)), accepted], axis=1),
+    )
+
+
+@pytest.mark.parametrize("used", [0.6, 0.3, 0.02])
+def test_the_mean_measurement_noise_does_not_depend_on_the_share_of_used_measurements(used: float) -> None:
+    trace, noise = with_gate(run(Boat(), every=1), used, 1e-4), [*STD["radar"], *STD["compass"], 1e-2]
+    assert trace.innovation is not None
+    assert trace.innovation_covariance is not None
+    values = measurement_noise(trace, trace.innovation, trace.innovation_covariance.astype(np.float64))
+    if used == 0.02:
+        assert "measurement noise//all" not in values, "too few steps with all of them"
+    else:
+        assert values["measurement noise//all"] == pytest.approx(float(np.prod(noise)) ** 0.25, rel=1e-3)
+
+
 def test_rejected_measurements_change_no_covariance() -> None:
     whole = run(Boat())
     gated = replace(whole, accepted=np.where(np.isfinite(whole.innovation).any(-1), 1.0, np.nan))
     assert innovation_statistics(gated) == innovation_statistics(whole)
     gated.accepted[:, 1] = 0.0
-    assert innovation_statistics(gated)["updates/compass/all"] == pytest.approx(0.0, abs=0.02)
+    assert innovation_statistics(gated)["updates/compass/all"] == pytest.approx(REJECTABLE, abs=0.04)
     lost = replace(gated, innovation=gated.innovation + 100.0 * np.sqrt(np.nanmax(gated.innovation_covariance)))
     assert innovation_statistics(lost)["updates/compass/all"] == 1.0, "a correct gate rejects them as well"
 
