@@ -122,7 +122,7 @@ def maps_figure(
         size: cells per side.
         quantity: by default the first one that the filter has.
     """
-    engine = MapEngine(checkpoint, trace)
+    engine = MapEngine(checkpoint, trace, [*steps.values()])
     quantity = quantity or engine.quantities[0]
     maps = {state: engine.map(step, size=size, quantity=quantity) for state, step in steps.items()}
     titles = [title for title, _ in axis_titles(checkpoint.task, checkpoint.task.map_indices)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -20,6 +21,9 @@ Array = NDArray[np.float32]
 Quantity = Literal["likelihood", "posterior"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 """What a map can contain; the first that a filter has is the default."""
+
+MapSteps = Sequence[int] | None
+"""Steps of maps; None: all."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from beliefscope.filters.models.fusion import mixture, only_present
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator
-from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, MapOptions, Quantity
+from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, MapOptions, MapSteps, Quantity
 from beliefscope.inspect.maps.map_statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.maps.plane import OTHERS, Others, Plane, describe_others, other_components, plane_of
@@ -54,20 +54,26 @@ LARGEST = 1024
 """Maximum number of cells per side."""
 
 
-def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quantity | None = None) -> str | None:
+def no_maps(
+    checkpoint: Checkpoint,
+    trace: Trace | None = None,
+    quantity: Quantity | None = None,
+    steps: MapSteps = None,
+) -> str | None:
     """One-line reason why a filter has no maps of a quantity, or None.
 
     Args:
         trace: a trace of the filter; required for an external filter, whose maps are computed from its Gaussians and
             particles.
         quantity: by default either.
+        steps: of the maps; by default all.
     """
     subject = "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
     if trace is not None and (only := trace.settings.get("standalone")):
         return f"{only} standalone {subject}; the maps of the run with all modalities show {only}"
     if isinstance(checkpoint, ExternalFilter):
         wanted = (quantity,) if quantity else QUANTITIES
-        reasons = [_no_density(checkpoint, trace, each) for each in wanted]
+        reasons = [_no_density(checkpoint, trace, each, steps) for each in wanted]
         if None not in reasons:
             return f"filter {checkpoint.name!r} {subject}: {reasons[-1]}"
     elif not KINDS[checkpoint.kind].has_covariance:
@@ -76,13 +82,13 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
     return None
 
 
-def missing_quantities(checkpoint: Checkpoint, trace: Trace) -> dict[Quantity, str]:
+def missing_quantities(checkpoint: Checkpoint, trace: Trace, steps: MapSteps = None) -> dict[Quantity, str]:
     """Quantities without maps of this filter, with the reasons (``no_maps``)."""
-    reasons = {quantity: no_maps(checkpoint, trace, quantity) for quantity in QUANTITIES}
+    reasons = {quantity: no_maps(checkpoint, trace, quantity, steps) for quantity in QUANTITIES}
     return {quantity: reason for quantity, reason in reasons.items() if reason is not None}
 
 
-def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quantity) -> str | None:
+def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quantity, steps: MapSteps) -> str | None:
     """Reason why an external filter has no density of a quantity, from Gaussians or particles; None if it has."""
     if trace is None or not trace.has_covariance:
         return "it reports no covariance"
@@ -100,8 +106,10 @@ def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quant
         covariances = trace.estimate_covariance[:, None]
         if trace.modalities_with_posterior:
             covariances = np.concatenate([trace.modality_covariance, covariances], axis=1)
-    degenerate = np.linalg.eigvalsh(covariances.astype(np.float64)).min(axis=(1, 2)) <= 0.0
-    return f"a covariance of step {int(degenerate.argmax())} is not positive definite" if degenerate.any() else None
+    wanted = np.arange(len(covariances)) if steps is None else np.array(steps)
+    degenerate = np.linalg.eigvalsh(covariances[wanted].astype(np.float64)).min(axis=(1, 2)) <= 0.0
+    step = wanted[degenerate.argmax()]
+    return f"a covariance of step {step} is not positive definite" if degenerate.any() else None
 
 
 class MapEngine:
@@ -110,9 +118,9 @@ class MapEngine:
     Observations are encoded for all steps at once; ``GridEvaluator`` reuses values that depend on the grid.
     """
 
-    def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
+    def __init__(self, checkpoint: Checkpoint, trace: Trace, steps: MapSteps = None) -> None:
         """Raises BadInput if the filter has no maps (``no_maps``), or if the trace is from another checkpoint."""
-        if why := no_maps(checkpoint, trace):
+        if why := no_maps(checkpoint, trace, steps=steps):
             raise BadInput(why)
         check_origin(checkpoint, trace)
         self.checkpoint = checkpoint
@@ -124,8 +132,8 @@ class MapEngine:
         self._planes: dict[tuple[str, ...], Plane] = {}
         self._anchors = trace.anchors
         self._present = ~absent_modalities(trace)  # (T, K)
-        missing = missing_quantities(checkpoint, trace)
-        self.quantities = tuple(quantity for quantity in QUANTITIES if quantity not in missing)
+        self._missing = missing_quantities(checkpoint, trace, steps)
+        self.quantities = tuple(quantity for quantity in QUANTITIES if quantity not in self._missing)
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
@@ -182,7 +190,7 @@ class MapEngine:
         quantity = quantity or self.quantities[0]
         check_name("map quantity", quantity, QUANTITIES)
         if quantity not in self.quantities:
-            raise BadInput(no_maps(self.checkpoint, self.trace, quantity) or "")
+            raise BadInput(self._missing[quantity])
         trace = self.trace
         check_step(step, len(trace), "episode")
         if not 2 <= size <= LARGEST:

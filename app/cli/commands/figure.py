@@ -140,7 +140,7 @@ def figure(
     selection = map_steps(trace.episode, trace.episode_index)
     extra: dict[str, Any] = {}
     if kind == "maps":
-        if reason := no_maps(checkpoint, trace, quantity):
+        if reason := no_maps(checkpoint, trace, quantity, [*selection.values()]):
             raise BadInput(reason)
         with_contact = "contact" in trace.task.covariates
         if with_contact and False not in selection:

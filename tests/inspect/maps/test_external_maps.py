@@ -18,6 +18,7 @@ from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.likelihood import log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.inspect.figures import paper
 from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, trace
 
@@ -85,3 +86,19 @@ def test_likelihood_of_an_adapter_is_checked(particles: Trace) -> None:
         BadInput, match=r"at the likelihood of step 0 returns shape \(1, 2\), expected \(2, 3\) numbers"
     ):
         log_likelihood(external(log_likelihood=wrong), particles.episode, 0, np.zeros((3, 3), np.float32), 2)
+
+
+def test_a_step_without_a_positive_definite_covariance_has_no_map_and_the_others_have(particles: Trace) -> None:
+    covariance = np.tile(1e-4 * np.eye(3, dtype=np.float32), (len(particles), 1, 1))
+    covariance[4] *= -1.0
+    filter_ = UnavailableFilter("mine", particles.checkpoint_hash, particles.task)
+    run = replace(
+        particles,
+        estimate_covariance=covariance,
+        modality_mean=np.full_like(particles.modality_mean, np.nan),
+        **dict.fromkeys(("particles", "log_weights", "prior_log_weights", "log_likelihood")),
+    )
+    assert "a covariance of step 4 is not positive definite" in (no_maps(filter_, run) or "")
+    assert "a covariance of step 4 is not positive definite" in (no_maps(filter_, run, "posterior", [4, 5]) or "")
+    assert no_maps(filter_, run, "posterior", [5]) is None
+    assert paper.maps_figure(filter_, run, {False: 5}, 5, "posterior").axes
