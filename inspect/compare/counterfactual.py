@@ -96,7 +96,7 @@ class Counterfactual(Diagnostic):
 
     @property
     def verdict(self) -> str:
-        if not self.distance.any() and not self.sigmas.any():
+        if not self.distance.any() and not np.nan_to_num(self.sigmas).any():
             return f"With {self.intervention}, nothing changed."
         peak = int(self.distance.argmax())
         largest = self.task.main_error.text(self.distance[peak])
@@ -113,7 +113,7 @@ class Counterfactual(Diagnostic):
 
     def _recovery(self) -> str:
         """Largest difference in standard deviations, and when the run with the intervention recovered."""
-        largest = float(self.sigmas[self.first :].max())
+        largest = float(np.nanmax(self.sigmas[self.first :]))  # NaN where the covariance is unknown
         text = f"at most {largest:.1f} standard deviations of the original run"
         if largest <= RECOVERED or self.to >= len(self.sigmas):
             return text
@@ -298,7 +298,8 @@ def _divergence(original: Trace, counterfactual: Trace, difference: Array) -> Ar
     n = s.shape[-1]
     trace_term = np.einsum("tii->t", solved[..., :n])
     quadratic = np.einsum("tn,tn->t", difference, solved[..., n])
-    volume = np.linalg.slogdet(s_counterfactual).logabsdet - np.linalg.slogdet(s).logabsdet
+    with np.errstate(invalid="ignore"):  # unknown covariances are NaN
+        volume = np.linalg.slogdet(s_counterfactual).logabsdet - np.linalg.slogdet(s).logabsdet
     return 0.5 * (trace_term + quadratic - n + volume)
 
 

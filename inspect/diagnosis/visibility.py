@@ -10,7 +10,7 @@ import numpy as np
 from beliefscope.inspect.diagnosis.cause import Recovery
 from beliefscope.inspect.diagnosis.checks.modules import component_errors
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
-from beliefscope.inspect.statistics.measures import counted, errors, nees
+from beliefscope.inspect.statistics.measures import counted, errors, known_mean, nees
 from beliefscope.inspect.trace import Trace
 
 NEES = "nees/fused/all"
@@ -68,14 +68,14 @@ def effect_ratios(before: Sequence[Trace], after: Sequence[Trace]) -> dict[str, 
 
 
 def _totals(traces: Sequence[Trace]) -> dict[str, float]:
-    """Statistic of an error, or ``NEES`` -> sum of the squared errors or of the NEES over the counted steps."""
+    """Statistic of an error, or ``NEES`` -> sum of the squared errors or mean of the NEES over the counted steps."""
     task = traces[0].task
     units = np.array([component.unit for component in task.components])
     squares = sum(np.square(errors(trace)[counted(trace), -1]).sum(0) for trace in traces)
     totals = {name: float(np.sum(squares[units == unit])) for unit, name in BY_UNIT.items() if unit in units}
     totals |= {name: float(squares[i]) for name, i in component_errors(task).items()}
     if all(trace.has_covariance for trace in traces):
-        totals[NEES] = float(sum(nees(trace)[counted(trace), -1].sum() for trace in traces))
+        totals[NEES] = known_mean(np.concatenate([nees(trace)[counted(trace), -1] for trace in traces]))
     return totals
 
 

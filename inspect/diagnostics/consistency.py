@@ -205,7 +205,9 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if not trace.has_covariance or not np.isfinite(trace.estimate_covariance).any():
         return f"filter {trace.filter} has no covariance to compare its errors with"
-    return None if measures.known_components(trace) else measures.UNKNOWN_TRUTH
+    if not measures.known_components(trace):
+        return measures.UNKNOWN_TRUTH
+    return None if (reason := measures.no_covariance(trace)) is None else f"filter {trace.filter} {reason}"
 
 
 def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> Consistency:
@@ -223,8 +225,9 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
     ]
     by_layer = []
     for k, layer, phase, where in cells:
-        steps = {name: values[where, k] for name, values in pooled.items()}
-        by_layer.append(_summarise(layer, phase, owner[where], steps, len(cells)))
+        known = where & ~np.isnan(pooled["nees"][:, k])
+        steps = {name: values[known, k] for name, values in pooled.items()}
+        by_layer.append(_summarise(layer, phase, owner[known], steps, len(cells)))
     keep, has_nis = drawn_steps(traces), nis_of(first) is not None
     return Consistency(
         **fields_of(traces),
@@ -247,7 +250,7 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
     nees, nis = measures.nees(trace), nis_of(trace)
     phases = measures.long_phases(trace)
     values = {
-        f"nees/{layer}/{phase}": float(nees[mask, k].mean())
+        f"nees/{layer}/{phase}": measures.known_mean(nees[mask, k])
         for k, layer in enumerate(measures.layers(trace))
         for phase, mask in phases.items()
     }

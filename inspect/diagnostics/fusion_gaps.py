@@ -168,7 +168,7 @@ def _prior(traces: Sequence[Trace]) -> Reason:
     """
     sums = np.array([_prior_weights(trace) for trace in traces])  # (R, 2, 2)
     logarithms = jackknife(sums, lambda s: np.log(s[..., 0, 0] * s[..., 1, 1] / (s[..., 0, 1] * s[..., 1, 0])))
-    nees = np.concatenate([measures.nees(trace)[measures.counted(trace), -1] for trace in traces]).mean()
+    nees = measures.known_mean(np.concatenate([measures.nees(trace)[measures.counted(trace), -1] for trace in traces]))
     return _of_fusion(
         PRIOR,
         "number of times that the fused mean counts the prior",

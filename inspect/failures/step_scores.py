@@ -215,7 +215,7 @@ def _regret(trace: Trace) -> Array:
 
 
 def _no_covariance(trace: Trace) -> str | None:
-    return None if trace.has_covariance else "this filter has no covariance"
+    return None if (reason := measures.no_covariance(trace)) is None else f"this filter {reason}"
 
 
 def _no_particles(trace: Trace) -> str | None:

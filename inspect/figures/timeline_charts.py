@@ -181,7 +181,8 @@ def _signed_error(trace: Trace, component: int, beta: bool) -> Chart | str:
 def _nees(trace: Trace, component: int, beta: bool) -> Chart | str:
     series = _sources(trace, measures.nees(trace)) if trace.has_covariance else []
     if not series:
-        return measures.UNKNOWN_TRUTH if trace.has_covariance else "the filter has no covariance"
+        reason = measures.no_covariance(trace)
+        return measures.UNKNOWN_TRUTH if reason is None else f"the filter {reason}"
     return Chart("NEES/n", "", series, bounds=nees_bounds(len(trace.task.components), 1))
 
 

@@ -79,9 +79,32 @@ def root(squared: Array) -> Array:
 
 
 def covariances(trace: Trace) -> Array:
-    """(T, L, n, n): each layer's covariance, invertible (``with_floor``); NaN for filters without covariances."""
-    both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
+    """(T, L, n, n): each layer's covariance, invertible (``with_floor``); NaN where it is unknown.
+
+    Zeros are unknown, except those of particles, which may collapse.
+    """
+    both = reported_covariances(trace)
+    if trace.particles is None:
+        both = np.where((both == 0.0).all((-2, -1), keepdims=True), np.nan, both)
     return with_floor(both)
+
+
+def reported_covariances(trace: Trace) -> NDArray[Any]:
+    """(T, L, n, n): each layer's covariance as the filter reports it."""
+    return np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
+
+
+def no_covariance(trace: Trace) -> str | None:
+    """Reason why the filter's covariances have no NEES at any step, or None."""
+    if not trace.has_covariance:
+        return "has no covariance"
+    return "reports a variance of zero at every step" if _has_zero(trace)[:, -1].all() else None
+
+
+def _has_zero(trace: Trace) -> Mask:
+    """(T, L): whether a known component has a variance of zero, which is unknown except that of particles."""
+    reported = of_components(reported_covariances(trace), known_components(trace))
+    return np.asarray((np.diagonal(reported, axis1=-2, axis2=-1) == 0.0).any(-1) & (trace.particles is None))
 
 
 def errors(trace: Trace) -> Array:
@@ -131,14 +154,14 @@ def of_components(covariance: NDArray[Any], components: Sequence[int]) -> NDArra
 def nees(trace: Trace) -> Array:
     """(T, L): ``e^T S^-1 e / n`` of the n known components; mean 1 if consistent, above 1 if overconfident.
 
-    NaN without a covariance or a true state.
+    NaN without a covariance or a true state, or with a variance of zero.
     """
     error, known = errors(trace), known_components(trace)
     if not trace.has_covariance or not known:
         return np.full(error.shape[:2], np.nan)
     error = error[..., known]
     white = np.linalg.solve(of_components(covariances(trace), known), error[..., None])[..., 0]
-    return np.einsum("tln,tln->tl", error, white) / len(known)
+    return np.where(_has_zero(trace), np.nan, np.einsum("tln,tln->tl", error, white) / len(known))
 
 
 def nll(trace: Trace) -> Array:

@@ -17,7 +17,7 @@ def phase_summaries(run: Trace) -> dict[str, dict[str, Any]]:
         name: {
             "steps": int(mask.sum()),
             f"rmse_{main.key}": _by_layer(run, np.sqrt(np.mean(main.factor**2 * error[mask] ** 2, axis=0))),
-            "nees": _by_layer(run, nees[mask].mean(0)),
+            "nees": _by_layer(run, np.array([measures.known_mean(each) for each in nees[mask].T])),
             "effective_weights": _weights(run, mask),
         }
         for name, mask in measures.phases(run).items()

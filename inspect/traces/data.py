@@ -133,8 +133,13 @@ class Trace:
 
     @property
     def has_covariance(self) -> bool:
-        """Whether the estimates have a covariance; those of an LSTM or transformer do not."""
-        return not np.isnan(self.estimate_covariance).all() or not len(self)
+        """Whether the estimates have a covariance; those of an LSTM or transformer do not.
+
+        Zeros are unknown, except those of particles, which may collapse.
+        """
+        covariance = self.estimate_covariance
+        unknown = np.isnan(covariance) if self.particles is not None else np.isnan(covariance) | (covariance == 0.0)
+        return not unknown.all() or not len(self)
 
     @property
     def modalities_with_posterior(self) -> tuple[str, ...]:

@@ -148,7 +148,7 @@ def _components(trace: Trace) -> list[dict[str, Any]]:
     """Truth, and mean and standard deviation (T, L) of each component, in units for display."""
     means = trace.task.near(measures.means(trace), trace.episode.states[:, None])
     covariances = measures.covariances(trace)
-    std = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+    std = measures.root(np.diagonal(covariances, axis1=-2, axis2=-1))
     return [
         {
             "label": component.label,

@@ -74,4 +74,6 @@ def _gaussian_nll(error: Array, covariance: Array) -> Array:
     """``(e^T S^-1 e + ln det S + n ln 2 pi) / 2`` of errors (..., n)."""
     squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
     n = error.shape[-1]
-    return np.asarray(0.5 * (squared + np.linalg.slogdet(covariance).logabsdet + n * np.log(2.0 * np.pi)))
+    with np.errstate(invalid="ignore"):  # unknown covariances are NaN
+        volume = np.linalg.slogdet(covariance).logabsdet
+    return np.asarray(0.5 * (squared + volume + n * np.log(2.0 * np.pi)))

@@ -103,3 +103,11 @@ def test_curves_of_angles_are_in_the_turn_of_the_truth_and_unreported_updates_ha
     truth, *_ = [c.values for c in curves if c.chart == "heading" and c.name == "truth"]
     assert np.abs(estimate - truth).max() < 90.0
     assert {c.name for c in curves if c.chart.startswith("Distance between")} == {"fused"}
+
+
+def test_steps_with_an_unknown_covariance_are_left_out_of_the_verdict(replay: Replay) -> None:
+    covariance = replay.original.estimate_covariance.copy()
+    covariance[::2] = np.nan
+    run = replace(replay.original, estimate_covariance=covariance)
+    result = compare(run, run, Intervention(2, 6))
+    assert result.verdict.endswith("nothing changed.")

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostics.consistency import Consistency, consistency
+from beliefscope.inspect.diagnostics.consistency import Consistency, consistency, why_not
 from beliefscope.inspect.diagnostics.layer_consistency import number
+from beliefscope.inspect.failures.step_scores import scores_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
     gaussian_crps,
@@ -64,6 +65,34 @@ def test_a_covariance_that_is_not_positive_definite_is_named(entry: tuple[int, i
     result = consistency([replace(run, estimate_covariance=covariance)])
     assert result.verdict.startswith("The covariance is not positive definite in 5 steps. No healthy record")
     assert result.alarms[0] == "the covariance is not positive definite in 5 steps"
+
+
+def test_steps_with_a_covariance_of_zeros_are_unknown_as_in_evaluate() -> None:
+    (run,) = plant.simulated(1)
+    covariance = run.estimate_covariance.copy()
+    covariance[-5:] = 0.0
+    covariance[-8:-5, 0] = covariance[-8:-5, :, 0] = 0.0
+    result = consistency([replace(run, estimate_covariance=covariance)])
+    known = replace(
+        run, estimate_covariance=np.where(np.arange(len(run))[:, None, None] < len(run) - 8, covariance, np.nan)
+    )
+    assert result.entry("fused").steps == int(measures.counted(run)[:-8].sum())
+    assert result.entry("fused").nees == consistency([known]).entry("fused").nees
+    assert np.isnan(measures.nees(replace(run, estimate_covariance=covariance))[-8:, -1]).all()
+    assert result.alarms == ()
+
+
+@pytest.mark.parametrize(
+    ("components", "reason"), [(slice(None), "has no covariance"), (0, "reports a variance of zero at every step")]
+)
+def test_covariances_of_zeros_are_no_covariances(components: int | slice, reason: str) -> None:
+    (run,) = plant.simulated(1)
+    covariance = run.estimate_covariance.copy()
+    covariance[:, components] = covariance[..., components] = 0.0
+    zeros = replace(run, estimate_covariance=covariance)
+    assert reason in (why_not(zeros) or "")
+    assert scores_of(run.task)["nees"].why_not(zeros) == f"this filter {reason}"
+    assert why_not(run) is None
 
 
 def test_nll_of_a_consistent_filter_is_the_entropy(exact: Consistency) -> None:
