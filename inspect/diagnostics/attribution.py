@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.engine import Progress
 
 TOLERANCE = 0.02
 """Maximum error of the sum of integrated gradients, relative to the change that they explain."""
@@ -21,7 +22,11 @@ BATCH = 64
 
 
 def integrate(
-    function: Callable[..., Tensor], inputs: tuple[Tensor, ...], baselines: tuple[Tensor, ...], min_change: float
+    function: Callable[..., Tensor],
+    inputs: tuple[Tensor, ...],
+    baselines: tuple[Tensor, ...],
+    min_change: float,
+    progress: Progress = None,
 ) -> tuple[tuple[Tensor, ...], int, float]:
     """Integrated gradients ``(x_i - b_i) mean over a of df/dx_i(b + a (x - b))`` (Sundararajan et al., 2017).
 
@@ -33,6 +38,7 @@ def integrate(
         function: batches (B, ...) of the inputs to (B,).
         inputs, baselines: (1, ...) each.
         min_change: minimum reference for relative errors.
+        progress: called with the part of ``MAX_POINTS`` that is done.
 
     Returns:
         Attributions (1, ...), number of gradients, and relative error of the sum.
@@ -60,9 +66,13 @@ def integrate(
     total = [torch.zeros_like(x) for x in inputs]
     final_errors, points = torch.zeros(0, dtype=torch.float64), 0
     while len(edges):
-        segments = [attribute(part) for part in edges.split(BATCH // POINTS)]
+        segments = []
+        for part in edges.split(BATCH // POINTS):
+            segments.append(attribute(part))
+            points += POINTS * len(part)
+            if progress is not None:
+                progress(points / MAX_POINTS)
         errors = torch.cat([error for _, error in segments])
-        points += POINTS * len(edges)
         all_errors = torch.cat([final_errors, errors])
         gap = max(abs(float(all_errors.sum())), float(all_errors.norm())) / change
         limit = min(0.5 * TOLERANCE * change / len(all_errors) ** 0.5, float(errors.abs().median()))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -228,20 +229,21 @@ def saliency(
     if isinstance(checkpoint, ExternalFilter):
         single_step = ExternalStep(checkpoint, trace, step)
     else:
-        single_step = SingleStep(Replay(checkpoint, trace, lambda share: report(0.2 * share)), step, at)
+        single_step = SingleStep(Replay(checkpoint, trace, lambda share: report(0.05 * share)), step, at)
     sides = [side for values in single_step.inputs if values.ndim == 3 for side in values.shape[1:]]
     if not 1 <= window <= min(sides, default=window):
         raise BadInput(f"window must be 1 to {min(sides)} pixels, the size of the image, not {window}")
     explained = single_step.target(target or _largest_error(trace, checkpoint, step))
-    report(0.2)
+    report(0.05)
     occlusion = occlude(explained, single_step.inputs, single_step.means, window)
-    report(0.3)
+    report(0.1)
     attributions = []
     if isinstance(explained, Target):  # the steps of an external filter need not be differentiable
         names = list(BASELINES) if sides else [MEAN]
         for i, name in enumerate(names):
-            attributions.append(_attribution(explained, name))
-            report(0.3 + 0.7 * (i + 1) / len(names))
+            part = partial(_part, report, i, len(names))
+            attributions.append(_attribution(explained, name, part))
+            part(1.0)
     with torch.no_grad():
         value = float(explained(*single_step.inputs))
     components = [c.name for c in checkpoint.task.components]
@@ -264,11 +266,16 @@ def saliency(
     )
 
 
-def _attribution(explained: Target, name: str) -> Attribution:
+def _part(report: Callable[[float], None], index: int, count: int, share: float) -> None:
+    """Report the share that is done of one of several attributions, most of the time."""
+    report(0.1 + 0.9 * (index + share) / count)
+
+
+def _attribution(explained: Target, name: str, progress: Progress) -> Attribution:
     """Integrated gradients from the baseline of this name."""
     step = explained.step
     baselines = step.baseline(black=name == "black")
-    integrated, points, gap = integrate(explained, step.inputs, baselines, MIN_CHANGE / explained.factor)
+    integrated, points, gap = integrate(explained, step.inputs, baselines, MIN_CHANGE / explained.factor, progress)
     with torch.no_grad():
         value = float(explained(*baselines))
     return Attribution(name, value, _by_modality(step, integrated), points, gap)

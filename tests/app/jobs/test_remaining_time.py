@@ -1,4 +1,4 @@
-"""Estimates of the time to the end of a task with constant speed after its start-up."""
+"""Estimates of the time to the end of a task after its start-up."""
 
 from __future__ import annotations
 
@@ -16,3 +16,13 @@ def test_startup_and_earlier_progress_do_not_count(startup: float, done: float) 
     assert time_left.update(done + 0.04, startup + 4.0) is None
     assert time_left.update(done + 0.1, startup + 10.0) == pytest.approx(100.0 * (0.9 - done))
     assert time_left.update(1.0, startup + 100.0 * (1.0 - done)) == 0.0
+
+
+def test_a_slow_part_has_its_own_rate() -> None:
+    """A part of 100 s begins after 0.8 of the progress, which took 10 s."""
+    time_left = RemainingTime()
+    for second in range(11):
+        time_left.update(0.08 * second, float(second))
+    assert time_left.update(0.83, 25.0) == pytest.approx(85.0)
+    assert time_left.update(0.83, 60.0) == pytest.approx(0.17 * 59.0 / 0.75)
+    assert time_left.update(0.9, 60.0) == pytest.approx(50.0)

@@ -19,7 +19,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, pretrained_path
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
+from beliefscope.inspect.diagnostics.attribution import MAX_POINTS, TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.saliency import ENTRY, MIN_CHANGE, Saliency, saliency
 from beliefscope.inspect.diagnostics.single_step import SingleStep, channels_of
 from beliefscope.inspect.statistics import measures
@@ -99,7 +99,10 @@ def test_steep_segments_of_the_path_are_bisected() -> None:
     def steep(x: Tensor) -> Tensor:
         return torch.relu(1000.0 * (x[:, 0] - 1.234)).clamp_max(10.0) + 0.1 * x[:, 1]
 
-    result, points, gap = integrate(steep, inputs, baselines, 1e-3)
+    parts: list[float] = []
+    result, points, gap = integrate(steep, inputs, baselines, 1e-3, parts.append)
+    assert parts == sorted(parts)
+    assert parts[-1] == points / MAX_POINTS
     assert 32 < points < 400
     assert gap < TOLERANCE
     # The increase covers 0.5 % of the path, too little for a uniform grid.
