@@ -23,4 +23,4 @@ def html_paragraph(text: str, strong: bool = False) -> str:
 def _text(value: object) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "&ndash;"
-    return f"{value:.3g}" if isinstance(value, float) else escape(str(value))
+    return f"{value:z.3g}" if isinstance(value, float) else escape(str(value))

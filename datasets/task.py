@@ -150,7 +150,7 @@ class MainError:
 
     def text(self, value: float, digits: int = 2) -> str:
         """A value as displayed: ``1.25 cm``."""
-        return f"{self.factor * value:.{digits}f} {self.unit}".rstrip()
+        return f"{self.factor * value:z.{digits}f} {self.unit}".rstrip()
 
 
 def _in_metres(components: Iterable[Component]) -> tuple[Component, ...]:

@@ -14,8 +14,8 @@ def capitalised(text: str) -> str:
 
 
 def percent(share: float, form: str = ".0f") -> str:
-    """A share in percent: ``38 %``. form: format of the number."""
-    return f"{100.0 * share:{form}} %"
+    """A share in percent: ``38 %``. form: format of the number; zero has no minus sign."""
+    return f"{100.0 * share:{form.replace('.', 'z.', 1)}} %"
 
 
 def typeset(text: str) -> str:

@@ -35,7 +35,7 @@ class Alignment:
 
     def __str__(self) -> str:
         x, y = self.offset
-        return f"moved {', '.join(self.moved)} by ({x:+.3f}, {y:+.3f}) m; the episodes differ by {self.spread:.3f} m"
+        return f"moved {', '.join(self.moved)} by ({x:+z.3f}, {y:+z.3f}) m; the episodes differ by {self.spread:.3f} m"
 
 
 def move(task: Task, episode: Episode, offset: Array, keys: Sequence[str]) -> Episode:

@@ -192,7 +192,7 @@ def _feature_findings(task: Task, summary: Mapping[str, Any], features: Array, i
     for i, (modality, kind) in enumerate(itertools.product(images, ("brightness", "contrast"))):
         if severity[i] > 1.0:
             channel = Channel(modality, task.modalities[modality][0], modality)
-            text = f"{kind} of the {modality} differs by {difference[i]:+.1f} std of the training data's gray levels"
+            text = f"{kind} of the {modality} differs by {difference[i]:+z.1f} std of the training data's gray levels"
             result.append(Finding(channel, float(severity[i]), text))
     pairs = itertools.combinations(channels(task), 2)
     for (a, b), value in zip(pairs, severity[2 * len(images) :], strict=True):

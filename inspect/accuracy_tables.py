@@ -66,4 +66,4 @@ def _number(value: float | None) -> str | None:
     """Two decimals, or three significant digits of a smaller value, such as an error in rad/s."""
     if value is None:
         return None
-    return f"{value:8.2f}" if value == 0.0 or abs(value) >= 0.1 else f"{value:8.3g}"
+    return f"{value:z8.2f}" if value == 0.0 or abs(value) >= 0.1 else f"{value:z8.3g}"

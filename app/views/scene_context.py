@@ -251,5 +251,5 @@ def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:
         add_lines(server, path, lines, GRAY, thickness)
     unit, factor = task.main_error.conversion
     for name, axis, edge in zip(task.map_components, floor.axes, floor.high, strict=True):
-        text = f"{display_name(name)} {round(factor * edge, 6):g} {unit}"
+        text = f"{display_name(name)} {round(factor * edge, 6):zg} {unit}"
         server.scene.add_label(f"/plane/{name}", text, position=axis[1], **SMALL_LABEL)

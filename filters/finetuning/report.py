@@ -58,7 +58,7 @@ def held_out_rows(record: Mapping[str, Any]) -> list[list[str | float | None]]:
 def _difference(before: float | None, after: float | None, key: str) -> str | None:
     if before is None or after is None:
         return None
-    return f"{after - before:+.2f}" if key in BELIEF or not before else percent(after / before - 1, "+.0f")
+    return f"{after - before:+z.2f}" if key in BELIEF or not before else percent(after / before - 1, "+.0f")
 
 
 def module_table(

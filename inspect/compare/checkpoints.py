@@ -329,18 +329,18 @@ def _change_texts(d: Difference) -> tuple[str, str, str]:
     """Values, change and interval as text: of coverage in points, of the NLL in nats, of others in percent."""
     before, after, unit = d.display
     if d.measure in ("coverage95", "miscalibration"):
-        texts, change_unit = [f"{100 * x:+.1f}" for x in d.change], "points"
+        texts, change_unit = [f"{100 * x:+z.1f}" for x in d.change], "points"
     elif d.measure == "nll":
-        texts, change_unit = [f"{x:+.3g}" for x in d.change], unit
+        texts, change_unit = [f"{x:+z.3g}" for x in d.change], unit
     else:
         texts, change_unit = [_factor(x) for x in (d.effect, d.low, d.high)], "%"
     change, low, high = texts
-    return f"{before:.3g} -> {after:.3g} {unit}".rstrip(), f"{change} {change_unit}", f"{low} to {high}"
+    return f"{before:z.3g} -> {after:z.3g} {unit}".rstrip(), f"{change} {change_unit}", f"{low} to {high}"
 
 
 def _factor(effect: float) -> str:
     """Logarithm of a factor as change in percent."""
-    return f"{100 * math.expm1(min(effect, 30.0)):+.3g}"
+    return f"{100 * math.expm1(min(effect, 30.0)):+z.3g}"
 
 
 def _numbers(d: Difference) -> tuple[Value, ...]:

@@ -118,5 +118,5 @@ def _broken_law(case: Case) -> str:
             if law.mistake:
                 return law.mistake.format(display_name(name.split("/")[1]))
             label = label_of(name, case.inputs.checkpoint.task).rstrip(",")
-            return f"{capitalised(label)} is {median:.2g}, in a correct filter {law.expected:.0f}"
+            return f"{capitalised(label)} is {median:z.2g}, in a correct filter {law.expected:.0f}"
     return ""

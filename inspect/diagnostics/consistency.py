@@ -131,7 +131,7 @@ class Consistency(RunDiagnostic):
         strongest = max(colored, key=lambda test: abs(test.autocorrelation))
         size = number(math.sqrt(self.entry(strongest.modality).nis))
         subject = ", ".join(dict.fromkeys(map(display_name, (strongest.modality, strongest.component))))
-        where = f"{subject}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
+        where = f"{subject}: autocorrelation {strongest.autocorrelation:z.2f} at lag 1"
         text = f"Innovations are not white ({where}) and {size} times as large as predicted"
         if strongest.autocorrelation > 0.2:
             text += ": errors persist over steps, but the filter treats them as independent"

@@ -133,7 +133,7 @@ class Conventions(Diagnostic):
 
     def _effect(self, i: int, j: int) -> str:
         low, high = self.low[i, j], min(self.high[i, j], 1.0)
-        interval = "" if np.isnan(low) else f" ({100 * low:.0f} to {100 * high:.0f})"
+        interval = "" if np.isnan(low) else f" ({100 * low:z.0f} to {100 * high:z.0f})"
         return f"the {self.errors[j]} error falls by {percent(self.share[i, j])}{interval}"
 
     def tables(self) -> list[Table]:

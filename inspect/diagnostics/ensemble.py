@@ -107,7 +107,7 @@ class Ensemble(Diagnostic):
         best = max(self.components, key=lambda c: c.correlation)
         predictive = best.correlation > 0.3
         text += " Its spread " + ("predicts" if predictive else "does not predict") + " which steps have large errors"
-        return f"{text} (correlation {best.correlation:.2f})."
+        return f"{text} (correlation {best.correlation:z.2f})."
 
     def tables(self) -> list[Table]:
         rows = [

@@ -94,7 +94,7 @@ class FusionEfficiency(RunDiagnostic):
             f"{display_name(name)} {main.text(x)}"
             for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)
         ]
-        errors = f"{', '.join(alone)}; correlation {total.correlation[0]:.2f}"
+        errors = f"{', '.join(alone)}; correlation {total.correlation[0]:z.2f}"
         sentence = (
             f"{main.title} RMSE {main.text(total.fused[0])}{self._gain()}; the standalone errors ({errors}) allow "
             f"{main.text(total.best[0])}: efficiency {total.efficiency[0]:.2f}"

@@ -125,7 +125,7 @@ def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
     for k, name in enumerate(traces[0].modalities):
         i, has = int(np.abs(value[k]).argmax()), counts[:, k] > 0
         factor, factor_low, factor_high = map(float, mean_interval(nees[has, k], counts[has, k]))
-        size = f"{scale[i] * bias[k, i]:+.2f} {units[i]}"
+        size = f"{scale[i] * bias[k, i]:+z.2f} {units[i]}"
         relevant = abs(value[k, i]) > MIN_BIAS and (low[k, i] > 0.0 or high[k, i] < 0.0)
         reasons.append(
             Reason(

@@ -335,7 +335,7 @@ def _numbers(value: float, *healthy: float) -> list[str]:
 
 
 def _number(value: float, digits: int = 2) -> str:
-    return f"{value:.0f}" if 10 ** (digits - 1) <= abs(value) < LARGE else f"{value:.{digits}g}"
+    return f"{value:.0f}" if 10 ** (digits - 1) <= abs(value) < LARGE else f"{value:z.{digits}g}"
 
 
 def _amount(number: str, unit: str) -> str:

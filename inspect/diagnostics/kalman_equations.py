@@ -99,7 +99,7 @@ class KalmanEquations(Diagnostic):
                 text = f"the Jacobian of {display_name(name)} differs from finite differences by {percent(error)}"
                 texts.append(f"{text}{self._part(k)}")
             elif slope <= OPPOSITE:
-                texts.append(f"corrections with {display_name(name)} have the wrong sign (slope {slope:.2f})")
+                texts.append(f"corrections with {display_name(name)} have the wrong sign (slope {slope:z.2f})")
         return texts
 
     def _of_covariances(self) -> list[str]:

@@ -195,7 +195,7 @@ class MapSurvey(Diagnostic):
 
 def _text(value: float, unit: str) -> str:
     """A number with three significant digits and its unit."""
-    return f"{value:.3g} {unit}".rstrip()
+    return f"{value:z.3g} {unit}".rstrip()
 
 
 def _median(values: Array) -> float:

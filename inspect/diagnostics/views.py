@@ -194,7 +194,7 @@ def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Val
     """
 
     def text(value: Value) -> str:
-        return "-" if value is None or value != value else f"{value:.3g}" if isinstance(value, float) else str(value)
+        return "-" if value is None or value != value else f"{value:z.3g}" if isinstance(value, float) else str(value)
 
     cells = [list(columns), *([text(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]

@@ -169,7 +169,8 @@ class WeightAudit(RunDiagnostic):
         effect = "would" if low > 100.0 * MIN_REGRET else "might" if high > 100.0 * MIN_REGRET else "would hardly"
         return (
             f"The best constant weights by phase {effect} reduce the error: {best} "
-            f"with them, from which the filter's differs by {value:+.1f} % (95 % interval {low:+.1f} to {high:+.1f} %)."
+            f"with them, from which the filter's differs by {value:+z.1f} % "
+            f"(95 % interval {low:+z.1f} to {high:+z.1f} %)."
         )
 
     @property
@@ -295,9 +296,9 @@ def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightA
 def _description(correlation: Correlation) -> str:
     where = f" in {display_name(correlation.component)}" if correlation.component else ""
     interval = (
-        "" if math.isnan(correlation.low) else f" (95 % interval {correlation.low:.2f} to {correlation.high:.2f})"
+        "" if math.isnan(correlation.low) else f" (95 % interval {correlation.low:z.2f} to {correlation.high:z.2f})"
     )
-    return f"{correlation.value:.2f} with {OTHERS[correlation.other]}{where}{interval}"
+    return f"{correlation.value:z.2f} with {OTHERS[correlation.other]}{where}{interval}"
 
 
 ENTRY = Entry(

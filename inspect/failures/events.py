@@ -166,7 +166,7 @@ class Failures(ScoredRuns):
     def format(self, value: float) -> str:
         """A score in its display unit."""
         unit, factor = self.conversion
-        return f"{value * factor:.3g} {unit}".rstrip()
+        return f"{value * factor:z.3g} {unit}".rstrip()
 
     def tables(self) -> list[Table]:
         return [self.phase_table(), self.event_table(self.worst(MAX_ROWS))]

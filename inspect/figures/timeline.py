@@ -177,7 +177,7 @@ def _number(value: Any) -> str:
     """An integer, or a number in single precision; empty for a missing one."""
     if isinstance(value, np.integer):
         return str(value)
-    return f"{value:.7g}" if np.isfinite(value) else ""
+    return f"{value:z.7g}" if np.isfinite(value) else ""
 
 
 def _visible(window: str, steps: int) -> tuple[float, float]:

@@ -76,7 +76,7 @@ class Condition:
             yes, no = self.covariate, f"no {self.covariate}"
             switch = {"yes": yes, yes: yes, "no": no, no: no}
             return switch.get(self.category, f"{self.covariate} is {self.category}")
-        low, high = (None if end is None else f"{end:.3g} {self.unit}".strip() for end in (self.low, self.high))
+        low, high = (None if end is None else f"{end:z.3g} {self.unit}".strip() for end in (self.low, self.high))
         if low is None:
             return f"{self.covariate} <= {high}"
         return f"{self.covariate} > {low}" if high is None else f"{low} < {self.covariate} <= {high}"

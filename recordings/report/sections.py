@@ -164,7 +164,7 @@ def text_columns(table: Table) -> list[bool]:
 
 def number_text(value: float) -> str:
     """Three significant digits."""
-    return f"{value:#.3g}".rstrip(".") if abs(value) < 1000.0 else f"{value:.0f}"
+    return f"{value:z#.3g}".rstrip(".") if abs(value) < 1000.0 else f"{value:.0f}"
 
 
 def _reach(map_: LikelihoodMap) -> NDArray[Any]:

@@ -208,7 +208,7 @@ def _start_std(trace: Trace) -> str:
     units, factors = measures.display_units(trace.task)
     std = factors * np.sqrt(np.diag(trace.start_covariance))
     named = zip(trace.task.components, std, units, strict=True)
-    return ", ".join(f"{component.label} {value:.3g} {unit}".rstrip() for component, value, unit in named)
+    return ", ".join(f"{component.label} {value:z.3g} {unit}".rstrip() for component, value, unit in named)
 
 
 def definitions(task: Task, trace: Trace) -> list[Passage]:

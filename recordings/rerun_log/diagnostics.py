@@ -136,7 +136,7 @@ def _table(table: Table) -> str:
 
 
 def _cell(value: Value) -> str:
-    text = "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+    text = "-" if value is None else f"{value:z.3g}" if isinstance(value, float) else str(value)
     return text.replace("|", r"\|")
 
 

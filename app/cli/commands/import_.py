@@ -206,7 +206,7 @@ def _values(episodes: list[Episode]) -> tuple[dict[str, Any], str]:
 
     dt, ranges = episodes[0].dt, component_ranges(episodes)
     units = {name: "" if r["unit"] == "1" else f" {r['unit']}" for name, r in ranges.items()}
-    parts = [f"{name} {r['min']:.4g} to {r['max']:.4g}{units[name]}".rstrip() for name, r in ranges.items()]
+    parts = [f"{name} {r['min']:z.4g} to {r['max']:z.4g}{units[name]}".rstrip() for name, r in ranges.items()]
     return {"dt": dt, "ranges": ranges}, "; ".join([durations_text(episodes), *parts])
 
 
