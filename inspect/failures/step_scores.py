@@ -180,7 +180,7 @@ def scores_of(task: Task) -> dict[str, Score]:
         "error": Score(f"{main.name} error", unit, display, lambda trace: measures.main_error(trace)[:, -1]),
         **angles,
         "nees": Score("NEES/n", "", ("", 1.0), lambda trace: measures.nees(trace)[:, -1], _no_covariance),
-        "ess": Score("particles per effective particle", "x", ("x", 1.0), _degeneracy, _no_particles),
+        "ess": Score("particles / effective sample size", "x", ("x", 1.0), _degeneracy, _no_particles),
         "disagreement": Score("disagreement of modalities", "sigma", ("sigma", 1.0), disagreement, _no_fusion),
         "regret": Score("regret of the weights", unit, display, _regret, _no_fusion),
     }

@@ -62,7 +62,7 @@ def test_permalinks_of_an_external_filter(run: Run, base_settings: Settings) -> 
 def test_tables_and_full_permalinks(run: Run, line: list[object]) -> None:
     code, out, err = run(*line, "--url", "http://127.0.0.1:9000/", "--by", "ess")
     assert code == 0
-    assert "Events by phase: particles per effective particle (x)" in out
+    assert "Events by phase: particles / effective sample size (x)" in out
     assert "http://127.0.0.1:9000/?task=door&" in out
     assert "track=particles" in out
     assert "the dashboard uses 300 particles" in err
