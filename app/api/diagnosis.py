@@ -24,6 +24,7 @@ from beliefscope.datasets.text import plural
 from beliefscope.inspect.diagnosis.cause import Candidate, Diagnosis as DiagnosisResult, Recovery
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.diagnosis.largest_error import LargestError
+from beliefscope.inspect.diagnosis.undo.repair import check_repairable
 from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import MAX_EPISODES as MAX_RECORDED
@@ -147,6 +148,7 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
 
     @app.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
     def search_repair(selection: RequestedRun) -> JobReply:
+        check_repairable(store.checkpoint(selection.task, selection.filter))
         named = replace(selection, data=store.dataset(selection.task, selection.data)[0])
         link = named.link("diagnosis", over="episode")
         title = f"Smallest repair of {selection.describe()}"

@@ -10,6 +10,7 @@ from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.finetuning.choices import SliceInfo
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis import weaknesses
@@ -24,8 +25,13 @@ class Weakness(Reply):
 
 
 def weaknesses_of(store: TraceStore, jobs: Jobs, selection: Selection) -> list[Weakness]:
-    """The weaknesses, diagnosed ones first. Raises InProgress while the run is computed."""
+    """The weaknesses, diagnosed ones first; none of an external filter.
+
+    Raises InProgress while the run is computed.
+    """
     checkpoint = store.checkpoint(selection.task, selection.filter)
+    if isinstance(checkpoint, ExternalFilter):  # FineTuneOffer.why_not
+        return []
     try:
         diagnosis = available_diagnosis(store, jobs, selection)
     except BadInput:  # no healthy profile

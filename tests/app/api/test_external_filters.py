@@ -116,6 +116,16 @@ def test_page_shows_available_values(client: TestClient) -> None:
         assert header["no_maps"] is None
 
 
+def test_repairs_and_weaknesses_of_an_external_filter_are_refused_at_once(client: TestClient) -> None:
+    with client:
+        answer = client.post("/api/repair/door/04_own_filter-build/0")
+        assert (answer.status_code, client.get("/api/jobs").json()) == (400, [])
+        assert "external filter '04_own_filter-build' has no smallest repair" in answer.json()["error"]
+        answer = client.get("/api/weaknesses/door/04_own_filter-build/0")
+        assert (answer.status_code, answer.json()) == (200, [])
+        assert client.get("/api/finetune/door/04_own_filter-build").json()["why_not"]
+
+
 def test_page_cannot_name_code(client: TestClient, tmp_path: Path) -> None:
     trap = tmp_path / "trap.py"
     trap.write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\n" + EXAMPLE.read_text())
