@@ -261,8 +261,7 @@ def test_cells_with_other_inputs_are_not_finished(finished: Path, data: Path, mo
 
 
 def test_cell_with_a_changed_checkpoint_is_not_finished(data: Path, finished: Path, tmp_path: Path) -> None:
-    first, folder = cell(data), tmp_path / "study"
-    shutil.copytree(finished, folder)
+    first, folder = cell(data), shutil.copytree(finished, tmp_path / "study")
     path = first.path(folder, ".safetensors")
     path.write_bytes(path.read_bytes()[:-1] + bytes([path.read_bytes()[-1] ^ 1]))
     assert first.finished(folder) is None

@@ -353,8 +353,7 @@ def test_reference_survives_json() -> None:
     before = reference("push")
     again = Reference.from_json(before.to_json())
     np.testing.assert_array_equal(again.image, before.image)
-    episode = episodes("push")[0]
-    exact, stored = (sensor_statistics(episode, r) for r in (before, again))
+    exact, stored = (sensor_statistics(episodes("push")[0], r) for r in (before, again))
     for name, value in exact.items():
         assert stored[name] == pytest.approx(value, abs=0.05, nan_ok=True), name
 
