@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from beliefscope.app.cli import options as opt
@@ -16,13 +17,19 @@ class TaskOrRecordedRuns(opt.Runs):
     def __post_init__(self) -> None:
         """As ``Runs``; raises BadInput without a filter that runs over the episodes."""
         if not self.is_recorded:
-            from beliefscope.filters.names import RUNS
-
-            if not self.filter and Path(self.task).is_dir():
-                raise BadInput(f"{self.task} has no recorded runs, files that end in {', '.join(RUNS)}")
             if not self.filter:
-                raise BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
+                raise self._missing_filter()
             super().__post_init__()
+
+    def _missing_filter(self) -> BadInput:
+        from beliefscope.datasets.catalog import TASKS
+        from beliefscope.filters.names import RUNS
+
+        if Path(self.task).is_dir():
+            return BadInput(f"{self.task} has no recorded runs, files that end in {', '.join(RUNS)}")
+        if os.sep in self.task and self.task not in TASKS and ":" not in self.task:
+            return BadInput(f"{self.task} does not exist: expected a recorded run, a folder with some, or a task")
+        return BadInput(f"--filter is missing: the filter that runs over the episodes of task {self.task}")
 
     @property
     def is_recorded(self) -> bool:

@@ -161,3 +161,9 @@ def test_a_task_needs_a_filter(run: Run) -> None:
     code, _, error = run("diagnose door")
     assert code == 2
     assert error == "error: --filter is missing: the filter that runs over the episodes of task door\n"
+
+
+def test_a_missing_folder_of_runs_is_named(run: Run) -> None:
+    code, _, error = run("diagnose traces/none --profile-from traces/healthy")
+    assert code == 2
+    assert error == "error: traces/none does not exist: expected a recorded run, a folder with some, or a task\n"
