@@ -31,7 +31,7 @@ CONTROL = r"(^|[/_.])(actions?|controls?|cmd|commands?)([/_.]|$)|^u_?\d*$"
 INTERNAL = r"innov|residual|(^|[._/])(nis|nees|ess|n_?eff)([._/]|$)|(^|[._/])(P|cov|var)_(?P<axis>[a-z])(?P=axis)$"
 """Pattern of values within a filter, which are neither estimates nor readings, such as the variance ``P_xx``."""
 
-VARIANCE = r"(^|[./])(P|cov|covariance)[_.\[(]?\d"
+VARIANCE = r"(^|[./])(P|cov|covariance)[_.\[(]?(\d|[xyz]_?[xyz]$)"
 """Pattern of the elements of a covariance in columns of their own."""
 
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
