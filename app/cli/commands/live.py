@@ -27,12 +27,14 @@ def live(
       beliefscope live door --filter crossmodal-ekf --faults blackout=0.8 --rate 50 --workspace runs
       beliefscope live door --filter examples/04_own_filter.py:build --name mine
     """
+    # Rerun reads it when it is imported: suppress its warning that a growing file has no index yet.
+    os.environ.setdefault("RUST_LOG", "error")
+
     from beliefscope.app.cli.commands.report import URL
     from beliefscope.app.protocol.permalinks import page_link
     from beliefscope.app.runs.live_runs import LIVE_PREFIX
     from beliefscope.recordings.live_episode import record_steps, run_steps
 
-    os.environ.setdefault("RUST_LOG", "error")  # suppress Rerun's warning that a growing file has no index yet
     if rate is not None and not (math.isfinite(rate) and rate >= 0):
         raise BadInput(f"--rate {rate:g} is not a number of steps per second, or 0 for as fast as possible")
     opt.check_workspace(workspace)

@@ -45,6 +45,15 @@ def test_unwritable_output_prints_one_line() -> None:
     )
 
 
+def test_live_runs_print_no_warning_of_rerun(tmp_path: Path) -> None:
+    """Of the growing recording, which has no index."""
+    line = ["live", "push", "--filter", "image-ekf", "--rate", "0", "--workspace", str(tmp_path)]
+    environment = {name: value for name, value in os.environ.items() if name != "RUST_LOG"}
+    ran = subprocess.run([*COMMAND, *line], capture_output=True, text=True, env=environment, check=False)
+    assert ran.returncode == 0
+    assert "WARN" not in ran.stderr
+
+
 # The command itself and a command's import of PyTorch; `doctor` takes as long again for its other checks.
 THREADS = """
 import os, sys
