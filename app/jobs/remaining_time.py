@@ -7,6 +7,9 @@ from collections import deque
 MIN_PROGRESS = 0.05
 """Smallest progress since the first one from which the rate is known well enough."""
 
+MIN_SECONDS = 5.0
+"""Shortest time of which the rate is used: progress may come in bursts."""
+
 
 class RemainingTime:
     """Estimates the time to the end from the rate in the second half of the time since the first progress.
@@ -18,7 +21,7 @@ class RemainingTime:
     def __init__(self) -> None:
         self._first: tuple[float, float] | None = None
         self._recent: deque[tuple[float, float]] = deque()
-        """Updates from the last one in the first half of the time on."""
+        """Updates from the last one in the first half of the time, or ``MIN_SECONDS`` ago, on."""
 
     def update(self, progress: float, now: float) -> float | None:
         """s to the end; None below ``MIN_PROGRESS``.
@@ -31,7 +34,7 @@ class RemainingTime:
         self._first = self._first or (progress, now)
         self._recent.append((progress, now))
         first, since = self._first
-        while len(self._recent) > 1 and self._recent[1][1] <= (since + now) / 2.0:
+        while len(self._recent) > 1 and self._recent[1][1] <= min((since + now) / 2.0, now - MIN_SECONDS):
             self._recent.popleft()
         if progress - first < MIN_PROGRESS:
             return None

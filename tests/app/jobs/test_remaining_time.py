@@ -26,3 +26,10 @@ def test_a_slow_part_has_its_own_rate() -> None:
     assert time_left.update(0.83, 25.0) == pytest.approx(85.0)
     assert time_left.update(0.83, 60.0) == pytest.approx(0.17 * 59.0 / 0.75)
     assert time_left.update(0.9, 60.0) == pytest.approx(50.0)
+
+
+def test_a_pause_of_seconds_does_not_count() -> None:
+    time_left = RemainingTime()
+    for progress, now in ((0.1, 0.0), (0.4, 1.0), (0.41, 2.0)):
+        remaining = time_left.update(progress, now)
+    assert remaining == pytest.approx(0.59 * 2.0 / 0.31)
