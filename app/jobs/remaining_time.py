@@ -8,7 +8,7 @@ MIN_PROGRESS = 0.05
 """Smallest progress since the first one from which the rate is known well enough."""
 
 MIN_SECONDS = 5.0
-"""Shortest time of which the rate is used: progress may come in bursts."""
+"""Shortest time over which the rate is measured: progress may come in bursts."""
 
 
 class RemainingTime:
