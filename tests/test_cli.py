@@ -283,6 +283,7 @@ BAD = [
     "serve --log-level loud",
     "serve --log-format xml",
     "doctor --port 70000",
+    "mcp --url localhost:8000",
     "doctor --json file",
     "change crossmodal-ekf crossmodal-pf",
     "change crossmodal-ekf missing.safetensors",
