@@ -46,8 +46,10 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
     if filter_:
         checkpoint = open_filter(first.task, filter_)
         if checkpoint.hash != first.checkpoint_hash:
-            own = ": its code has changed, or Python built the filter of the trace" if is_code(filter_) else ""
-            raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}{own}")
+            changed = is_code(filter_) and checkpoint.name == first.filter
+            own = ": its code has changed, or Python built the filter of the trace" if changed else ""
+            name = f"{first.filter}, checkpoint {first.checkpoint_hash[:12]}"
+            raise BadInput(f"{files[0]} is a run of {name}, not of {filter_!r}{own}")
         return checkpoint
     try:
         checkpoint = load_checkpoint(pretrained_path(first.task, first.filter))

@@ -52,6 +52,9 @@ def test_the_timeline_as_a_figure_and_as_values(run: Callable[..., Any], tmp_pat
     assert (tmp_path / "timeline.pdf").read_bytes().startswith(b"%PDF")
 
 
+EXAMPLE = Path(__file__).parents[3] / "examples" / "04_own_filter.py"
+
+
 @pytest.mark.slow
 def test_a_recorded_run_has_the_figures_of_the_run(run: Callable[..., Any], tmp_path: Path) -> None:
     selection = ("door", "--filter", "crossmodal-ekf", "--episode", 9)
@@ -64,7 +67,8 @@ def test_a_recorded_run_has_the_figures_of_the_run(run: Callable[..., Any], tmp_
     for arguments, message in (
         ((tmp_path / "run.trace", "--faults", "blackout=0.4"), "a recorded run is drawn as it is"),
         ((tmp_path,), "is a folder; give one of its runs"),
-        ((tmp_path / "run.trace", "--filter", "image-ekf"), "not from 'image-ekf'"),
+        ((tmp_path / "run.trace", "--filter", "image-ekf"), "is a run of crossmodal-ekf, checkpoint"),
+        ((tmp_path / "run.trace", "--filter", f"{EXAMPLE}:build"), "04_own_filter.py:build'\n"),
         (("door",), "--filter is missing"),
     ):
         code, _, error = run("figure", "weights", *arguments, "-o", tmp_path / "weights.png")
