@@ -360,9 +360,7 @@ def test_files_that_are_no_archives_are_refused(tmp_path: Path) -> None:
 
 def test_a_published_ensemble_filter(tmp_path: Path) -> None:
     """The recorded run of the differentiable ensemble Kalman filter (DEnKF) has NEES/n 0.0747 in NumPy."""
-    path = Path(__file__).parents[4] / "shared" / "data" / "denkf" / "eval-13920.npz"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not here")
+    path = Path(__file__).parents[3] / "examples" / "denkf" / "eval-13920.npz"
     columns = read_columns(path)
     text = guess_map(Preview(columns), "vehicle")
     mapping = read_map(map_file(tmp_path, text))
