@@ -44,6 +44,9 @@ def integer(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
     return parse
 
 
+URL = "http://127.0.0.1:8000"
+"""Default address of ``beliefscope serve``."""
+
 Quantity = Literal["likelihood", "posterior"]
 Engine = Literal["local", "ray"]
 
@@ -355,6 +358,12 @@ def check_folder(path: Path | None, option: str) -> Path | None:
     if path is not None and path.exists() and not path.is_dir():
         raise BadInput(f"{option} {str(path)!r} is a file; give the name of a folder")
     return path
+
+
+def check_url(url: str) -> None:
+    """Raise BadInput if it is not the address of a server."""
+    if not url.startswith(("http://", "https://")):
+        raise BadInput(f"--url {url!r} is not an address such as {URL}")
 
 
 def check_workspace(workspace: Path) -> None:

@@ -1,5 +1,5 @@
 from beliefscope.app.cli import console, options as opt
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import check_name
 from beliefscope.recordings.report.command_lines import serve_command
 
 
@@ -36,8 +36,8 @@ def failures(
     from beliefscope.inspect.failures.events import find_failures
     from beliefscope.inspect.failures.step_scores import phases_of
 
-    if url is not None and not url.startswith(("http://", "https://")):
-        raise BadInput(f"--url {url!r} is not an address such as http://127.0.0.1:8000")
+    if url is not None:
+        opt.check_url(url)
     checkpoint, faults = runs.open()
     if phase is not None:
         check_name("phase", phase, phases_of(checkpoint.task))

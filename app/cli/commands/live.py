@@ -30,7 +30,6 @@ def live(
     # Rerun reads it when it is imported: suppress its warning that a growing file has no index yet.
     os.environ.setdefault("RUST_LOG", "error")
 
-    from beliefscope.app.cli.commands.report import URL
     from beliefscope.app.protocol.permalinks import page_link
     from beliefscope.app.runs.live_runs import LIVE_PREFIX
     from beliefscope.recordings.live_episode import record_steps, run_steps
@@ -45,7 +44,7 @@ def live(
     recorder, steps = record_steps(*arguments, name, workspace / "live")
     watch = shlex.join(["beliefscope", "serve", "--workspace", str(workspace)])
     link = page_link(task=checkpoint.task.name, data=f"{LIVE_PREFIX}{recorder.path.stem}")  # of the run's only episode
-    console.note(f"{recorder.path}: view it with {watch} at {URL}/{link}")
+    console.note(f"{recorder.path}: view it with {watch} at {opt.URL}/{link}")
     count = len(recorded)
     with console.bars() as update:
         timing = run_steps(

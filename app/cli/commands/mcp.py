@@ -24,8 +24,8 @@ def mcp(
       beliefscope mcp
       beliefscope mcp --data door.h5 --filter mine.safetensors --url http://127.0.0.1:8000
     """
-    if url and not url.startswith(("http://", "https://")):
-        raise BadInput(f"--url {url!r} is not an address such as http://127.0.0.1:8000")
+    if url:
+        opt.check_url(url)
     from beliefscope.app.runs.trace_store import TraceStore
     from beliefscope.app.server.assistant import Assistant, build_server
 

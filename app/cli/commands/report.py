@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from beliefscope.inspect.trace import Trace
     from beliefscope.recordings.report.sections import Report
 
-URL = "http://127.0.0.1:8000"
-"""Default address of ``beliefscope serve``."""
-
 
 def report(
     paths: list[Path] = opt.argument("TRACE...", "Traces or recordings of one filter, or folders of traces."),
@@ -41,7 +38,7 @@ def report(
     ),
     quantity: opt.Quantity | None = None,
     every: bool = opt.flag("Include slow diagnostics.", "--all"),
-    url: str = opt.option("ADDRESS", "Address of the dashboard, for permalinks.", URL),
+    url: str = opt.option("ADDRESS", "Address of the dashboard, for permalinks.", opt.URL),
     pdf: bool = opt.flag("Also print report.pdf; requires Chromium.", "--pdf"),
 ) -> console.Result:
     """Write a report of filter runs.
@@ -65,8 +62,7 @@ def report(
 
     check_folder(output)
     chromium = browser() if pdf else None
-    if not url.startswith(("http://", "https://")):
-        raise BadInput(f"--url {url!r} is not an address such as {URL}")
+    opt.check_url(url)
     files = _files(paths)
     opened, checkpoint = open_traces(files, filter, task)
     pairs = sorted(zip(files, opened, strict=True), key=lambda pair: pair[1].episode_index)
