@@ -82,7 +82,7 @@ def _jumping(case: Case) -> list[str]:
 def _extrapolated(case: Case) -> list[str]:
     """Sensors with a considerable share of steps (``EXTRAPOLATED``) whose states the record does not have."""
     result = []
-    for model in (model for model in case.profile.readings if model.channels):
+    for model in case.profile.readings:
         counts = [model.unknown_steps(trace.episode) for trace in case.traces if is_expected(model, trace.episode)]
         unknown, total = (sum(values) for values in zip((0, 0), *counts, strict=True))
         if unknown > EXTRAPOLATED * total:

@@ -98,9 +98,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     of a channel without a model.
     """
     values: dict[str, float] = {}
-    for model in (model for model in models if model.channels):
-        if not is_expected(model, episode):
-            continue
+    for model in (model for model in models if is_expected(model, episode)):
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)
         is_short = delay == 0.0 and _is_own_arrangement(errors)
@@ -135,14 +133,15 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
 
 
 def is_expected(model: ReadingModel, episode: Episode) -> bool:
-    """Whether an episode has labels and the sensor of a model."""
-    return model.key in (*episode.observations, CONTROL) and bool(np.isfinite(episode.states).all())
+    """Whether the labels explain channels of the model's sensor, and an episode has both."""
+    has_sensor = model.key in (*episode.observations, CONTROL)
+    return has_sensor and len(model.channels) > 0 and bool(np.isfinite(episode.states).all())
 
 
 def without_outliers(episode: Episode, models: Sequence[ReadingModel]) -> Episode:
     """The episode with interpolated readings instead of isolated ones, of sensors with such ones in the record."""
     changed = {}
-    for model in (m for m in models if m.outliers and m.channels and is_expected(m, episode) and m.key != CONTROL):
+    for model in (m for m in models if m.outliers and is_expected(m, episode) and m.key != CONTROL):
         outliers = model.compare(episode).outliers
         others, steps = np.flatnonzero(episode.present(model.key) & ~outliers), np.flatnonzero(outliers)
         if len(others) and len(steps):
@@ -155,7 +154,7 @@ def without_outliers(episode: Episode, models: Sequence[ReadingModel]) -> Episod
 def with_errors(episode: Episode, models: Sequence[ReadingModel]) -> Episode:
     """The episode with errors in place of the readings that models expect, interpolated at other steps."""
     changed = {}
-    for model in (m for m in models if m.channels and is_expected(m, episode) and m.key != CONTROL):
+    for model in (m for m in models if is_expected(m, episode) and m.key != CONTROL):
         compared = model.compare(episode)
         delay, _ = delayed_errors(compared, episode.dt)
         errors, known = delayed(compared, 0 if np.isnan(delay) else int(delay))
