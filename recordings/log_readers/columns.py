@@ -96,6 +96,8 @@ def _reader(path: Path) -> str:
             f"folder {path.name} has none of {', '.join(FOLDERS)}, and no files {', '.join((*TABLES, *MESSAGES))}: "
             "not a ROS 2 bag, LeRobot or Zarr data, or one log per episode"
         )
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist")
     suffix = path.suffix.lower()
     if suffix == ".bag":
         command = f"rosbags-convert --src {path.name} --dst {path.stem}"
@@ -104,8 +106,6 @@ def _reader(path: Path) -> str:
         raise BadInput(
             f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder"
         )
-    if not path.is_file():
-        raise BadInput(f"{path} does not exist")
     check_downloaded(path)
     return SUFFIXES[suffix]
 

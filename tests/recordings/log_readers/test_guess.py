@@ -56,8 +56,15 @@ def test_a_table_of_a_filter_has_its_estimate_covariance_and_controls(elements: 
 
 
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    (tmp_path / "drive.bag").touch()
     with pytest.raises(BadInput, match=r"drive.bag is a bag of ROS 1; convert it: .*--src drive.bag --dst drive"):
         preview_columns(tmp_path / "drive.bag")
+
+
+@pytest.mark.parametrize("name", ["bag", "buffer.zarr", "drive.bag", "log.csv"])
+def test_a_missing_log_is_not_said_to_have_a_wrong_format(name: str, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=rf"{name} does not exist"):
+        preview_columns(tmp_path / name)
 
 
 def test_units_of_sensors_are_those_of_their_columns_and_values_of_the_filter_are_no_sensors() -> None:
