@@ -116,4 +116,4 @@ def find_score(by: str, task: Task) -> Score:
 def check_applies(by: str, reason: str | None) -> None:
     """Raise BadInput if there is a reason why the score does not apply."""
     if reason:
-        raise BadInput(f"no failures by {by}: {reason}")
+        raise BadInput(f"no score {by!r}: {reason}")

@@ -291,14 +291,14 @@ def test_angles_have_a_score_and_wrap() -> None:
     assert failures.events[0].score == pytest.approx(0.5, abs=0.1)
     assert failures.unit == "rad"
     assert "deg at step 50" in failures.verdict
-    with pytest.raises(BadInput, match="no failures by ess: this filter has no particles"):
+    with pytest.raises(BadInput, match="no score 'ess': this filter has no particles"):
         failures_of(survey_over([run]), "ess")
 
 
 def test_a_score_that_does_not_apply_is_refused_after_the_first_block() -> None:
     feature = load_checkpoint(pretrained_path("door", "feature-ekf"))
     progress: list[float] = []
-    with open_dataset(sample_path("door")) as data, pytest.raises(BadInput, match="no failures by regret"):
+    with open_dataset(sample_path("door")) as data, pytest.raises(BadInput, match="no score 'regret'"):
         find_failures(feature, dict.fromkeys(range(40), shortened(data[9])), by="regret", progress=progress.append)
     assert max(progress, default=0.0) <= 0.5
 
