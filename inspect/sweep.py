@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from glob import glob
@@ -98,11 +98,12 @@ class Inputs:
     particles: int = 300
     all_episodes: bool = False
 
-    def cells(self, size: int = EPISODES, skip: Callable[[str], None] | None = None) -> list[Cell]:
+    def cells(self, size: int = EPISODES, skip: Callable[[str, Sequence[Path]], None] | None = None) -> list[Cell]:
         """All cells with up to ``size`` episodes, by checkpoint.
 
         Args:
-            skip: called with the problem of each unusable checkpoint, which is left out. By default, they are errors.
+            skip: called with each problem and its unusable checkpoints, which are left out. By default, they are
+                errors.
 
         Raises BadInput with all unusable checkpoints, or if none is usable; for data sets that are unusable or fit no
         checkpoint; and for faults that fit no checkpoint.
@@ -144,7 +145,9 @@ class Inputs:
         return list(dict.fromkeys(cells))
 
 
-def _report_unusable(problems: list[tuple[Path, str]], count: int, skip: Callable[[str], None] | None) -> None:
+def _report_unusable(
+    problems: list[tuple[Path, str]], count: int, skip: Callable[[str, Sequence[Path]], None] | None
+) -> None:
     """Call ``skip`` with the problems of ``count`` checkpoints; raise BadInput without it, or if none is usable.
 
     A problem of several checkpoints is stated once, with the names of the others.
@@ -152,18 +155,18 @@ def _report_unusable(problems: list[tuple[Path, str]], count: int, skip: Callabl
     groups: dict[str, list[tuple[Path, str]]] = {}
     for path, problem in problems:
         groups.setdefault(problem.replace(path.name, ""), []).append((path, problem))
-    texts = []
-    for (_, problem), *others in groups.values():
-        names = ", ".join(path.name for path, _ in others)
-        texts.append(f"{problem} (the same: {names})" if others else problem)
+    texts = {}
+    for (path, problem), *others in groups.values():
+        names = ", ".join(other.name for other, _ in others)
+        texts[f"{problem} (the same: {names})" if others else problem] = [path, *(other for other, _ in others)]
     if problems and (skip is None or len(problems) == count):
         if len(problems) == 1:
-            raise BadInput(texts[0])
+            raise BadInput(*texts)
         advice = "; --skip-bad leaves them out" if len(problems) < count else ""
         raise BadInput(f"{len(problems)} of {count} checkpoints are unusable: {'; '.join(texts)}{advice}")
-    for text in texts:
+    for text, paths in texts.items():
         assert skip is not None
-        skip(text)
+        skip(text, paths)
 
 
 def provenance_of(path: Path) -> Mapping[str, Any]:

@@ -101,8 +101,10 @@ class Assistant:
     ) -> dict[str, Any]:
         """The worst events of a filter over the held-out episodes, and the phases in which they are more frequent.
 
-        by: score that ranks them: error, nees, ess, disagreement or regret.
+        by: score that ranks them: error, nees, ess, disagreement or regret. top: number of events, 1 to 50.
         """
+        if not 1 <= top <= MOST_EVENTS:
+            raise BadInput(f"top is 1 to {MOST_EVENTS} events, not {top}")
         name, source = self._store.dataset(task, data)
         report = find_failures(
             self._store.checkpoint(task, filter),
@@ -115,7 +117,7 @@ class Assistant:
         events = [
             {"episode": e.episode, "step": e.step, "value": report.format(e.score), "phase": e.phase}
             | {"link": self._url + permalink(source.task, filter, name, e.episode, e.step, faults, by)}
-            for e in report.worst(max(1, min(top, MOST_EVENTS)))
+            for e in report.worst(top)
         ]
         return as_json({"verdict": report.verdict, "events": events})
 

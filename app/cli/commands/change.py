@@ -80,7 +80,8 @@ def change(
         )
         data_hash = episodes.hash
     document = {"data_hash": data_hash} | _document(report, target, (before, after), data, seed)
-    heading = f"Before: {report.filters[0]}; after: {report.filters[1]}; {plural(len(report.episodes), 'episode')}"
+    first, second = (before, after) if len({*report.filters}) == 1 else report.filters
+    heading = f"Before: {first}; after: {second}; {plural(len(report.episodes), 'episode')}"
     notes = dict.fromkeys(filter(None, map(removal_note, checkpoints)))
     text = "\n\n".join([heading, report.text, *notes])
     if output is not None:

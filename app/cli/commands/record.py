@@ -32,7 +32,7 @@ def record(
     if maps and (reason := no_maps(checkpoint, trace, quantity)):
         if quantity:
             raise BadInput(reason)
-        console.note(f"no likelihood maps: {reason}")
+        console.note(f"recorded without maps: {reason}")
         maps = 0
     steps = range(0, len(trace), maps) if maps else range(0)
     layers = MapEngine(checkpoint, trace).maps(steps, map_size, quantity=quantity) if maps else None

@@ -9,7 +9,7 @@ from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.text import plural
 
 if TYPE_CHECKING:
-    from beliefscope.inspect.sweep import Cell, Inputs
+    from beliefscope.inspect.sweep import Cell
 
 
 def sweep(
@@ -69,10 +69,16 @@ def sweep(
         particles,
         every,
     )
-    cells = inputs.cells(block, skip=(lambda problem: console.note(f"skipped: {problem}")) if skip_bad else None)
+    skipped: set[Path] = set()
+
+    def skip(problem: str, paths: Sequence[Path]) -> None:
+        console.note(f"skipped: {problem}")
+        skipped.update(paths)
+
+    cells = inputs.cells(block, skip=skip if skip_bad else None)
     opt.check_output(output / "results.parquet" if output.is_dir() else output)
     output.mkdir(exist_ok=True)
-    _warn(inputs, cells, output)
+    _warn([path for path in inputs.checkpoints if path not in skipped], cells, output)
     console.note(f"{plural(len(cells), 'cell')}; if interrupted, the same command resumes")
     with console.bars() as update:
         table = run_sweep(
@@ -89,12 +95,12 @@ def sweep(
     return console.Result(sizes | {"overview": overview.to_pylist()}, text, output / "results.parquet")
 
 
-def _warn(inputs: Inputs, cells: Sequence[Cell], output: Path) -> None:
-    """Name checkpoints without cells, and the number of results in the tables that this sweep replaces."""
+def _warn(usable: Sequence[Path], cells: Sequence[Cell], output: Path) -> None:
+    """Name usable checkpoints without cells, and the number of results in the tables that this sweep replaces."""
     from beliefscope.recordings.sweep_table import replaced_results
 
     used = {cell.checkpoint for cell in cells}
-    if idle := [path.name for path in inputs.checkpoints if path not in used]:
+    if idle := [path.name for path in usable if path not in used]:
         console.note(f"Warning: no data of their tasks, or copies of other checkpoints: {', '.join(idle)}")
     if lost := replaced_results(cells, output):
         console.note(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import console, options as opt
 from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.text import plural
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
@@ -114,8 +115,9 @@ def _option(name: str, value: object) -> str:
 
 
 def _check_training(task: Task, episodes: Sequence[Episode], sample: bool) -> None:
-    """Raise BadInput for a sample set without training episodes; warn of angles that wrap around."""
+    """Raise BadInput for a sample set without training episodes; warn of wrapping angles and of few held-out ones."""
     from beliefscope.filters.angles import wrapping_warning
+    from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 
     if sample and task.simulate is not None and all(episode.split != "train" for episode in episodes):
         raise BadInput(
@@ -124,3 +126,8 @@ def _check_training(task: Task, episodes: Sequence[Episode], sample: bool) -> No
         )
     if warning := wrapping_warning(episodes):
         console.note(f"Warning: {warning}")
+    if (held_out := sum(episode.split != "train" for episode in episodes)) < MIN_HEALTHY:
+        console.note(
+            f"Warning: the data have {plural(held_out, 'held-out episode')}; diagnose needs a healthy record of at "
+            f"least {MIN_HEALTHY}: collect more, or give it other clean data with --profile-from"
+        )

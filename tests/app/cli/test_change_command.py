@@ -80,5 +80,7 @@ def test_report_names_filters_and_removed_sensors(
     assert document["regressed_slices"] == ["clean"]
     assert "; regressed: clean: x " in document["verdict"]
     assert run(*reversed_filters(change), "--fail-on-regression")[0] == 0
+    code, out, _ = run("change", "cart.py:encoder", "cart.py:encoder", "--data", "cart.h5")
+    assert (code, out.startswith("Before: cart.py:encoder; after: cart.py:encoder")) == (0, True)
     code, _, error = run(*change, "--slice", "slip")
     assert (code, "slices select steps by contact only, not by 'slip'; a sweep has" in error) == (2, True)

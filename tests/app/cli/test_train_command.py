@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.training.train import Trained
 
@@ -68,3 +69,7 @@ def test_the_healthy_record_over_a_sample_set_uses_the_images_of_its_camera(
     monkeypatch.setattr("beliefscope.inspect.healthy.measure_profile", lambda *arguments: given.append(arguments[4]))
     assert run("train push --filter haptics-ekf -o", tmp_path / "new.safetensors")[0] == 0
     assert given == [True]
+    with open_dataset(sample_path("push")) as data:
+        write_dataset(tmp_path / "few.h5", data.task, [data[i] for i in (0, 9, 19)])  # the first is of training
+    _, _, error = run("train push --filter haptics-ekf --data", tmp_path / "few.h5", "-o", tmp_path / "few.safetensors")
+    assert "Warning: the data have 2 held-out episodes; diagnose needs a healthy record of at least 10" in error

@@ -78,6 +78,12 @@ def test_names_that_do_not_exist(assistant: Assistant, arguments: dict[str, Any]
         assistant.explain_run(**(RUN | arguments))
 
 
+@pytest.mark.parametrize("top", [0, -3, 51])
+def test_a_number_of_events_out_of_range_is_refused(assistant: Assistant, top: int) -> None:
+    with pytest.raises(BadInput, match=f"top is 1 to 50 events, not {top}"):
+        assistant.failures("door", "crossmodal-ekf", top=top)
+
+
 def test_protocol() -> None:
     mcp = pytest.importorskip("mcp", reason="pip install 'beliefscope[mcp]'")
 
