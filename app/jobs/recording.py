@@ -35,7 +35,7 @@ def write(
     report: Report = lambda share, message: None,
     quantity: Quantity = "likelihood",
 ) -> None:
-    """Write a recording. stride: steps between maps of the quantity, 0 for none."""
+    """Write a recording. stride: steps between maps of the quantity, 0 for none; steps without one are left out."""
     from beliefscope.recordings.rerun_log.metadata import describe  # imports Rerun, which takes a second
     from beliefscope.recordings.write import write_recording
 
@@ -44,7 +44,8 @@ def write(
 
     def maps() -> Iterator[LikelihoodMap]:
         for count, step in enumerate(steps, start=1):
-            yield run.map(step, FINE, MapOptions(quantity=quantity))
+            if run.no_maps_at(step) is None:
+                yield run.map(step, FINE, MapOptions(quantity=quantity))
             report(count / len(steps), f"likelihood maps, {count} of {len(steps)}")
 
     with files.partial_file() as part:

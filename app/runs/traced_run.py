@@ -80,9 +80,13 @@ class TracedRun:
 
     def no_maps_at(self, step: int) -> str | None:
         """Reason why a step of the run has no likelihood maps; None if it has."""
+        if self.no_maps:
+            return self.no_maps
         trace, index = self.at(step)
-        finite = self.no_maps or np.isfinite(trace.estimate_mean[index]).all()
-        return self.no_maps if finite else f"No maps: the estimate at step {step} is not a finite number."
+        if not np.isfinite(trace.estimate_mean[index]).all():
+            return f"No maps: the estimate at step {step} is not a finite number."
+        valid = no_maps(self.checkpoint, trace, steps=[index]) is None
+        return None if valid else f"No maps: a covariance at step {step} is not positive definite."
 
     @cached_property
     def header(self) -> dict[str, Any]:

@@ -125,7 +125,7 @@ class Assistant:
         """PNG: scene from above and belief on the fused map at one step."""
         traced = self._run(task, filter, episode, data, faults, step)
         run = traced.trace
-        map_ = None if traced.no_maps else traced.map(step, COARSE)
+        map_ = None if traced.no_maps_at(step) else traced.map(step, COARSE)
         png = io.BytesIO()
         draw_step(run, step, map_).savefig(png, format="png", dpi=150)
         return png.getvalue()

@@ -127,7 +127,7 @@ class View:
             message = {"type": "no_maps", "serial": cursor.serial, "step": cursor.step, "reason": reason}
             await websocket.send_json(message)
         else:
-            if cursor.comparison_maps and comparison is not None and not comparison.no_maps:
+            if cursor.comparison_maps and comparison is not None and not comparison.no_maps_at(cursor.step):
                 other = await self._maps(cursor, comparison)
                 await websocket.send_bytes(other.message(cursor.serial, other=True))
             encoded = await self._maps(cursor, run)

@@ -45,17 +45,17 @@ STEPS_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class MapSurvey(Diagnostic):
-    """Statistics of the maps of all steps of one or more concatenated traces.
+    """Statistics of the maps of all B steps that have one, of one or more concatenated traces.
 
     Attributes:
-        numbers: statistics of B steps.
+        numbers: statistics of the maps.
         title: quantity of the maps and rule of the fused one (``LikelihoodMap.title``).
         ridge_layers: modalities that observe the end effector, whose shape is evaluated.
         phases: phase -> mask (B,) without warm-up steps.
         trajectories: number of traces. trajectory: (B,) index of each step's trace.
         size: cells per side.
         task, components: of the maps.
-        contact, blackout: (B,) masks including warm-up steps.
+        contact, blackout: masks of all steps, with and without maps.
     """
 
     numbers: MapStatistics
@@ -178,15 +178,23 @@ class MapSurvey(Diagnostic):
         if self.trajectories > 1:
             return []
         n, curves, (area, factor) = self.numbers, [], area_unit(self.task, self.components)
+
+        def at_all_steps(values: Array) -> Array:
+            """NaN at steps without a map."""
+            result = np.full(len(self.contact), np.nan)
+            result[n.steps] = values
+            return result
+
         for layer in self.ridge_layers if np.isfinite(n.expected).any() else ():
-            angle = np.degrees(n.deviation[:, n.layers.index(layer)])
+            angle = at_all_steps(np.degrees(n.deviation[:, n.layers.index(layer)]))
             curves.append(
                 Curve(layer, angle, "Angle between principal axis and expected ridge", "°", layer, (0.0, 45.0))
             )
         for i, layer in enumerate(n.layers):
-            curves.append(Curve(layer, factor * n.area95[:, i], f"95 % {self._region}", area, layer))
+            curves.append(Curve(layer, at_all_steps(factor * n.area95[:, i]), f"95 % {self._region}", area, layer))
         for i, layer in enumerate(n.layers[:-1]):
-            curves.append(Curve(layer, n.divergence[:, i, -1], "KL divergence to the fused map", "nats", layer))
+            divergence = at_all_steps(n.divergence[:, i, -1])
+            curves.append(Curve(layer, divergence, "KL divergence to the fused map", "nats", layer))
         return curves
 
     def bands(self) -> dict[str, Mask]:
@@ -237,15 +245,17 @@ def maps(
     quantity: Quantity | None = None,
     progress: Progress = None,
 ) -> MapSurvey:
-    """Evaluate the maps of all steps at the true angle. Raises BadInput for a filter without maps."""
-    parts, title = [], ""
+    """Evaluate the maps of all steps that have one, at the true angle. Raises BadInput for a filter without maps."""
+    parts, title, has_map = [], "", []
     for i, trace in enumerate(traces):
         engine = MapEngine(checkpoint, trace)
         for first in range(0, len(trace), STEPS_AT_ONCE):
             steps = range(first, min(first + STEPS_AT_ONCE, len(trace)))
             computed = list(engine.maps(steps, size, quantity=quantity))
-            title = computed[0].title
-            parts.append(measure_maps(computed, trace))
+            has_map.append(np.isin(steps, [map_.step for map_ in computed]))
+            if computed:
+                title = computed[0].title
+                parts.append(measure_maps(computed, trace))
             if progress is not None:
                 progress((i + steps.stop / len(trace)) / len(traces))
     joined = {
@@ -257,15 +267,16 @@ def maps(
     ridge_layers = tuple(
         name for name in parts[0].layers[:-1] if any("effector_position" in keys.get(m, ()) for m in name.split("+"))
     )
+    kept = np.concatenate(has_map)
     contact = np.concatenate([trace.episode.contact.astype(bool) for trace in traces])
     blackouts = np.concatenate([blackout(trace) for trace in traces])
     return MapSurvey(
         numbers=MapStatistics(layers=parts[0].layers, **joined),
         title=title,
         ridge_layers=ridge_layers,
-        phases=pooled_phases(traces),
+        phases={phase: mask[kept] for phase, mask in pooled_phases(traces).items()},
         trajectories=len(traces),
-        trajectory=trace_indices(traces),
+        trajectory=trace_indices(traces)[kept],
         size=size,
         task=checkpoint.task,
         components=checkpoint.task.map_indices,

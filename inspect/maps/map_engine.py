@@ -66,7 +66,7 @@ def no_maps(
         trace: a trace of the filter; required for an external filter, whose maps are computed from its Gaussians and
             particles.
         quantity: by default either.
-        steps: of the maps; by default all.
+        steps: of the maps, which all need valid covariances; by default those that have them (``no_map``).
     """
     subject = "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
     if trace is not None and (only := trace.settings.get("standalone")):
@@ -108,8 +108,9 @@ def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quant
             covariances = np.concatenate([trace.modality_covariance, covariances], axis=1)
     wanted = np.arange(len(covariances)) if steps is None else np.array(steps)
     degenerate = np.linalg.eigvalsh(covariances[wanted].astype(np.float64)).min(axis=(1, 2)) <= 0.0
-    step = wanted[degenerate.argmax()]
-    return f"a covariance of step {step} is not positive definite" if degenerate.any() else None
+    if not (degenerate.all() if steps is None else degenerate.any()):
+        return None
+    return f"a covariance of step {wanted[degenerate.argmax()]} is not positive definite"
 
 
 class MapEngine:
@@ -158,6 +159,10 @@ class MapEngine:
             self._planes[components] = plane_of(self.trace, components)
         return self._planes[components]
 
+    def no_map(self, step: int, quantity: Quantity | None = None) -> str | None:
+        """Reason why a step has no map of a quantity, by default of the first one that the filter has, or None."""
+        return no_maps(self.checkpoint, self.trace, quantity or self.quantities[0], [step])
+
     def no_others(self, quantity: Quantity, others: Others) -> str | None:
         """Reason why components off the map cannot be treated this way for a quantity; None if they can."""
         if others == "marginal" and quantity == "likelihood" and (self.evidence is not None or self._calls_models):
@@ -185,7 +190,7 @@ class MapEngine:
                 possible (``no_others``), because a map at fixed values of all of them shows little of the belief.
 
         Raises:
-            BadInput: step, angle, size or components are invalid, or the filter does not have such maps.
+            BadInput: step, angle, size or components are invalid, or the filter or step does not have such maps.
         """
         quantity = quantity or self.quantities[0]
         check_name("map quantity", quantity, QUANTITIES)
@@ -193,6 +198,8 @@ class MapEngine:
             raise BadInput(self._missing[quantity])
         trace = self.trace
         check_step(step, len(trace), "episode")
+        if why := self.no_map(step, quantity):
+            raise BadInput(why)
         if not 2 <= size <= LARGEST:
             raise BadInput(f"a map has 2 to {LARGEST} cells per side, not {size}")
         if angle is not None and not math.isfinite(angle):
@@ -227,8 +234,9 @@ class MapEngine:
         )
 
     def available_map(self, step: int, size: int, options: MapOptions) -> LikelihoodMap:
-        """Compute one map. A quantity or treatment of other components that the filter does not have is replaced."""
-        quantity = options.quantity if options.quantity in self.quantities else self.quantities[0]
+        """Compute one map. A quantity or treatment of other components that filter or step do not have is replaced."""
+        wanted = [quantity for quantity in (options.quantity, *self.quantities) if quantity in self.quantities]
+        quantity = next((quantity for quantity in wanted if self.no_map(step, quantity) is None), wanted[0])
         others = options.others
         if others is not None and self.no_others(quantity, others) is not None:
             others = None
@@ -241,9 +249,10 @@ class MapEngine:
         progress: Progress = None,
         quantity: Quantity | None = None,
     ) -> Iterator[LikelihoodMap]:
-        """Default maps of several steps. ``progress`` is called with the completed fraction, 0..1."""
+        """Default maps of the steps that have one. ``progress`` is called with the completed fraction, 0..1."""
         for count, step in enumerate(steps, start=1):
-            yield self.map(step, size=size, quantity=quantity)
+            if self.no_map(step, quantity) is None:
+                yield self.map(step, size=size, quantity=quantity)
             if progress is not None:
                 progress(count / len(steps))
 

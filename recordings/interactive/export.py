@@ -206,19 +206,22 @@ def _scene(trace: Trace) -> dict[str, Any] | None:
 def _maps(
     trace: Trace, checkpoint: Checkpoint | None, size: int, progress: Callable[[float], None]
 ) -> tuple[dict[str, Any] | None, str]:
-    """Maps as bytes (steps, L, R, S) relative to the maximum of each layer; None with the reason if there are none."""
+    """Maps as bytes (steps, L, R, S) relative to the maximum of each layer; None with the reason if there are none.
+
+    A step without a map has zeros.
+    """
     if checkpoint is None:
         return None, "maps need the filter: its checkpoint, or --filter FILE.py:FUNCTION"
     if reason := no_maps(checkpoint, trace):
         return None, reason
     engine = MapEngine(checkpoint, trace)
-    first = engine.map(0, size=size)
+    first = next(engine.maps(range(len(trace)), size))
     stride = -(-len(trace) * first.log_likelihood.size // MAP_BYTES)
     layers, centres = [], []
     for step in range(0, len(trace), stride):
-        map_ = engine.map(step, size=size)
-        layers.append(map_.normalised())
-        centres.append(map_.centre)
+        maps = [*engine.maps([step], size)]
+        layers += [map_.normalised() for map_ in maps] or [np.zeros(first.log_likelihood.shape, np.uint8)]
+        centres.append(trace.anchors[step][list(first.components)])
         progress(step / len(trace))
     components = [trace.task.components[i] for i in first.components]
     factors = np.array([component.conversion[1] for component in components])

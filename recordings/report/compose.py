@@ -222,12 +222,13 @@ class Writer:
         if self.no_maps is None and worst.modalities_with_posterior and worst.episode.contact.any():
             assert self.report.checkpoint is not None
             steps = paper.steps_by_contact(worst.episode, worst.episode_index)
-            figure = paper.maps_figure(self.report.checkpoint, worst, steps, quantity=self.report.quantity)
-            caption = (
-                "Likelihood or posterior (see the titles) of each modality around the true position, episode "
-                f"{worst.episode_index}, in the middle of the longest stretch of contact and of free motion."
-            )
-            items.append(self.figure("maps-by-contact", caption, figure))
+            if no_maps(self.report.checkpoint, worst, self.report.quantity, list(steps.values())) is None:
+                figure = paper.maps_figure(self.report.checkpoint, worst, steps, quantity=self.report.quantity)
+                caption = (
+                    "Likelihood or posterior (see the titles) of each modality around the true position, episode "
+                    f"{worst.episode_index}, in the middle of the longest stretch of contact and of free motion."
+                )
+                items.append(self.figure("maps-by-contact", caption, figure))
         return Section("summary", "Accuracy", "", "", tuple(items))
 
     def diagnosis(self) -> Section:
@@ -263,8 +264,9 @@ class Writer:
         name = f"event-{index + 1}"
         map_ = zoomed = None
         zoom, data = 1, []
-        if self.no_maps is None:
-            quantity = self.report.quantity
+        quantity = self.report.quantity
+        reason = self.no_maps or self._engine(event.trace).no_map(step, quantity)
+        if reason is None:
             map_ = zoomed = self._engine(event.trace).map(step, size=FINE, quantity=quantity)
             buffer = io.BytesIO()
             arrays: dict[str, Any] = {f.name: np.asarray(getattr(map_, f.name)) for f in fields(map_)}
@@ -277,7 +279,7 @@ class Writer:
                 caption += " The fused estimate is outside of the map."
                 zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:
-            caption = f"Estimates as offsets from the true position. No maps: {self.no_maps}."
+            caption = f"Estimates as offsets from the true position. No maps: {reason}."
         if any(not sensor.points for sensor in displayed_sensors(trace)):
             caption = f"Inputs of the filter. {caption}"
         scene = [] if trace.task.floor is None else [draw_step(trace, step, zoomed)]

@@ -1,4 +1,4 @@
-"""A live run whose filter lost the state at one step: the other steps have maps, this one the reason."""
+"""A live run whose filter lost the state or its covariance at one step: it has the reason, the others have maps."""
 
 from __future__ import annotations
 
@@ -24,29 +24,30 @@ TASK = bs.Task(
     map_components=("cart", "swing"),
     map_half_width=0.2,
 )
-LOST = 2
+LOST, INDEFINITE = 2, 3
 
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    values = [*np.full(LOST, 0.01), np.nan, 0.01]
+    steps = [(0.01, 1e-4), (0.01, 1e-4), (np.nan, 1e-4), (0.01, -1e-4), (0.01, 1e-4)]
     with bs.LiveRecorder("run", task=TASK, folder=tmp_path / "workspace" / "live", filter="own", views=False) as live:
-        for value in values:
-            estimate = {"estimate_mean": np.full(2, value), "estimate_covariance": np.eye(2) * 1e-4}
+        for value, variance in steps:
+            estimate = {"estimate_mean": np.full(2, value), "estimate_covariance": np.eye(2) * variance}
             live.step(estimate, {"encoder": np.zeros(1)}, np.zeros(0), truth=np.zeros(2))
     return Settings(tmp_path / "workspace")
 
 
-def test_one_step_without_an_estimate_does_not_stop_the_maps(client: TestClient) -> None:
+def test_one_step_without_a_belief_does_not_stop_the_maps(client: TestClient) -> None:
     view = client.post("/api/views", json={}).json()
     cursor = {"task": "crane", "filter": "own", "episode": 0, "size": 41, "data": "live:run", "scene": False}
     with client.websocket_connect(view["socket"]) as socket:
-        for step in (LOST - 1, LOST, LOST + 1):
+        for step in range(1, 5):
             socket.send_json({"type": "cursor", "serial": step, "step": step, **cursor})
             answer = socket.receive()
-            if step == LOST:
+            if step in (LOST, INDEFINITE):
                 reply = json.loads(answer["text"])
                 assert (reply["type"], reply["step"]) == ("no_maps", step)
-                assert reply["reason"] == f"No maps: the estimate at step {step} is not a finite number."
+                reason = "the estimate at step 2 is not a finite number"
+                assert reason in reply["reason"] if step == LOST else "a covariance at step 3 is not" in reply["reason"]
             else:
                 assert answer.get("bytes"), answer

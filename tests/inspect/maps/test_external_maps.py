@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from base64 import b64decode
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,11 @@ from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.likelihood import log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.inspect.diagnostics.likelihood_maps import maps
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, trace
+from beliefscope.recordings.interactive.export import run_document
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "traces"))
 import torchfilter_stubs as stubs
@@ -98,7 +101,21 @@ def test_a_step_without_a_positive_definite_covariance_has_no_map_and_the_others
         modality_mean=np.full_like(particles.modality_mean, np.nan),
         **dict.fromkeys(("particles", "log_weights", "prior_log_weights", "log_likelihood")),
     )
-    assert "a covariance of step 4 is not positive definite" in (no_maps(filter_, run) or "")
+    assert no_maps(filter_, run) is None
+    everywhere = replace(run, estimate_covariance=-np.abs(covariance))
+    assert "a covariance of step 0 is not positive definite" in (no_maps(filter_, everywhere) or "")
     assert "a covariance of step 4 is not positive definite" in (no_maps(filter_, run, "posterior", [4, 5]) or "")
     assert no_maps(filter_, run, "posterior", [5]) is None
     assert paper.maps_figure(filter_, run, {False: 5}, 5, "posterior").axes
+    engine = MapEngine(filter_, run)
+    assert [map_.step for map_ in engine.maps(range(3, 7), 5)] == [3, 5, 6]
+    with pytest.raises(BadInput, match="a covariance of step 4 is not positive definite"):
+        engine.map(4, size=5)
+    survey = maps([run], filter_, size=5)
+    assert len(survey.numbers.steps) == len(run) - 1
+    assert [curve.values.shape for curve in survey.curves()] == [(len(run),)] * len(survey.curves())
+    assert all(np.flatnonzero(np.isnan(curve.values)).tolist() == [4] for curve in survey.curves())
+    assert {len(values) for values in (*survey.phases.values(), survey.trajectory)} == {len(run) - 1}
+    document = run_document(run, filter_, 5, lambda share: None)["maps"]
+    cells = np.frombuffer(b64decode(document["data"]), np.uint8).reshape(-1, *document["shape"])
+    assert np.flatnonzero(~cells.any(axis=(1, 2, 3))).tolist() == [4], document["stride"]
