@@ -11,7 +11,7 @@ from beliefscope.app.runs.worker import Report
 from beliefscope.filters.checkpoint import PRETRAINED
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.names import is_code
-from beliefscope.inspect.maps.map_engine import missing_quantities
+from beliefscope.inspect.maps.availability import missing_quantities
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 from beliefscope.recordings.report.pdf import browser
 

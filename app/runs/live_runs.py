@@ -24,8 +24,9 @@ from beliefscope.datasets.faults.injection import NO_FAULTS
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.inspect.maps.availability import missing_quantities, no_maps
 from beliefscope.inspect.maps.likelihood_map import MapOptions
-from beliefscope.inspect.maps.map_engine import LikelihoodMap, MapEngine, missing_quantities, no_maps
+from beliefscope.inspect.maps.map_engine import LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.live_file import SUFFIX
 from beliefscope.inspect.traces.live_run import LiveRun

@@ -16,8 +16,9 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.out_of_distribution import data_warning
 from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
 from beliefscope.inspect.diagnostics.kalman_equations import wrong_equations
+from beliefscope.inspect.maps.availability import missing_quantities, no_maps
 from beliefscope.inspect.maps.likelihood_map import MapOptions
-from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap, MapEngine, missing_quantities, no_maps
+from beliefscope.inspect.maps.map_engine import COARSE, LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import Trace, arrays_of
 from beliefscope.inspect.traces.restarts import FAILURE, RESTARTS
 

@@ -15,7 +15,8 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Progress
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table
-from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.availability import no_maps
+from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, Quantity
 from beliefscope.inspect.maps.map_statistics import MapStatistics, measure_maps
 from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES

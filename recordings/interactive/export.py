@@ -22,7 +22,8 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.cause import probability_text
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.figures.top_view import scene_footprints
-from beliefscope.inspect.maps.map_engine import COARSE, MapEngine, no_maps
+from beliefscope.inspect.maps.availability import no_maps
+from beliefscope.inspect.maps.map_engine import COARSE, MapEngine
 from beliefscope.inspect.palette import colour, colour_table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace

@@ -35,7 +35,8 @@ from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
 from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.figures.top_view import draw_step, draws_force, scene_footprints
-from beliefscope.inspect.maps.map_engine import FINE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.availability import no_maps
+from beliefscope.inspect.maps.map_engine import FINE, MapEngine, Quantity
 from beliefscope.inspect.maps.plane import is_outside
 from beliefscope.inspect.slices.report import check_episodes, slices_of
 from beliefscope.inspect.standalone import standalone_runs

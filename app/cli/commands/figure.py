@@ -121,7 +121,7 @@ def figure(
     from beliefscope.inspect.figures import paper
     from beliefscope.inspect.figures.timeline import DEFAULT_CHARTS, View, timeline
     from beliefscope.inspect.figures.timeline_figure import FORMATS, encoded_timeline
-    from beliefscope.inspect.maps.map_engine import no_maps
+    from beliefscope.inspect.maps.availability import no_maps
     from beliefscope.inspect.maps.plane import is_outside
 
     format = figure_format(output, FORMATS if kind == "timeline" else plotting.FORMATS)

@@ -24,7 +24,8 @@ def record(
       beliefscope record door --filter crossmodal-pf --faults image_frozen=20 -o frozen.rrd
     """
     from beliefscope.inspect.catalog import quick
-    from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
+    from beliefscope.inspect.maps.availability import no_maps
+    from beliefscope.inspect.maps.map_engine import MapEngine
     from beliefscope.recordings.write import write_recording
 
     checkpoint, faults = run.open()

@@ -54,7 +54,7 @@ def report(
       beliefscope report run.trace --event 35 --event 68 --all
       beliefscope report traces/today --profile-from traces/healthy
     """
-    from beliefscope.inspect.maps.map_engine import no_maps
+    from beliefscope.inspect.maps.availability import no_maps
     from beliefscope.recordings.open_trace import open_traces
     from beliefscope.recordings.report.compose import compose, parse_event, write_report
     from beliefscope.recordings.report.folder import check_folder

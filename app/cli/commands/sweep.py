@@ -61,14 +61,8 @@ def sweep(
     from beliefscope.recordings.sweep_table import run_sweep
 
     opt.check_folder(output, "output")
-    inputs = Inputs(
-        find_checkpoints(checkpoints),
-        tuple(path.resolve() for path in data or ()),
-        tuple(dict.fromkeys(faults or [""])),
-        tuple(range(seeds)),
-        particles,
-        every,
-    )
+    files, texts = tuple(path.resolve() for path in data or ()), tuple(dict.fromkeys(faults or [""]))
+    inputs = Inputs(find_checkpoints(checkpoints), files, texts, tuple(range(seeds)), particles, every)
     skipped: set[Path] = set()
 
     def skip(problem: str, paths: Sequence[Path]) -> None:

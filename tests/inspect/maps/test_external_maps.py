@@ -21,7 +21,8 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnostics.likelihood_maps import maps
 from beliefscope.inspect.figures import paper
-from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
+from beliefscope.inspect.maps.availability import no_maps
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.recordings.interactive.export import run_document
 

@@ -14,7 +14,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.external.unavailable import UnavailableFilter
-from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
+from beliefscope.inspect.maps.availability import no_maps
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.maps.plane import plane_of, round_up
 from beliefscope.inspect.trace import Trace, trace
 

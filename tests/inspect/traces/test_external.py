@@ -23,7 +23,8 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.maps.map_engine import MapEngine, no_maps
+from beliefscope.inspect.maps.availability import no_maps
+from beliefscope.inspect.maps.map_engine import MapEngine
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
 sys.path.insert(0, str(Path(__file__).parent))
