@@ -20,6 +20,7 @@ from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import CovarianceRule
 from beliefscope.filters.models.networks import Encoders, Networks, Pooling
 from beliefscope.filters.models.resampling import Resampling
+from beliefscope.filters.names import no_built_in
 
 Kind = Literal["ekf", "ukf", "pf", "lstm", "transformer"]
 Fusion = Literal["crossmodal", "unimodal", "information", "none"]
@@ -126,9 +127,8 @@ class Filter(nn.Module, ABC):
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         task = architecture.task
-        if task.rotations:
-            name = task.components[task.rotations[0].start].rotation
-            raise BadInput(f"built-in filters estimate vectors; task {task.name!r} has the rotation {name!r}")
+        if reason := no_built_in(task):
+            raise BadInput(reason)
         self.architecture = architecture
         self.task = task
         self.n = len(task.components)
@@ -157,10 +157,13 @@ class Filter(nn.Module, ABC):
         return self.statistics.standardise_observations(batch.observations)
 
     def with_readings(self, evidence: Evidence, batch: Batch) -> Evidence:
-        """The batch's evidence without models none of whose sensors has a reading (``Evidence.select_models``)."""
+        """Evidence of the last steps of a batch without models none of whose sensors has a reading there.
+
+        See ``Evidence.select_models``.
+        """
         if batch.present is None:
             return evidence
-        present = [self.has_reading(batch, name.split("+")) for name in self.names]
+        present = [self.has_reading(batch, name.split("+"))[-len(evidence) :] for name in self.names]
         return evidence.select_models(torch.stack(present, dim=-1))
 
     def has_reading(self, batch: Batch, modalities: Iterable[str]) -> Tensor:
@@ -177,6 +180,10 @@ class Filter(nn.Module, ABC):
     @abstractmethod
     def encode(self, batch: Batch) -> Evidence:
         """Everything that does not depend on the belief, for all T x N at once."""
+
+    def encode_after(self, batch: Batch, lead: int) -> Evidence:
+        """The evidence of all steps but the first ``lead``, which are only seen as earlier ones (``history``)."""
+        return self.encode(batch)[lead:]
 
     @abstractmethod
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:

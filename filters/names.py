@@ -60,6 +60,8 @@ def pretrained_path(task: str | Task, name: str) -> Path:
     available = [filter_ for filter_, path in paths.items() if is_built_in and path.is_file()]
     if name not in filters:
         raise unknown_name("filter", name, available)
+    if definition.rotations and name not in available:
+        raise BadInput(f"{no_built_in(definition)}; give your own filter as FILE.py:FUNCTION")
     if name not in available and task not in TASKS:
         raise BadInput(
             f"no pretrained {name!r} for your own task {task!r}: train one (beliefscope train FILE.py:TASK --data "
@@ -73,6 +75,14 @@ def pretrained_path(task: str | Task, name: str) -> Path:
     return paths[name]
 
 
+def no_built_in(task: Task) -> str | None:
+    """Reason why the built-in filters cannot run over a task, whatever its sensors; None if they can."""
+    if not task.rotations:
+        return None
+    name = task.components[task.rotations[0].start].rotation
+    return f"built-in filters estimate vectors; task {task.name!r} has the rotation {name!r}"
+
+
 def check_trainable(definition: Task, task: str, text: str) -> None:
     """Raise BadInput if ``train`` has no filter of this name, such as for a file or an external filter.
 
@@ -80,6 +90,8 @@ def check_trainable(definition: Task, task: str, text: str) -> None:
     """
     names = filter_names(definition)
     if text in names:
+        if reason := no_built_in(definition):
+            raise BadInput(reason)
         return
     is_external = text.endswith(".py") or is_code(text)
     if not (is_external or is_path(text)):

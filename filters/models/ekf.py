@@ -114,14 +114,23 @@ class ExtendedKalmanFilter(Filter):
         z, noise = self.virtual_sensors[name](observations)
         return z, noise
 
+    def sees_past(self, name: str) -> bool:
+        """Whether a virtual sensor also sees earlier steps."""
+        return False
+
     def encode(self, batch: Batch) -> Evidence:
-        observations = self.observations(batch)
-        z, noise = zip(*(self.sense(name, observations) for name in self.names), strict=True)
+        return self.encode_after(batch, 0)
+
+    def encode_after(self, batch: Batch, lead: int) -> Evidence:
+        observations, count = self.observations(batch), len(batch) - lead
+        recent = {name: values[lead:] for name, values in observations.items()}
+        sensed = (self.sense(name, observations if self.sees_past(name) else recent) for name in self.names)
+        z, noise = zip(*sensed, strict=True)
         evidence = Evidence(
-            control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
-            observation=torch.stack(z, dim=2),
-            noise=torch.stack(noise, dim=2),
-            log_weights=self.log_weights(observations),
+            control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls[lead:])),
+            observation=torch.stack([values[-count:] for values in z], dim=2),
+            noise=torch.stack([values[-count:] for values in noise], dim=2),
+            log_weights=self.log_weights(recent),
         )
         return self.with_readings(evidence, batch)
 

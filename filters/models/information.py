@@ -63,8 +63,7 @@ class InformationFilter(ExtendedKalmanFilter):
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
-        vectors = [name for name in self.names if len(self.task.observations[self.task.modalities[name][0]]) == 1]
-        for name in vectors:
+        for name in filter(self.sees_past, self.names):
             extra = FEATURES if self.follows_circle(name) else 0
             self.virtual_sensors[name] = VirtualSensor(self.task, name, architecture, 1 + len(LAGS), extra)
         shape = (len(self.names), self.n)
@@ -88,6 +87,9 @@ class InformationFilter(ExtendedKalmanFilter):
         """Sizes and correlations of all errors: scales of each R, biases, and process noise."""
         return [self.log_scale, self.log_bias, self.memory, self.log_motion, self.dynamics.log_noise]
 
+    def sees_past(self, name: str) -> bool:
+        return len(self.task.observations[self.task.modalities[name][0]]) == 1
+
     def sense(self, name: str, observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """z and the square root of R's diagonal of one virtual sensor, (T, N, n), standardised.
 
@@ -95,7 +97,7 @@ class InformationFilter(ExtendedKalmanFilter):
             observations: standardised, of consecutive steps.
         """
         sensor, values = self.virtual_sensors[name], observations[name]
-        if values.ndim != 3 or values.dtype == torch.int64:
+        if not self.sees_past(name):
             return sensor(observations)
         channels = position_channels(self.task, name)
         flat = [channel for pair in channels for channel in pair]

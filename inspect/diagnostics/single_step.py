@@ -110,16 +110,15 @@ class SingleStep:
         observations = {name: expand(values) for name, values in batch.observations.items()}
         for name, values in zip(self.modalities, inputs, strict=True):
             observations[name] = torch.cat([observations[name][:-1].to(values.dtype), values.unsqueeze(0)])
-        evidence = self.filter.encode(
-            Batch(
-                observations=observations,
-                controls=expand(batch.controls),
-                states=expand(batch.states),
-                contact=expand(batch.contact),
-                previous=batch.previous.expand(count, -1),
-                present=None if batch.present is None else expand(batch.present),
-            )
-        )[-1:]
+        window = Batch(
+            observations=observations,
+            controls=expand(batch.controls),
+            states=expand(batch.states),
+            contact=expand(batch.contact),
+            previous=batch.previous.expand(count, -1),
+            present=None if batch.present is None else expand(batch.present),
+        )
+        evidence = self.filter.encode_after(window, len(window) - 1)
         for intervention in self._interventions:
             evidence = self.replay.apply_weights(evidence, intervention)
         belief = repeat_belief(self.replay.beliefs[self.step], count)

@@ -145,7 +145,7 @@ def encoded(filter_: Filter, episode: Episode | EpisodeParts) -> Iterator[Eviden
     for first in range(0, len(episode), STEPS_PER_PART):
         lead = min(first, filter_.history)
         part = episode.part(first - lead, min(first + STEPS_PER_PART, len(episode)))
-        yield filter_.encode(_batch(filter_, part))[lead:]
+        yield filter_.encode_after(_batch(filter_, part), lead)
 
 
 def _batch(filter_: Filter, episode: Episode) -> Batch:

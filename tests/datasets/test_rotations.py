@@ -15,6 +15,7 @@ from beliefscope.filters.catalog import build
 from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.external.derived_values import derived
 from beliefscope.filters.filter import Architecture
+from beliefscope.filters.names import check_trainable, pretrained_path
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.diagnostics.consistency import consistency
 from beliefscope.inspect.statistics import measures
@@ -126,6 +127,9 @@ def test_definition_main_error_and_refusals() -> None:
         StartOffset.parse("20deg", attitude)
     with pytest.raises(BadInput, match="built-in filters estimate vectors; task 'attitude'"):
         build(Architecture(attitude, "ekf", "none", ("mag",)))
+    for refuse in (lambda: pretrained_path(attitude, "crossmodal-ekf"), lambda: check_trainable(attitude, "", "lstm")):
+        with pytest.raises(BadInput, match="built-in filters estimate vectors; task 'attitude'"):
+            refuse()
 
 
 @pytest.mark.slow

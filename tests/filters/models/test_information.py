@@ -242,6 +242,12 @@ def test_history_has_the_past_steps_and_nothing_else(filter_: InformationFilter)
     whole = filter_.encode(steps.episode(0)).observation
     later = steps.windows(steps.first + 3, filter_.history + 1)
     torch.testing.assert_close(filter_.encode(later).observation[-1], whole[-1])
+    torch.testing.assert_close(filter_.encode_after(later, filter_.history).observation, whole[-1:])
+    earlier = {**later.observations, "image": later.observations["image"].clone()}
+    earlier["image"][:-1] = 0
+    after = filter_.encode_after(replace(later, observations=earlier), filter_.history)
+    torch.testing.assert_close(after.observation, whole[-1:])
+
     changed = {**later.observations, "haptics": later.observations["haptics"].clone()}
     changed["haptics"][0] += 1.0
     assert (filter_.encode(replace(later, observations=changed)).observation[-1] != whole[-1]).any()
