@@ -23,8 +23,8 @@ from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference
 from beliefscope.inspect.statistics.signals import Array
 
-FORMAT = 3
-"""Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 has other ``MEASURED_ANEW``."""
+FORMAT = 4
+"""Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 and 3 have other ``MEASURED_ANEW``."""
 
 MEASURED_ANEW = (
     "dynamics ",
@@ -87,7 +87,7 @@ class HealthyProfile:
     def from_json(cls, document: Any) -> HealthyProfile:
         """Inverse of ``to_json``. Raises BadInput for another format or malformed values."""
         try:
-            if document["format"] not in (1, 2, FORMAT):
+            if document["format"] not in range(1, FORMAT + 1):
                 raise BadInput(f"healthy record of format {document['format']!r}; this version reads 1 to {FORMAT}")
             count, particles = int(document["episodes"]), document["particles"]
             rows = {

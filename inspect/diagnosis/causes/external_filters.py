@@ -23,6 +23,9 @@ JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*|cov
 EFFECTS = "dynamics effect/*"
 """Effects of the controls on the state, relative to the predicted ones."""
 
+AT_TRUTH = "|".join(f"innovation {kind}/*" for kind in ("offset", "drift", "spread"))
+"""Innovations of steps from true states, after one prediction."""
+
 OF_TRUE_STATES = (
     *(f"dynamics {kind}/" for kind in ("bias", "effect", "error", "nis", "slope", "spread")),
     "process noise/",
@@ -157,8 +160,7 @@ def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str],
     if has_true_starts:
         cause = _with_true_starts(cause)
     if cause.component in inputs:
-        at_truth = "|".join(f"innovation {kind}/*" for kind in ("offset", "drift", "spread"))
-        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|{at_truth}")
+        cause = replace(cause, consequences=f"{cause.consequences}|{JACOBIANS}|{AT_TRUTH}")
     if (modality := images.get(cause.component)) is not None:
         noise = f"measurement noise//*|measurement noise/{modality}/*"
         cause = replace(cause, consequences=f"{cause.consequences}|{noise}")
@@ -174,6 +176,8 @@ def _with_true_starts(cause: Cause) -> Cause:
     if cause.name == "control.bias":  # not the expected controls alone, which are extrapolated to other motions
         symptom = Symptom("dynamics bias/*|dynamics offset/*", 0, optional=True)
         return replace(cause, symptoms=(*cause.symptoms, symptom))
+    if cause.name.startswith("dynamics.") and cause.name != JACOBIAN.name:  # a lost state may have another R
+        cause = replace(cause, consequences=f"{cause.consequences}|{AT_TRUTH}", raises="measurement noise/*")
     if cause.name.startswith(OF_DYNAMICS) and cause.name not in (DRIFT.name, JACOBIAN.name):
         return cause
     unchanged = UNCHANGED_BY_DRIFT if cause.name == DRIFT.name else OF_TRUE_STATES

@@ -41,6 +41,9 @@ NEAR_ANGLE = 0.2
 PREDICTED = 0.05
 """Smallest variance of the predicted changes, relative to that of the true ones, for a slope on them."""
 
+LARGEST_GAIN = 10.0
+"""Largest gain of predicted changes; the true ones hardly depend on those of a larger one."""
+
 ROUNDING = 1e-12
 """Largest variance that a prediction adds by rounding, relative to that of the states; smallest process noise."""
 
@@ -50,7 +53,9 @@ def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
 
     ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2, where the q of an information filter
     grows with the motion. ``dynamics slope``: slope of the predicted on the true change, for components that move
-    enough. ``dynamics bias`` and ``dynamics spread``: mean and standard deviation of r that the slope does not explain.
+    enough; of predictions from true states, the inverse of that of the true on the predicted one, which the process
+    noise does not decrease. ``dynamics bias`` and ``dynamics spread``: mean and standard deviation of r that the slope
+    does not explain.
     ``process noise``: q. ``lag/dynamics``: steps by which the true changes follow the predicted ones.
 
     Of this project's filters also ``opposed/control``, of controls that do not command a measured hand: log-ratio of
@@ -172,14 +177,15 @@ def _of_changes(
 ) -> dict[str, float]:
     """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,).
 
-    are_exact: whether predictions start at true states, so that they have no noise. Bias and spread are then what a
-        slope on the predicted changes does not explain: that on the true ones decreases with the process noise, so that
-        its intercept depends on the speed and what it leaves on the variation of the motion.
+    are_exact: whether predictions start at true states, so that they have no noise. Slope, bias and spread are then
+        those of a line over the predicted changes: the slope on the true ones decreases with the process noise, so that
+        it depends on the variation of the motion, and its intercept on the speed.
     """
     moved = _moved(change, std)
     centred, around = residual - residual.mean(0), change - change.mean(0)
     excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
     bias, spread = residual.mean(0) - excess * change.mean(0), (centred - excess * around).std(0)
+    gain = 1.0 + excess
     if are_exact:
         predicted = residual + change
         distance = predicted - predicted.mean(0)
@@ -188,10 +194,12 @@ def _of_changes(
         varies = moved & (power > PREDICTED * np.square(around).sum(0))
         bias = np.where(varies, residual.mean(0) - slope * predicted.mean(0), bias)
         spread = (centred - slope * distance).std(0)
+        inverse = 1.0 - slope  # of the true on the predicted changes
+        gain = np.where(varies, np.sign(inverse) / np.maximum(np.abs(inverse), 1.0 / LARGEST_GAIN), gain)
     columns = {
         "dynamics bias": bias,
         "dynamics error": np.sqrt(np.square(residual).mean(0)),
-        "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
+        "dynamics slope": np.where(moved, gain, np.nan),
         "dynamics spread": spread,
     }
     return _by_component(task, columns | dict(more))

@@ -17,8 +17,7 @@ from beliefscope.inspect.diagnosis.checks.likelihoods import (
     likelihoods_at_truth,
 )
 from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
-from beliefscope.inspect.diagnostics.statistic_kinds import channel_of
-from beliefscope.inspect.statistics.innovations import channel_names, prediction
+from beliefscope.inspect.statistics.innovations import channels_of, prediction
 from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
 from beliefscope.inspect.statistics.signals import NEAR_TURN, TURN, Array
@@ -180,7 +179,7 @@ def _innovations_at_truth(trace: Trace) -> dict[str, float]:
     if trace.innovation is None:
         return {}
     values: dict[str, float] = {}
-    names = channel_names(trace, trace.innovation)
+    channels = channels_of(trace, trace.innovation)
     for k, modality in enumerate(trace.modalities):
         at = np.isfinite(trace.innovation[:, k]).any(-1) & ~absent(trace, modality)
         if at.sum() < MIN_STEPS:
@@ -188,14 +187,14 @@ def _innovations_at_truth(trace: Trace) -> dict[str, float]:
         nu, times = trace.innovation[at, k].astype(np.float64), np.flatnonzero(at) / len(at)
         for i in np.flatnonzero(np.isfinite(nu).all(0)).tolist():
             spread = max(float(nu[:, i].std()), 1e-12)
-            values[f"innovation offset/{modality} {names[k][i]}/all"] = float(nu[:, i].mean()) / spread
-            values[f"innovation spread/{modality} {names[k][i]}/all"] = spread
+            name = f"{modality} {channels[k][i].name}"
+            values[f"innovation offset/{name}/all"] = float(nu[:, i].mean()) / spread
+            values[f"innovation spread/{name}/all"] = spread
             slope, level = np.polyfit(times, nu[:, i], 1)
             rest = max(float((nu[:, i] - slope * times - level).std()), 1e-12)
-            values[f"innovation drift/{modality} {names[k][i]}/all"] = float(slope) / rest
-        channels = [channel_of(f"{modality} {name}", trace.task) for name in names[k]]
-        metric = [channel is not None and channel[1].unit not in ("", "1", "rad") for channel in channels]
-        turns = (_turned(column) for column, skipped in zip(nu.T, metric, strict=False) if not skipped)
+            values[f"innovation drift/{name}/all"] = float(slope) / rest
+        may_be_angles = [channel.unit in ("", "1", "rad") for channel in channels[k]]
+        turns = (_turned(column) for column, may_turn in zip(nu.T, may_be_angles, strict=False) if may_turn)
         values[f"innovation turns/{modality}/all"] = max(turns, default=0.0)
     return values
 

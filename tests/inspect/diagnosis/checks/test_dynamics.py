@@ -267,8 +267,8 @@ def test_likelihoods_show_the_measurement_model_of_a_filter_that_has_lost_the_st
             assert values[f"measurement function/{key} {axis}/all"] == pytest.approx(0.03 / std, rel=0.3)
 
 
-def test_the_bias_of_exact_predictions_does_not_depend_on_the_speed() -> None:
-    """The slope on true changes is that of changes with process noise: its intercept grows with the mean change."""
+def test_bias_and_gain_of_exact_predictions_do_not_depend_on_process_noise_and_speed() -> None:
+    """A slope on the true changes decreases with the process noise, and its intercept grows with the mean change."""
     biases = {}
     for speed in (0.0, 0.02, 0.06):
         rng, rows = np.random.default_rng(0), []
@@ -280,7 +280,8 @@ def test_the_bias_of_exact_predictions_does_not_depend_on_the_speed() -> None:
             episode = bs.Episode(TASK, states, controls, readings, seed=seed, split="test")
             values = dynamics_statistics(bs.trace(of_cart(Cart(noise=0.05)), [episode]), of_cart(Cart(noise=0.05)))
             rows.append(values["dynamics bias/x/all"])
-            assert values["dynamics slope/x/all"] < 0.7, "diluted"
+            predicted, noise = float(episode.controls[1:, 0].std()), 0.05 / math.sqrt(len(episode))
+            assert 1.0 / values["dynamics slope/x/all"] == pytest.approx(1.0, abs=4.0 * noise / predicted)
         biases[speed] = np.mean(rows)
     deviation = 0.05 / math.sqrt(4 * 60)
     assert biases == pytest.approx(dict.fromkeys(biases, 0.0), abs=4.0 * deviation)
