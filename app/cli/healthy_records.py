@@ -17,16 +17,23 @@ if TYPE_CHECKING:
 
 
 def record_for_runs(
-    traces: Sequence[Trace], places: Sequence[str], filter_: str, source: Path | None, alarm_rate: float | None = None
+    traces: Sequence[Trace],
+    places: Sequence[str],
+    filter_: str,
+    source: Path | None,
+    alarm_rate: float | None = None,
+    workspace: Path | None = None,
 ) -> tuple[list[Trace], Checkpoint, HealthyProfile]:
     """Runs with one definition of their task, their filter, which may be unavailable, and its healthy record.
 
     Args:
         places: of the runs, for messages. filter_: as for ``checkpoint_of``.
-        source: recorded runs, or data that the filter runs over. Default: the record of the filter itself.
+        source: recorded runs, or data that the filter runs over. Default: the record of the filter itself, or that
+            which the workspace keeps of it.
 
     Raises BadInput as ``comparable`` and ``record_of_data``, and if an unavailable filter would have to run.
     """
+    from beliefscope.app.workspace.healthy_records import with_kept_record
     from beliefscope.filters.external.unavailable import UnavailableFilter
     from beliefscope.filters.names import is_run
     from beliefscope.inspect.healthy import recorded_profile
@@ -39,7 +46,9 @@ def record_for_runs(
         _warn_of_overlap((trace.episode for trace in clean), (trace.episode for trace in runs))
         with console.progress("Measuring the healthy record") as advance:
             return runs, checkpoint, recorded_profile(checkpoint, clean, str(source), advance)
-    if isinstance(checkpoint, UnavailableFilter):
+    if source is None and workspace is not None:
+        checkpoint = with_kept_record(checkpoint, workspace)
+    if isinstance(checkpoint, UnavailableFilter) and (source is not None or checkpoint.healthy_profile is None):
         raise BadInput(
             "recorded runs need a healthy record: give a folder of at least 10 recorded runs without a fault, "
             "--profile-from DIR, or the filter of the runs, --filter"

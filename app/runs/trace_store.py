@@ -1,6 +1,5 @@
 """The traces of a server, each computed once on first request; and the catalog of filters and data sets."""
 
-import copy
 import hashlib
 import json
 import threading
@@ -23,7 +22,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings, origin
 from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
-from beliefscope.app.workspace.healthy_records import record_path
+from beliefscope.app.workspace.healthy_records import record_path, with_record
 from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.app.workspace.saved_filters import SavedFilters
 from beliefscope.datasets.dataset import Dataset
@@ -201,10 +200,7 @@ class TraceStore:
     def _with_record(self, checkpoint: Checkpoint) -> Checkpoint:
         with self._lock:
             record = self._records.get(record_path(self.settings.workspace, checkpoint))
-        if record is not None:
-            checkpoint = copy.copy(checkpoint)
-            object.__setattr__(checkpoint, "healthy_profile", record)  # a checkpoint is frozen
-        return checkpoint
+        return checkpoint if record is None else with_record(checkpoint, record)
 
     def record_version(self, checkpoint: Checkpoint) -> int | None:
         """Differs between measurements of the filter's record in the workspace; None without."""

@@ -24,7 +24,8 @@ from beliefscope.inspect.statistics.reference_images import Reference
 from beliefscope.inspect.statistics.signals import Array
 
 FORMAT = 4
-"""Of earlier ones, 1 has no reference and no statistics of sensors and modules, 2 and 3 have other ``MEASURED_ANEW``."""
+"""Of earlier ones, 1 has no reference and no statistics of sensors and modules; 2 and 3 have other ``MEASURED_ANEW``,
+3 other slopes of the dynamics."""
 
 MEASURED_ANEW = (
     "dynamics ",

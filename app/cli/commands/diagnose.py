@@ -13,6 +13,7 @@ from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,19 @@ class Options(TaskOrRecordedRuns):
     )
     workspace: Path | None = opt.option(
         "DIR",
-        "Workspace that keeps the healthy record of recorded runs, so that the page diagnoses the runs of this filter.",
+        "Workspace that keeps the healthy record of --profile-from: later diagnoses of the filter and the page use it.",
         None,
     )
     workers: int = 1
     engine: opt.Engine = "local"
+
+    def keep_record(self, checkpoint: Checkpoint, profile: HealthyProfile) -> None:
+        """Keep a measured record in the workspace, where the page finds it."""
+        from beliefscope.app.workspace.healthy_records import record_path
+        from beliefscope.app.workspace.json_files import write_record
+
+        if self.workspace is not None and self.profile_from is not None:
+            write_record(profile.to_json(), record_path(self.workspace, checkpoint))
 
 
 def diagnose(options: Options) -> console.Result:
@@ -93,25 +102,28 @@ def diagnose(options: Options) -> console.Result:
         raise BadInput(f"--alarm-rate is {options.alarm_rate:g}, not a probability between 0 and 1")
     if options.profile_filter is not None and options.profile_from is None:
         raise BadInput("--profile-filter needs --profile-from, the clean episodes that it runs over")
+    if options.workspace is not None:
+        opt.check_workspace(options.workspace)
     if options.is_recorded:
         if options.faults or options.base or options.profile_filter or options.repair is not None:
             raise BadInput(
                 "recorded runs are diagnosed as they are, without --faults, --base, --profile-filter, --repair"
             )
         return _of_recordings(options)
-    if options.workspace is not None:
-        raise BadInput("--workspace is for recorded runs; the page itself measures the record of a filter that can run")
     return _of_filter(options)
 
 
 def _of_filter(options: Options) -> console.Result:
     """The diagnosis of a filter that runs over episodes."""
+    from beliefscope.app.workspace.healthy_records import with_kept_record
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
     from beliefscope.inspect.diagnosis.undo.repair import check_repairable, healthy_bound, smallest_repair
     from beliefscope.inspect.trace import trace
 
     checkpoint, faults = options.open()
+    if options.workspace is not None and options.profile_from is None:
+        checkpoint = with_kept_record(checkpoint, options.workspace)
     if options.repair is not None:
         check_repairable(checkpoint)
     correct = checkpoint if options.profile_filter is None else open_filter(checkpoint.task, options.profile_filter)
@@ -126,6 +138,7 @@ def _of_filter(options: Options) -> console.Result:
     profile = record_of_data(
         correct, options.profile_from, episodes.values(), options.alarm_rate, injected=bool(options.faults)
     )
+    options.keep_record(checkpoint, profile)
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
@@ -150,8 +163,6 @@ def _of_filter(options: Options) -> console.Result:
 
 def _of_recordings(options: Options) -> console.Result:
     """The diagnosis of recorded runs, with a healthy record of other ones or of the filter, which may run for it."""
-    from beliefscope.app.workspace.healthy_records import record_path
-    from beliefscope.app.workspace.json_files import write_record
     from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
     from beliefscope.inspect.diagnostics.views import Table
     from beliefscope.recordings.open_trace import runs_by_file
@@ -164,11 +175,9 @@ def _of_recordings(options: Options) -> console.Result:
             raise BadInput(f"{options.task} has no run of episode {options.episode}")
     places = [options.task] * len(traces)
     traces, checkpoint, profile = record_for_runs(
-        traces, places, options.filter, options.profile_from, options.alarm_rate
+        traces, places, options.filter, options.profile_from, options.alarm_rate, options.workspace
     )
-    if options.workspace is not None:
-        opt.check_workspace(options.workspace)
-        write_record(profile.to_json(), record_path(options.workspace, checkpoint))  # where the page finds it
+    options.keep_record(checkpoint, profile)
     with console.progress("Diagnosing") as advance:
         result = diagnose_traces(
             checkpoint,

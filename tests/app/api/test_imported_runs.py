@@ -12,6 +12,8 @@ from httpx import Response
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.workspace.healthy_records import record_path
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 
 pytestmark = pytest.mark.slow
 
@@ -104,9 +106,13 @@ def test_runs_are_diagnosed_with_a_kept_record(
         assert client.get(all_runs, params=over).json() == {"job": None}  # not the result without the record
         other = client.get(f"/api/diagnosis/{url}", params={"data": "live:day_1"}).json()["preliminary"]
         assert other["state"] == "healthy"
+        code, out, _ = run("diagnose", live / "wrong_0.live", "--workspace", imported.workspace)
+        assert (code, out.startswith("Filter changed, while its readings show no fault")) == (0, True)
 
 
-def test_a_kept_record_is_of_recorded_runs(run: Run, tmp_path: Path) -> None:
+def test_an_invalid_record_of_the_workspace_is_named(run: Run, tmp_path: Path) -> None:
+    path = record_path(tmp_path, load_checkpoint(pretrained_path("door", "crossmodal-ekf")))
+    path.parent.mkdir()
+    path.write_text("[]")
     code, _, error = run("diagnose", "door", "--filter", "crossmodal-ekf", "--workspace", tmp_path)
-    assert code == 2
-    assert "--workspace is for recorded runs" in error
+    assert (code, f"{path} is no healthy record: " in " ".join(error.split())) == (2, True)

@@ -55,3 +55,18 @@ def test_a_small_record_has_no_low_alarm_rate(run: Run, tmp_path: Path) -> None:
     code, _, error = run(line)
     assert code == 2
     assert "needs 49; diagnose several episodes, or use a rate of 0.077 or more" in error
+
+
+def test_a_workspace_keeps_the_record_for_later_diagnoses(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_dataset(sample_path("door")) as data:
+        write_dataset(tmp_path / "clean.h5", data.task, [data[index] for index in data.held_out()[:12]])
+    line = f"diagnose door --filter {OWN} --episode 9 --workspace {tmp_path / 'workspace'}"
+    code, first, _ = run(f"{line} --profile-from {tmp_path / 'clean.h5'}")
+    assert code == 0
+    monkeypatch.setattr("beliefscope.inspect.healthy.profile_of", None)
+    code, second, _ = run(line)
+    assert (code, second.splitlines()[0]) == (0, first.splitlines()[0]), "nothing is measured again"
+    code, _, error = run(f"diagnose door --filter {OWN} --episode 9 --workspace {tmp_path / 'other'}")
+    assert (code, "no healthy record" in error) == (2, True)
