@@ -179,6 +179,9 @@ def _check_components(task: Task, place: str) -> None:
 
 def _check_sensors(task: Task, place: str) -> None:
     """Observations, their shapes and periods, and the modalities that have them."""
+    for kind, names in (("observation", task.observations), ("modality", task.modalities)):
+        for name in names:
+            _check_name(name, f"{place}: {kind} {name!r:.200}", "/" if kind == "observation" else "/+")
     for key, shape in task.observations.items():
         if not shape or not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
@@ -202,10 +205,20 @@ def _check_sensors(task: Task, place: str) -> None:
             raise BadInput(f"{place}: modality {modality!r} has no observations.")
 
 
+def _check_name(name: object, about: str, excluded: str = "/") -> None:
+    """Raise BadInput for a name with a separator of statistics or files, or of joined modalities.
+
+    about: start of the message.
+    """
+    if not isinstance(name, str) or not name or set(name) & set(excluded):
+        raise BadInput(f"{about} has an invalid name, expected a text without {' and '.join(excluded)}.")
+
+
 def _check_component(component: Component, about: str) -> None:
     """about: start of the message."""
-    if not isinstance(component.name, str) or component.static not in (0, 1):
-        raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
+    _check_name(component.name, about)
+    if component.static not in (0, 1):
+        raise BadInput(f"{about} is static {component.static!r:.200}, expected true or false.")
     if not isinstance(component.unit, str) or len(component.unit) > 40:
         raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
     if component.wraps not in (0, 1) or (component.wraps and (component.unit != "rad" or component.rotation)):
@@ -224,8 +237,6 @@ def _check_channels(task: Task, place: str) -> None:
             raise BadInput(f"{place}: channels of {key!r:.200} are {len(channels)}, expected {expected}.")
         for channel in channels:
             _check_component(channel, f"{place}: channel {channel.name!r:.200} of {key!r:.200}")
-            if "/" in channel.name:
-                raise BadInput(f"{place}: channel {channel.name!r:.200} of {key!r:.200} has a slash in its name.")
         if len({channel.name for channel in channels}) < len(channels):
             raise BadInput(f"{place}: channels of {key!r:.200} have equal names.")
 
@@ -255,7 +266,8 @@ def _check_covariates(task: Task, place: str) -> None:
         if not isinstance(covariate, Covariate):
             raise BadInput(f'{place}: covariate {name!r:.200} is {covariate!r:.200}, expected Covariate("boolean").')
         where, cuts = f"{place}: covariate {name!r:.200}", covariate.cuts
-        if not name or "/" in name or covariate.kind not in get_args(Kind) or not isinstance(covariate.unit, str):
+        _check_name(name, where)
+        if covariate.kind not in get_args(Kind) or not isinstance(covariate.unit, str):
             raise BadInput(f"{where} has kind {covariate.kind!r:.200}, expected one of {', '.join(get_args(Kind))}.")
         if not all(map(_number, cuts)) or list(cuts) != sorted(set(cuts)) or (cuts and covariate.kind != "continuous"):
             raise BadInput(f"{where} has cuts {cuts!r:.200}, expected ascending numbers of a continuous covariate.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -17,7 +18,9 @@ from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.inspect.diagnosis.checks.control_effects import control_effects
 from beliefscope.inspect.diagnosis.checks.true_starts import (
+    Predictions,
     has_true_starts,
+    predictions_by_calls,
     predictions_from_truth,
     some_steps,
     uses_start,
@@ -134,8 +137,9 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
             return values
         change, predicted, added = task.difference(states[steps], states[steps - 1]), started.change, started.added
         values |= control_effects(trace, checkpoint, steps, started, change)
+        random = _random_variance(trace, checkpoint, steps, started)
     else:
-        added = None
+        added = random = None
         if belief.covariance is not None and trace.has_covariance:
             added = belief.covariance[steps] - trace.estimate_covariance[steps - 1].astype(np.float64)
     residual = measures.wrapped(task, predicted - change)
@@ -145,7 +149,17 @@ def external_dynamics_statistics(trace: Trace, checkpoint: ExternalFilter) -> di
         variance = np.maximum(np.median(np.diagonal(added, axis1=-2, axis2=-1), axis=0), smallest)
         squared = np.maximum(np.square(residual).mean(0), smallest)
         more = {"dynamics nis": squared / variance, "process noise": np.sqrt(variance)}
-    return values | _of_changes(task, residual, change, more, states.std(0), are_exact=starts)
+    return values | _of_changes(task, residual, change, more, states.std(0), random)
+
+
+def _random_variance(
+    trace: Trace, checkpoint: ExternalFilter, steps: NDArray[np.intp], predictions: Predictions
+) -> Array:
+    """(n,) variance of the predicted changes by random numbers, such as those of particles: that of two seeds."""
+    other = predictions_by_calls(replace(trace, seed=trace.seed + 1), checkpoint, steps, predictions.calls)
+    if other is None:
+        return np.zeros(predictions.change.shape[1])
+    return 0.5 * np.square(measures.wrapped(trace.task, predictions.change - other.change)).mean(0)
 
 
 def _offset(trace: Trace, steps: NDArray[np.intp], residual: Array) -> Array:
@@ -173,28 +187,29 @@ def _moved(change: Array, std: Array) -> Mask:
 
 
 def _of_changes(
-    task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array, are_exact: bool = False
+    task: Task, residual: Array, change: Array, more: Mapping[str, Array], std: Array, random: Array | None = None
 ) -> dict[str, float]:
     """Statistics of residuals (T, n) of predicted changes, of states with standard deviations (n,).
 
-    are_exact: whether predictions start at true states, so that they have no noise. Slope, bias and spread are then
-        those of a line over the predicted changes: the slope on the true ones decreases with the process noise, so that
-        it depends on the variation of the motion, and its intercept on the speed.
+    random: (n,) variance of the predictions by random numbers, if they start at true states and so have no other noise.
+        Slope, bias and spread are then those of a line over the predicted changes: the slope on the true ones decreases
+        with the process noise, so that it depends on the variation of the motion, and its intercept on the speed.
     """
     moved = _moved(change, std)
     centred, around = residual - residual.mean(0), change - change.mean(0)
     excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
     bias, spread = residual.mean(0) - excess * change.mean(0), (centred - excess * around).std(0)
     gain = 1.0 + excess
-    if are_exact:
+    if random is not None:
         predicted = residual + change
         distance = predicted - predicted.mean(0)
-        power = np.square(distance).sum(0)
-        slope = (centred * distance).sum(0) / np.maximum(power, 1e-12)
+        total = np.square(distance).sum(0)
+        power = total - len(predicted) * random
         varies = moved & (power > PREDICTED * np.square(around).sum(0))
-        bias = np.where(varies, residual.mean(0) - slope * predicted.mean(0), bias)
-        spread = (centred - slope * distance).std(0)
-        inverse = 1.0 - slope  # of the true on the predicted changes
+        power = np.maximum(np.where(varies, power, total), 1e-12)
+        inverse = (around * distance).sum(0) / power  # slope of the true on the predicted changes
+        bias = np.where(varies, inverse * predicted.mean(0) - change.mean(0), bias)
+        spread = (inverse * distance - around).std(0)
         gain = np.where(varies, np.sign(inverse) / np.maximum(np.abs(inverse), 1.0 / LARGEST_GAIN), gain)
     columns = {
         "dynamics bias": bias,
