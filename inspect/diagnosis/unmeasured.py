@@ -36,6 +36,8 @@ def statistics_by_subject(case: Case) -> dict[str, int]:
 
     def subject(statistic: str) -> str:
         kind, about, _ = statistic.split("/")
+        if kind == "label shift":
+            return "labels"
         if statistic in of_sensors or about == "labels":
             return sensor_of(about, case.inputs.checkpoint.task.observations)[0]
         return "models" if kind.startswith(("module", "dynamics", "process noise")) else "filter"

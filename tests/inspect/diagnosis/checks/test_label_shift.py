@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnosis.case import Case
 from beliefscope.inspect.diagnosis.catalog import causes_of
 from beliefscope.inspect.diagnosis.checks.label_shift import label_shift_statistics
 from beliefscope.inspect.diagnosis.scoring import explain, probabilities
+from beliefscope.inspect.diagnosis.unmeasured import statistics_by_subject
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
@@ -83,3 +87,13 @@ def test_the_cause_is_the_labels_and_not_each_of_the_sensors() -> None:
         deviations.append(Deviation(f"reading bias/{key} x/all", 9.0, 0.0, -0.1, 0.1, 0.0, True, 20.0))
     result = probabilities({cause.name: explain(cause, deviations) for cause in causes_of(TASK)})
     assert result["labels.offset"] > 0.8
+
+
+def test_the_statistic_counts_as_one_of_the_labels() -> None:
+    names = ["label shift//all", "reading bias/gps x/all", "error//all"]
+    case = SimpleNamespace(
+        inputs=SimpleNamespace(checkpoint=SimpleNamespace(task=TASK)),
+        deviations=[Deviation(name, 0.0, 0.0, 0.0, 0.0, 1.0, False, 0.0) for name in names],
+        sensors=[dict.fromkeys(names[:2], 0.0)],
+    )
+    assert statistics_by_subject(cast(Case, case)) == {"gps": 1, "labels": 1, "filter": 1}
