@@ -147,6 +147,28 @@ test('listeners are called once per frame with all changes', () => {
   assert.equal(store.inputTime, null);
 });
 
+test('a component that the new task does not have is replaced by one of its map', () => {
+  const [x, y] = TASK.components.map(({ unit }, i) => ({
+    ...TASK.components[i],
+    name: 'xyz'[i],
+    unit,
+  }));
+  const push = {
+    ...TASK,
+    name: 'push',
+    components: [x, y],
+    map: { ...TASK.map, components: ['x', 'y'] },
+  };
+  const store = new Store(stateOf('?component=angle'), { ...CATALOG, tasks: [TASK, push] });
+  store.set({ task: 'push' });
+  assert.equal(store.state.component, 'x');
+  store.set({ task: 'push', component: 'y' });
+  assert.equal(store.state.component, 'y');
+  store.set({ task: 'door', component: 'angle' });
+  assert.equal(store.state.component, 'angle');
+  runFrames();
+});
+
 test('a change of the selection adds a history entry', () => {
   const store = new Store(stateOf(''));
   const before = history.length;
@@ -157,7 +179,7 @@ test('a change of the selection adds a history entry', () => {
 });
 
 test('undo and redo restore the selection with its step', () => {
-  const store = new Store(stateOf('?step=2'));
+  const store = new Store(stateOf('?step=2'), CATALOG);
   const undo = new Undo(store);
   store.set({ faults: 'blackout=1' });
   store.flush();

@@ -1,7 +1,7 @@
 /** The state of the page and its permalink: opening the link restores the state. */
 
 /** @import { Maps, Range, Scale } from '../maps/map_values.js' */
-/** @import { Catalog, DataSet, LiveList } from '../types/server.js' */
+/** @import { Catalog, DataSet, LiveList, Task } from '../types/server.js' */
 /** @import { ColourMap } from './colours.js' */
 
 import { SCALAR, TRACKS } from '../timeline/tracks.js';
@@ -219,13 +219,16 @@ export class Store {
   }
 
   /**
+   * Changes the state. A component that the new task does not have is replaced by the first one of its map.
    * @param {Partial<State>} patch
    * @param {{origin?: Origin, inputTime?: number | null}} [cause]
    */
   set(patch, { origin = 'page', inputTime = null } = {}) {
     /** @type {Record<string, unknown>} */
     const state = this.state;
-    for (const [key, value] of Object.entries(patch)) {
+    const task = 'task' in patch && this.task(patch.task);
+    const component = task && componentOf(task, patch.component ?? this.state.component);
+    for (const [key, value] of Object.entries(component ? { ...patch, component } : patch)) {
       if (state[key] === value) continue;
       state[key] = value;
       this.#changed.add(key);
@@ -265,6 +268,14 @@ export class Store {
     }
   }
 }
+
+/**
+ * Returns the name of a component that a task has: the given one, or else the first one of its map.
+ * @param {Task} task
+ * @param {string} name
+ */
+export const componentOf = ({ components, map }, name) =>
+  components.some((component) => component.name === name) ? name : map.components[0];
 
 /**
  * Returns the query string that restores a state.

@@ -6,7 +6,7 @@
 
 import { HASH_DIGITS } from '../core/constants.js';
 import { create, createButton, html, messageOf } from '../core/dom.js';
-import { permalink } from '../core/state.js';
+import { componentOf, permalink } from '../core/state.js';
 import { fixed, significant, stepLabel } from '../core/units.js';
 import * as api from '../data/api.js';
 import { sortRows } from '../widgets/sorting.js';
@@ -172,9 +172,16 @@ export class EpisodePanel {
     const { result } = worstOfSeed(this.#episodes, this.#openedSeed);
     const episode = result?.episode ?? worst_episode ?? 0;
     const step = result?.worst_step ?? worst_step ?? 0;
-    const sets = this.#store.task(task)?.data;
+    const [run, { component }] = [this.#store.task(task), this.#store.state];
     const place = { episode, step, against: '', playing: false };
-    return { task, filter, faults, data: data ?? sets?.[0]?.name ?? '', ...place };
+    return {
+      task,
+      filter,
+      faults,
+      data: data ?? run?.data[0]?.name ?? '',
+      component: run ? componentOf(run, component) : component,
+      ...place,
+    };
   }
 
   /**
