@@ -28,6 +28,7 @@ import {
   sortText,
   sortValue,
   unknownChoice,
+  whyNotCompared,
 } from '../../app/page/tabs/experiment_rows.js';
 import { niceStep } from '../../app/page/core/units.js';
 import { scale } from '../../app/page/tabs/scatter.js';
@@ -121,6 +122,11 @@ test('pinned columns are the first, in the order of pinning, and no column is lo
 test('a row of the displayed filter is compared by its sensor faults', () => {
   assert.equal(comparedWith(ROW, 'a', 'b'), 'filter=a');
   assert.equal(comparedWith(ROW, 'a', 'a'), 'faults=blackout%3D0.4');
+});
+
+test('only a row of the displayed task can be compared', () => {
+  assert.equal(whyNotCompared(ROW, ROW.task), '');
+  assert.match(whyNotCompared(ROW, 'push_field'), /is of task push field: open an episode/);
 });
 
 test('the order survives the permalink', () => {

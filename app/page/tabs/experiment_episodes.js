@@ -5,12 +5,12 @@
 /** @import { SeedGroup } from './experiment_groups.js' */
 
 import { HASH_DIGITS } from '../core/constants.js';
-import { create, createButton, html, messageOf } from '../core/dom.js';
+import { create, createButton, element, html, messageOf } from '../core/dom.js';
 import { componentOf, permalink } from '../core/state.js';
 import { fixed, significant, stepLabel } from '../core/units.js';
 import * as api from '../data/api.js';
 import { sortRows } from '../widgets/sorting.js';
-import { comparedWith, rowKey } from './experiment_rows.js';
+import { comparedWith, rowKey, whyNotCompared } from './experiment_rows.js';
 
 const LISTED = 50; // episodes, the worst first
 
@@ -61,6 +61,13 @@ export class EpisodePanel {
         over: 'held-out',
       })),
     );
+    store.when(['task'], () => this.#enableCompare());
+  }
+
+  #enableCompare() {
+    const button = element('.compare', HTMLButtonElement, this.#section);
+    button.title = this.#row ? whyNotCompared(this.#row, this.#store.state.task) : '';
+    button.disabled = Boolean(button.title);
   }
 
   /**
@@ -76,6 +83,7 @@ export class EpisodePanel {
     for (const name of ['.compare', '.diagnose']) html(name, section).hidden = Boolean(members);
     html('.seeds', section).textContent = '';
     [this.#sweep, this.#row] = [sweep, members ? undefined : selected];
+    this.#enableCompare();
     if (!selected) return;
     if (members) {
       this.#showMembers(selected.name, members);

@@ -116,6 +116,16 @@ export const rowKey = ({ checkpoint, data, faults }) =>
   `${checkpoint.slice(0, 12)}.${data.slice(0, 12)}.${faults}`;
 
 /**
+ * Returns why a row cannot be compared with the displayed run; empty if it can.
+ * @param {ExperimentRow} row
+ * @param {string} task of the displayed run
+ */
+export const whyNotCompared = (row, task) =>
+  row.task === task
+    ? ''
+    : `The displayed run is of task ${displayName(task)}: open an episode of this checkpoint first.`;
+
+/**
  * The comparison of the displayed run with a row: by filter or, if both have the same one, by sensor faults.
  * @param {Pick<ExperimentRow, 'faults'>} row
  * @param {string} filter of the row
