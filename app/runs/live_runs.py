@@ -122,7 +122,7 @@ class LiveRuns:
         """The live run, or None if the selection applies another filter, faults or an intervention to its episode.
 
         name, checkpoint: of the run's filter (``resolve_filter``). Raises BadInput if the run belongs to another task
-        or episode.
+        or episode, or ended without a step.
         """
         if (selection.task, selection.episode) != (run.task.name, run.template.episode_index):
             raise BadInput(
@@ -132,6 +132,8 @@ class LiveRuns:
         if (selection.filter, selection.faults, selection.intervention, selection.only) != (name, NO_FAULTS, None, ""):
             return None
         running = run.state == "running"
+        if not running and not run.reader.steps:
+            raise BadInput(run.message or f"live run {run.name!r} ended before its first step")
         with self._lock:
             traced = self._traced.pop(run.name, None)
             state = (run.key, running, checkpoint.healthy_profile)

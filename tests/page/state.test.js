@@ -66,7 +66,11 @@ test('live runs of one filter are all in the catalog', () => {
     assert.equal(isRecordedOnly(catalog, state), true);
   }
   assert.equal(isRecordedOnly(catalog, stateOf('')), false);
-  const listed = /** @type {any} */ ([{ name: 'damaged', state: 'damaged' }, ...runs]);
+  const listed = /** @type {any} */ ([
+    { name: 'damaged', state: 'damaged' },
+    { ...runs[0], name: 'wed', data: 'live:wed', steps: 0, state: 'died' },
+    ...runs,
+  ]);
   const examples = [{ title: '', help: '', link: '?task=door&filter=crossmodal-pf' }];
   assert.equal(
     completeLink('', { ...catalog, examples }, listed),

@@ -339,7 +339,7 @@ export function parsePermalink(search, catalog) {
 /**
  * Completes the query string of an address that names no task: by the task of the live run that it names, or else by
  * the first example, whose own values yield to those of the address. In place of an example, an empty address opens
- * the newest live or imported run, if there is one.
+ * the newest live or imported run that has or awaits steps, if there is one.
  * @param {string} search query string
  * @param {Catalog} catalog
  * @param {LiveList['runs']} [runs] live runs, the newest first
@@ -347,7 +347,7 @@ export function parsePermalink(search, catalog) {
 export function completeLink(search, { examples, tasks }, runs = []) {
   const query = new URLSearchParams(search);
   if (query.has('task')) return search;
-  const newest = runs.find((run) => 'data' in run);
+  const newest = runs.find((run) => 'data' in run && (run.steps || run.state === 'running'));
   if (!query.size && examples.length && newest && 'data' in newest) {
     const { task, filter, data } = newest;
     return `?${new URLSearchParams({ task, filter, data })}`;

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.failures.events import failures_of
 from beliefscope.inspect.failures.step_scores import EpisodeScores, Survey
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_from_arrays
-from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter, write_live
+from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
 from beliefscope.inspect.traces.sensors import camera_images
 from beliefscope.recordings.read import read_recording
 
@@ -389,12 +388,3 @@ def test_growing_recording_is_streamed(client: TestClient, writer: LiveFileWrite
     growing.join()
     recording.unlink()
     assert client.get("/api/live/run.rrd").status_code == 404
-
-
-def test_a_run_of_a_filter_with_a_slash_in_its_name(client: TestClient, folder: Path, full_trace: Trace) -> None:
-    write_live(replace(full_trace, filter="/odometry/filtered", checkpoint_hash=""), folder / "run.live")
-    (run,) = client.get("/api/live").json()["runs"]
-    assert run["filter"] == "odometry-filtered"
-    answer = client.get(TRACE.format(quote(run["filter"], safe="")))
-    assert answer.status_code == 200, answer.text
-    assert answer.json()["filter"] == run["filter"]
