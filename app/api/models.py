@@ -130,10 +130,11 @@ class FilterInfo(Reply):
 
 
 class FaultPreset(Reply):
-    """A named fault injection."""
+    """A named fault injection. stored: as runs and links name it, without default values."""
 
     name: str
     faults: str
+    stored: str
 
 
 class DataInfo(Reply):

@@ -14,7 +14,7 @@ from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.datasets.faults.injection import available_presets
+from beliefscope.datasets.faults.injection import Faults, available_presets
 from beliefscope.datasets.initial_view import initial_view
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
@@ -119,7 +119,10 @@ class TaskCatalog:
                 "scale": main.factor,
                 "indices": main.indices,
             },
-            "fault_presets": [{"name": name, "faults": text} for name, text in available_presets(task).items()],
+            "fault_presets": [
+                {"name": name, "faults": text, "stored": str(Faults.parse(text))}
+                for name, text in available_presets(task).items()
+            ],
             "filters": [_filter_json(name, filter_) for name, filter_ in self.filters.items()],
             "data": [_data_json(name, data) for name, data in self.data.items()],
         }

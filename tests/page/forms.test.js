@@ -8,7 +8,7 @@ import { promoteText } from '../../app/page/tabs/finetune_run.js';
 import { notExcluded, outcomeView } from '../../app/page/tabs/finetune_runs.js';
 import { inOrder, verdictStatus } from '../../app/page/tabs/diagnostics.js';
 import { episodeNote } from '../../app/page/tabs/failures.js';
-import { spanNote } from '../../app/page/widgets/fault_dialog.js';
+import { presetOptions, spanNote } from '../../app/page/widgets/fault_dialog.js';
 import { episodeLabel } from '../../app/page/widgets/pickers.js';
 
 test('the steps of an intervention end before the first step after it', () => {
@@ -26,6 +26,18 @@ test('a note names faults that end after the displayed episode', () => {
     /last step of this episode is 99, so :to=600, :to=200 has no effect/,
   );
   assert.equal(spanNote('image_frozen:to=600', null), '');
+});
+
+test('faults of a preset have its name, with and without default values', () => {
+  const presets = [{ name: 'image noisy', faults: 'image_noise=40', stored: 'image_noise' }];
+  const expected = [['image_noise=40', 'image noisy']];
+  assert.deepEqual(presetOptions(presets, ''), expected);
+  assert.deepEqual(presetOptions(presets, 'image_noise=40'), expected);
+  assert.deepEqual(presetOptions(presets, 'image_noise'), [['image_noise', 'image noisy']]);
+  assert.deepEqual(presetOptions(presets, 'image_noise=9'), [
+    ...expected,
+    ['image_noise=9', 'image_noise=9'],
+  ]);
 });
 
 test('the button that promotes a checkpoint names a criterion that is not met', () => {

@@ -752,13 +752,15 @@ export interface components {
         };
         /**
          * FaultPreset
-         * @description A named fault injection.
+         * @description A named fault injection. stored: as runs and links name it, without default values.
          */
         FaultPreset: {
             /** Name */
             name: string;
             /** Faults */
             faults: string;
+            /** Stored */
+            stored: string;
         };
         /**
          * FilterInfo

@@ -1,6 +1,6 @@
 /** Sensor faults: presets, and a dialog for any other fault injection as text (docs/data.md). */
 
-/** @import { FaultInfo } from '../types/server.js' */
+/** @import { FaultInfo, FaultPreset } from '../types/server.js' */
 
 import { createButton, element, html, messageOf, setOptions } from '../core/dom.js';
 
@@ -11,7 +11,6 @@ const OTHER = 'other';
  * @property {(faults: string) => Promise<unknown>} check throws the reason if the faults are invalid
  * @property {(faults: string) => void} choose applies the faults
  */
-/** @typedef {{name: string, faults: string}} FaultPreset */
 
 /** Dialog to edit a fault injection. Invalid faults are reported in the dialog and change nothing else. */
 export class FaultDialog {
@@ -86,6 +85,27 @@ export function spanNote(faults, steps) {
 }
 
 /**
+ * Whether faults are those of a preset.
+ * @param {FaultPreset} preset
+ * @param {string} faults
+ */
+export const isOfPreset = (preset, faults) => faults === preset.faults || faults === preset.stored;
+
+/**
+ * Returns the values and labels of the presets, and of other selected faults.
+ * @param {FaultPreset[]} presets
+ * @param {string} faults
+ */
+export function presetOptions(presets, faults) {
+  const current = presets.find((preset) => isOfPreset(preset, faults));
+  const options = presets.map((preset) => [
+    preset === current ? faults : preset.faults,
+    preset.name,
+  ]);
+  return current || !faults ? options : [...options, [faults, faults]];
+}
+
+/**
  * Connects a select element with the fault presets; its last entry opens the dialog.
  * @param {HTMLSelectElement} select
  * @param {FaultDialog} dialog
@@ -97,13 +117,7 @@ export function faultPicker(select, dialog, { none, selected, choose, check }) {
   let presets = [];
   const show = () => {
     const faults = selected();
-    const isPreset = !faults || presets.some((preset) => preset.faults === faults);
-    const options = [
-      ['', none],
-      ...presets.map((preset) => [preset.faults, preset.name]),
-      ...(isPreset ? [] : [[faults, faults]]),
-      [OTHER, 'other …'],
-    ];
+    const options = [['', none], ...presetOptions(presets, faults), [OTHER, 'other …']];
     setOptions(select, options, faults);
     select.title = faults ? `Sensor faults:\n${faults.replaceAll(',', ',\n')}` : 'Sensor faults';
   };

@@ -10,7 +10,7 @@ import { SPEEDS } from '../core/state.js';
 import { percent, plural } from '../core/units.js';
 import { checkSelection, episodes } from '../data/api.js';
 import { liveRunState } from '../tabs/live_runs.js';
-import { faultPicker } from './fault_dialog.js';
+import { faultPicker, isOfPreset } from './fault_dialog.js';
 
 const NEARBY = 100; // listed episodes around the selected one, of a large data set
 /** Value of the option that opens the search. */
@@ -141,7 +141,7 @@ const swapped = (state, key, value) =>
 export function firstRun(task, state) {
   const { name: data, first, first_step: step } = firstData(task);
   const filters = filtersOf(task, data);
-  const hasFaults = task.fault_presets.some(({ faults }) => faults === state.faults);
+  const hasFaults = task.fault_presets.some((preset) => isOfPreset(preset, state.faults));
   return {
     task: task.name,
     filter: (byName(filters, state.filter) ?? filters[0]).name,

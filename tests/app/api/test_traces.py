@@ -108,6 +108,8 @@ def test_faults_change_the_images(shared_client: TestClient, shared_trace_url: s
     tasks = {t["name"]: t for t in shared_client.get("/api/catalog").json()["tasks"]}
     fault_sets = {r["name"]: r["faults"] for r in tasks["door"]["fault_presets"]}
     assert fault_sets["40 % image blackout"] == "blackout=0.4"
+    for preset in tasks["door"]["fault_presets"]:
+        assert preset["stored"] == str(Faults.parse(preset["faults"]))
     assert {"force axis stuck", "end-effector offset 2 cm", "haptics lost"} <= fault_sets.keys()
     clean = shared_client.get(f"{shared_trace_url}/images").content
     for faults in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
