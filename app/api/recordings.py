@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -218,13 +218,16 @@ class RunMatcher:
     def entry(self, recording: Recording) -> RecordingEntry:
         """The list entry of a recording."""
         run, why_not = self._match(recording.info)
+        info = recording.info or RecordingInfo()
+        if info.filter:
+            info = replace(info, filter=self.filter_name(info.filter, info.checkpoint_hash, str(info.task)))
         return RecordingEntry(
             name=recording.name,
             url=_url(recording.name),
             bytes=recording.bytes,
             modified=datetime.fromtimestamp(recording.modified, UTC).isoformat(timespec="seconds"),
             reading=recording.info is None,
-            **vars(recording.info or RecordingInfo()),
+            **vars(info),
             run=run,
             why_not=why_not,
         )
@@ -234,6 +237,10 @@ class RunMatcher:
         with suppress(BadInput):
             return self._store.filters(task)
         return {}
+
+    def filter_name(self, name: str, checkpoint_hash: str, task: str) -> str:
+        """Name in the catalog of the filter of a file, or its own name, with its hash if another filter has it."""
+        return display_name(name, checkpoint_hash, self.filters(task), checkpoint_hash[:6])
 
     def _match(self, info: RecordingInfo | None) -> tuple[RunNames | None, str]:
         """Names of the run's filter and data set, or None and the reason."""

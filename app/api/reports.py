@@ -1,6 +1,7 @@
 """Routes under ``/api/reports``: reports of runs, written by jobs and kept in the workspace."""
 
 import hashlib
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import Body, FastAPI, Request
@@ -8,6 +9,7 @@ from fastapi.responses import FileResponse, Response
 from pydantic import Field, NonNegativeInt
 
 from beliefscope.app.api.models import DeletedId, Freed, JobReply, Reply, RequestBody
+from beliefscope.app.api.recordings import RunMatcher
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.trace_store import TraceStore
@@ -54,10 +56,15 @@ class ReportRequest(RequestBody):
 
 def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     reports = ReportFolder(store.settings.workspace / "reports")
+    matcher = RunMatcher(store)
 
     @app.get("/api/reports")
     def list_reports() -> ReportList:
-        return ReportList(reports=reports.list_reports(), deleted=reports.trash.list_deleted())
+        entries = [
+            replace(entry, filter=matcher.filter_name(entry.filter, entry.checkpoint_hash, entry.task))
+            for entry in reports.list_reports()
+        ]
+        return ReportList(reports=entries, deleted=reports.trash.list_deleted())
 
     @app.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def write_report(

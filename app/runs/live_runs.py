@@ -212,13 +212,14 @@ def resolve_filter(run: LiveRun, filters: Mapping[str, Checkpoint]) -> tuple[str
     return name, UnavailableFilter(run.template.filter, hash_, run.task)
 
 
-def display_name(name: str, hash_: str, filters: Mapping[str, Checkpoint]) -> str:
+def display_name(name: str, hash_: str, filters: Mapping[str, Checkpoint], suffix: str = "live") -> str:
     """The displayed name of a run's filter: that of the same checkpoint in ``filters``, else its own name.
 
+    suffix: follows its own name if another filter has the same.
     Slashes become hyphens, as in ``odometry-filtered``, because the name is one part of the path of an address.
     """
     matches = [key for key, checkpoint in filters.items() if hash_ and checkpoint.hash == hash_]
     if matches:
         return name if name in matches else matches[0]
     name = name.strip("/").replace("/", "-")
-    return f"{name} (live)" if name in filters else name
+    return f"{name} ({suffix})" if name in filters else name

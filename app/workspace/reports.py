@@ -19,7 +19,7 @@ NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
 
 @dataclass(frozen=True)
 class ReportEntry:
-    """A report. created: ISO 8601. pdf: address of its PDF, or None."""
+    """A report. filter: its own name. created: ISO 8601. pdf: address of its PDF, or None."""
 
     name: str
     url: str
@@ -27,6 +27,7 @@ class ReportEntry:
     created: str
     task: str
     filter: str
+    checkpoint_hash: str
     episode: int
     faults: str
     bytes: int
@@ -68,7 +69,7 @@ def _read_entry(path: Path) -> ReportEntry:
         entry = {
             "name": name,
             "url": f"/api/reports/{name}.html",
-            **{key: manifest[key] for key in ("title", "task", "filter")},
+            **{key: manifest[key] for key in ("title", "task", "filter", "checkpoint_hash")},
             "created": manifest["made"],
             "episode": run["episode"],
             "faults": str(Faults.from_json(run["faults"])),

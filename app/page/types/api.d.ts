@@ -1637,7 +1637,7 @@ export interface components {
         };
         /**
          * ReportEntry
-         * @description A report. created: ISO 8601. pdf: address of its PDF, or None.
+         * @description A report. filter: its own name. created: ISO 8601. pdf: address of its PDF, or None.
          */
         ReportEntry: {
             /** Name */
@@ -1652,6 +1652,8 @@ export interface components {
             task: string;
             /** Filter */
             filter: string;
+            /** Checkpoint Hash */
+            checkpoint_hash: string;
             /** Episode */
             episode: number;
             /** Faults */

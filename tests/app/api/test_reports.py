@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from typing import Any
 
@@ -72,3 +73,26 @@ def test_report_is_written_downloaded_deleted_and_restored(settings: Settings) -
         assert request_report().json()["job"]["state"] in ("waiting", "running"), "a deleted report is written again"
         assert client.get("/api/reports/door-nosuch-episode9-00000000.html").status_code == 404
         assert client.post("/api/reports/door/nosuch/9").status_code in (400, 404)
+
+
+@pytest.mark.parametrize(("known", "name"), [(True, "image-ekf"), (False, "crossmodal-ekf (abcdef)")])
+def test_the_filter_of_a_report_has_its_name_in_the_catalog(
+    client: TestClient, settings: Settings, known: bool, name: str
+) -> None:
+    """A fine-tuned checkpoint has the name of its base checkpoint in its files."""
+    (door,) = (task for task in client.get("/api/catalog").json()["tasks"] if task["name"] == "door")
+    (hash_,) = (entry["checkpoint_hash"] for entry in door["filters"] if entry["name"] == "image-ekf")
+    folder = settings.workspace / "reports" / "door-crossmodal-ekf-episode1-00000000"
+    folder.mkdir(parents=True)
+    manifest = {
+        "title": "Report",
+        "made": "2026-01-01T00:00:00+00:00",
+        "task": "door",
+        "filter": "crossmodal-ekf",
+        "checkpoint_hash": hash_ if known else "abcdef" * 10,
+        "traces": [{"episode": 1, "faults": []}],
+        "files": {},
+    }
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    (listed,) = client.get("/api/reports").json()["reports"]
+    assert listed["filter"] == name
