@@ -242,6 +242,17 @@ class RunMatcher:
         """Name in the catalog of the filter of a file, or its own name, with its hash if another filter has it."""
         return display_name(name, checkpoint_hash, self.filters(task), checkpoint_hash[:6])
 
+    def data_name(self, task: str, episode: int, data_hash: str) -> str | None:
+        """Name of the live run or data set with an episode; None if there is none."""
+        for name in self._store.live.newest():
+            with suppress(BadInput):
+                run = self._store.live[name]
+                if (run.task.name, run.template.episode_index, run.template.data_hash) == (task, episode, data_hash):
+                    return f"{LIVE_PREFIX}{name}"
+        with suppress(BadInput):
+            return self._find_data(task, episode, data_hash)
+        return None
+
     def _match(self, info: RecordingInfo | None) -> tuple[RunNames | None, str]:
         """Names of the run's filter and data set, or None and the reason."""
         if info is None or info.problem:

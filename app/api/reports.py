@@ -61,7 +61,11 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     @app.get("/api/reports")
     def list_reports() -> ReportList:
         entries = [
-            replace(entry, filter=matcher.filter_name(entry.filter, entry.checkpoint_hash, entry.task))
+            replace(
+                entry,
+                filter=matcher.filter_name(entry.filter, entry.checkpoint_hash, entry.task),
+                data=matcher.data_name(entry.task, entry.episode, entry.data_hash) if entry.data_hash else None,
+            )
             for entry in reports.list_reports()
         ]
         return ReportList(reports=entries, deleted=reports.trash.list_deleted())

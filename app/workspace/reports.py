@@ -19,7 +19,10 @@ NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
 
 @dataclass(frozen=True)
 class ReportEntry:
-    """A report. filter: its own name. created: ISO 8601. pdf: address of its PDF, or None."""
+    """A report. filter: its own name. created: ISO 8601. pdf: address of its PDF, or None.
+
+    data_hash: of the episode; empty if it is unknown. data: the data set of this server with it, or None.
+    """
 
     name: str
     url: str
@@ -29,9 +32,11 @@ class ReportEntry:
     filter: str
     checkpoint_hash: str
     episode: int
+    data_hash: str
     faults: str
     bytes: int
     pdf: str | None
+    data: str | None = None
 
 
 ENTRY = TypeAdapter(ReportEntry)
@@ -72,6 +77,7 @@ def _read_entry(path: Path) -> ReportEntry:
             **{key: manifest[key] for key in ("title", "task", "filter", "checkpoint_hash")},
             "created": manifest["made"],
             "episode": run["episode"],
+            "data_hash": run["data_hash"],
             "faults": str(Faults.from_json(run["faults"])),
             "bytes": disk_usage(path.parent),
             "pdf": f"/api/reports/{name}.pdf" if "report.pdf" in manifest["files"] else None,

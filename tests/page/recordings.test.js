@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { parsePermalink, permalink } from '../../app/page/core/state.js';
-import { describeOpened, openRecordings } from '../../app/page/tabs/recorded_run.js';
+import { describeOpened, openRecordings, reportedRun } from '../../app/page/tabs/recorded_run.js';
 import { CATALOG } from './fixtures.js';
 
 /** @typedef {import('../../app/page/types/server.js').RecordingEntry} RecordingEntry */
@@ -53,4 +53,20 @@ test('the bar names the run of the page where the recording has another one', ()
   assert.equal(describeOpened([FILE, ELSEWHERE], false, state), `a.rrd and b.rrd. ${rest}`);
   const foreign = { ...ELSEWHERE, task: null, filter: null, episode: null, application: 'other' };
   assert.equal(describeOpened([foreign], false, state), `b.rrd is another run (other). ${rest}`);
+});
+
+test('the run of a report is over the data with its episode', () => {
+  const report = /** @type {any} */ ({
+    task: 'door',
+    filter: 'crossmodal-pf',
+    episode: 9,
+    faults: '',
+  });
+  const dataOf = (/** @type {object} */ changes) =>
+    reportedRun(CATALOG, { ...report, ...changes }).run?.data;
+  assert.equal(dataOf({ data_hash: 'ab', data: 'live:mon' }), 'live:mon');
+  assert.equal(dataOf({ data_hash: 'ab', data: null }), undefined);
+  assert.equal(dataOf({ data_hash: '', data: null }), 'door');
+  const { problem } = reportedRun(CATALOG, { ...report, data_hash: 'ab', data: null });
+  assert.equal(problem, 'No data set of this server has the episode 9.');
 });

@@ -71,13 +71,16 @@ const describeRun = ({ task, filter, episode }) =>
  * @param {ReportEntry} report
  * @returns {{run: Run, problem?: undefined} | {run?: undefined, problem: string}}
  */
-export function reportedRun(catalog, { task: name, filter, episode, faults }) {
+export function reportedRun(
+  catalog,
+  { task: name, filter, episode, faults, data, data_hash: hash },
+) {
   const task = catalog.tasks.find((item) => item.name === name);
   if (!task?.filters.some((item) => item.name === filter))
     return { problem: `This server has no filter ${filter} for task ${name}.` };
-  const set = task.data.find((entry) => hasEpisode(entry, episode));
-  if (!set) return { problem: `No data set of this server has an episode ${episode}.` };
-  return { run: { task: name, filter, data: set.name, episode, faults } };
+  const set = hash ? data : task.data.find((entry) => hasEpisode(entry, episode))?.name;
+  if (!set) return { problem: `No data set of this server has the episode ${episode}.` };
+  return { run: { task: name, filter, data: set, episode, faults } };
 }
 
 /**

@@ -1638,6 +1638,8 @@ export interface components {
         /**
          * ReportEntry
          * @description A report. filter: its own name. created: ISO 8601. pdf: address of its PDF, or None.
+         *
+         *     data_hash: of the episode; empty if it is unknown. data: the data set of this server with it, or None.
          */
         ReportEntry: {
             /** Name */
@@ -1656,12 +1658,16 @@ export interface components {
             checkpoint_hash: string;
             /** Episode */
             episode: number;
+            /** Data Hash */
+            data_hash: string;
             /** Faults */
             faults: string;
             /** Bytes */
             bytes: number;
             /** Pdf */
             pdf: string | null;
+            /** Data */
+            data?: string | null;
         };
         /**
          * ReportList

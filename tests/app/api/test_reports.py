@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,6 +13,10 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
+from beliefscope.inspect.trace import trace
+from beliefscope.inspect.traces.live_file import write_live
 
 pytestmark = pytest.mark.slow
 
@@ -90,9 +95,36 @@ def test_the_filter_of_a_report_has_its_name_in_the_catalog(
         "task": "door",
         "filter": "crossmodal-ekf",
         "checkpoint_hash": hash_ if known else "abcdef" * 10,
-        "traces": [{"episode": 1, "faults": []}],
+        "traces": [{"episode": 1, "data_hash": "", "faults": []}],
         "files": {},
     }
     (folder / "manifest.json").write_text(json.dumps(manifest))
     (listed,) = client.get("/api/reports").json()["reports"]
     assert listed["filter"] == name
+
+
+def test_the_run_of_a_report_has_the_episode_of_its_hash(client: TestClient, settings: Settings) -> None:
+    """Several live runs have the same number of an episode."""
+    with open_dataset(sample_path("door")) as data:
+        run = trace(load_checkpoint(pretrained_path("door", "crossmodal-ekf")), data[9], 9)
+    manifest: dict[str, Any] = {
+        "title": "",
+        "made": "2026-01-01T00:00:00+00:00",
+        "task": "door",
+        "filter": "own",
+        "files": {},
+    }
+    (settings.workspace / "live").mkdir(parents=True)
+    for i, hash_ in enumerate(["aa" * 32, "bb" * 32, run.data_hash]):
+        if hash_ != run.data_hash:
+            write_live(replace(run, data_hash=hash_), settings.workspace / "live" / f"{hash_[:2]}.live")
+        folder = settings.workspace / "reports" / f"door-own-episode9-0000000{i}"
+        folder.mkdir(parents=True)
+        traces = [{"episode": 9, "data_hash": hash_, "faults": []}]
+        (folder / "manifest.json").write_text(json.dumps({**manifest, "checkpoint_hash": "", "traces": traces}))
+    reports = client.get("/api/reports").json()["reports"]
+    assert {report["data_hash"][:2]: report["data"] for report in reports} == {
+        "aa": "live:aa",
+        "bb": "live:bb",
+        run.data_hash[:2]: "sample",
+    }
