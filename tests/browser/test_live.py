@@ -11,6 +11,11 @@ from typing import Any
 
 import pytest
 
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
+from beliefscope.inspect.trace import trace
+from beliefscope.inspect.traces.live_file import write_live
+
 NEWEST = "Number(document.querySelector('#tracks').getAttribute('aria-valuemax'))"
 
 
@@ -76,7 +81,26 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
 @pytest.mark.long
 def test_link_to_a_live_run_opens_it_when_it_starts(open_page: Any, request: pytest.FixtureRequest) -> None:
     page = open_page("?task=door&data=live:go")
-    page.until("() => /“go” has not started/.test(document.querySelector('#messages').textContent)")
+    page.until(
+        "() => /“go” does not exist. It opens when it starts/.test(document.querySelector('#messages').textContent)"
+    )
     request.getfixturevalue("running")
     page.until(f"() => beliefscope.state().data === 'live:go' && beliefscope.state().follow && {NEWEST} > 0")
     page.until("() => !document.querySelector('#messages').textContent")
+
+
+def test_long_names_of_runs_leave_room_for_their_filters(open_page: Any, server: Any) -> None:
+    with open_dataset(sample_path("door")) as data:
+        run = trace(load_checkpoint(pretrained_path("door", "image-ekf")), data[9], 9)
+    file = server.workspace / "live" / f"{'long' * 30}.live"
+    file.parent.mkdir(exist_ok=True)
+    write_live(run, file)
+    try:
+        page = open_page("?task=door")
+        page.page.click("#live")
+        name, owner = (page.page.locator(f"#live-runs li button > {tag}").first for tag in ("b", "span"))
+        assert name.get_attribute("title") == file.stem
+        assert owner.bounding_box()["width"] > 80
+        assert name.bounding_box()["x"] + name.bounding_box()["width"] <= owner.bounding_box()["x"]
+    finally:
+        file.unlink()

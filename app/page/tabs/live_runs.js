@@ -138,7 +138,7 @@ export class Live {
     this.#trace = trace;
     this.#latencies = [];
     const awaited =
-      this.#awaited && `The live run “${this.#awaited}” has not started. It opens when it does.`;
+      this.#awaited && `The live run “${this.#awaited}” does not exist. It opens when it starts.`;
     this.#handlers.message(awaited || (trace?.live?.message ?? this.#selectedRun?.message ?? ''));
     if (this.#isRunning && this.#store.state.follow) this.#goToNewest();
     this.#showFollowButton();
@@ -274,8 +274,10 @@ export class Live {
       const isCurrent = isReadable(run) && run.data === this.#store.state.data;
       button.disabled = !isReadable(run);
       button.setAttribute('aria-current', String(isCurrent));
-      html('b', button).textContent = run.name;
-      html('span', button).textContent = isReadable(run)
+      const name = html('b', button);
+      name.textContent = name.title = run.name;
+      const owner = html('span', button);
+      owner.textContent = owner.title = isReadable(run)
         ? `${run.filter} · ${displayName(run.task)} ${run.episode}`
         : '';
       const status = html('small', button);
