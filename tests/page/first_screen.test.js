@@ -257,6 +257,13 @@ test('an error that grows to the end is a divergence, shown where it begins', ()
   assert.equal(result.headline, 'The estimate diverges from step 15 on.');
   assert.match(result.evidence, /^Largest error at step 19\. Fused error 5\.00 cm,/);
   assert.deepEqual([result.tone, result.step], ['bad', 15]);
+  const healthy = finding({ ...run(11), error: () => grows }, 0, HEALTHY);
+  assert.equal(healthy.headline, 'No fault found, but the filter is overconfident at step 19.');
+  assert.match(
+    healthy.evidence,
+    /^The estimate diverges from step 15 on\. Largest error at step 19\./,
+  );
+  assert.equal(healthy.step, 15);
   const predicted = { ...run(11), largestDeviation: () => ({ sigmas: 1, component: 'x' }) };
   assert.match(finding({ ...predicted, error: () => grows }, 0, null).headline, /^Largest error/);
 });

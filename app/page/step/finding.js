@@ -96,8 +96,9 @@ function healthyHeadline(trace, component, { headline, miscalibrated }, worst) {
     step >= first && Number.isFinite(value) && Number.isFinite(error?.[step]);
   const errors = error?.filter(isCounted) ?? [];
   if (miscalibrated || !errors.length) return typeset(sentence(headline));
-  if (worst.tone === 'bad' && worst.step !== null)
-    return `No fault found, but the filter is overconfident at ${trace.stepLabel(worst.step)}.`;
+  const largestStep = largestErrorStep(trace); // as in the diagnosis; a divergence begins before
+  if (worst.tone === 'bad' && largestStep !== null)
+    return `No fault found, but the filter is overconfident at ${trace.stepLabel(largestStep)}.`;
   const rmse = withUnit(
     fixed(Math.sqrt(mean(errors.map((value) => value ** 2))), 2),
     trace.mainUnit,
