@@ -101,14 +101,16 @@ def robust_fit(columns: Array, values: Array) -> Array:
     return result
 
 
-def is_angle(values: Array) -> bool:
+def is_angle(values: Array, successive: Mask | None = None) -> bool:
     """Whether a signal (T,) is an angle in rad that wraps around: from -pi to pi or 0 to 2 pi, with jumps of a turn.
 
     Other jumps of more than a quarter of a turn are rare (``OTHER_JUMPS``), unlike those of noise.
+
+    successive: (T - 1,) whether a value and the next one have no gap between them; jumps over gaps do not count.
     """
     if len(values) < 2 or min(np.abs(values - middle).max() for middle in (0.0, np.pi)) > (TURN + NEAR_TURN) / 2.0:
         return False
-    jumps = np.abs(np.diff(values))
+    jumps = np.abs(np.diff(values))[... if successive is None else successive]
     turns = jumps > TURN - NEAR_TURN
     return bool(turns.any() and np.mean((jumps > TURN / 4.0) & ~turns) < OTHER_JUMPS)
 

@@ -274,7 +274,11 @@ def angle_channels(episode: Episode, key: str) -> list[int]:
     readings = episode.observations[key]
     if readings.ndim != 2 or key in (HAND, FORCE, TORQUE, CONTACT):
         return []
-    return [i for i, channel in enumerate(readings[episode.present(key)].T) if is_angle(channel)]
+    present = episode.present(key)
+    gaps = np.diff(np.flatnonzero(present))
+    successive = gaps <= np.median(gaps) if len(gaps) else None  # an angle in bursts jumps between them
+    channels = enumerate(readings[present].T)
+    return [i for i, channel in channels if is_angle(channel) or is_angle(channel, successive)]
 
 
 def vector_keys(episode: Episode) -> list[str]:

@@ -9,6 +9,7 @@ from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
+from beliefscope.inspect.diagnosis.checks.vectors import angle_channels
 from beliefscope.inspect.statistics.signals import is_angle
 
 
@@ -51,3 +52,27 @@ def test_bearings_have_the_statistics_of_continuous_angles() -> None:
     for name, value in continuous.items():
         turns = (jumping[name] - value) / (2.0 * np.pi) if name.startswith("level/") else 0.0
         assert jumping[name] == pytest.approx(value + 2.0 * np.pi * round(turns), abs=1e-4, nan_ok=True), name
+
+
+def test_bearings_in_bursts_are_angles_although_they_jump_between_them() -> None:
+    rng = np.random.default_rng(3)
+    course = 0.2 * np.arange(120) - 1.46 + rng.normal(0.0, 0.02, 120)
+    seen = np.arange(120) % 20 < 8
+    values = ((course + np.pi) % (2.0 * np.pi) - np.pi)[seen]
+    assert not is_angle(values)
+    assert is_angle(values, np.diff(np.flatnonzero(seen)) == 1)
+    task = Task(
+        "boat",
+        (Component("x", "m"),),
+        observations={"bearing": (1,)},
+        modalities={"radar": ("bearing",)},
+        masks={"bearing": "seen"},
+        covariates={"seen": Covariate("boolean")},
+        control_size=0,
+        dt=0.1,
+    )
+    readings = np.zeros((120, 1))
+    readings[seen, 0] = values
+    covariates = {"seen": seen.astype(np.float32)}
+    episode = Episode(task, np.zeros((120, 1)), np.zeros((120, 0)), {"bearing": readings}, covariates=covariates)
+    assert angle_channels(episode, "bearing") == [0]
