@@ -53,7 +53,7 @@ def test_channels_have_names_and_units() -> None:
         ({"image": (Component("gray", ""),)}, r"channels of 'image' are 1, expected an observation \(d,\) or control"),
         ({"lidar": (Component("range", "m"),)}, r"expected an observation \(d,\) or control"),
         ({"radar": 2 * (Component("range", "m"),)}, "channels of 'radar' have equal names"),
-        ({"speed": (Component("m/s", "m/s"),)}, "channel 'm/s' of 'speed' has an invalid name, expected a text without /"),
+        ({"speed": (Component("m/s", "m/s"),)}, "channel 'm/s' of 'speed' has an invalid name, expected a text"),
     ],
 )
 def test_invalid_channels_are_refused(channels: dict[str, Any], message: str) -> None:

@@ -107,6 +107,14 @@ class ParticleCart(torch.nn.Module):
         }
 
 
+class SharedNoise(ParticleCart):
+    """All particles have the same noise, as large as the motion, so that the predicted mean is random."""
+
+    def forward(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        noise = 0.05 * torch.randn_like(controls)
+        return super().forward(observations=observations, controls=controls + noise)
+
+
 class SeeingCart(ParticleCart):
     """Its weights ignore the likelihoods, and its particles stay where they are, so that it loses the state."""
 
@@ -139,6 +147,16 @@ def test_predicted_changes_are_the_controls_with_the_process_noise(filter_: Any,
     np.testing.assert_allclose(result.change, episode.controls[steps], atol=error)
     assert result.added is not None
     np.testing.assert_allclose(np.sqrt(np.diagonal(result.added, axis1=1, axis2=2)), STD, rtol=0.1)
+
+
+def test_random_numbers_of_predictions_do_not_change_their_gain() -> None:
+    checkpoint = cart(SharedNoise())
+    gains = []
+    for seed in range(10):
+        values = dynamics_statistics(bs.trace(checkpoint, [drive(seed)]), checkpoint)
+        gains += [1.0 / values[f"dynamics slope/{name}/all"] for name in "xy"]
+    assert np.mean(gains) == pytest.approx(1.0, abs=4.0 * float(np.std(gains)) / math.sqrt(len(gains)))
+    assert np.mean(gains) > 0.8, "half of the power of the predicted changes is random"
 
 
 def test_their_number_is_limited() -> None:

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import beliefscope as bs
+from beliefscope.datasets.task import Component
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.checks.dynamics import external_dynamics_statistics
 from beliefscope.inspect.diagnosis.checks.innovations import REJECTABLE, innovation_statistics, measurement_noise
@@ -310,6 +311,11 @@ def test_innovations_at_true_states_show_offsets_and_differences_that_are_not_wr
     assert values["innovation turns/compass/all"] == pytest.approx(0.1, abs=0.01)
     other = measurement_model_statistics(trace, [], replace(trace))  # the innovations of the run, not at true states
     assert not any(name.startswith(("innovation offset/", "innovation spread/")) for name in other)
+    for unit, turns in (("m", 0.0), ("rad", 0.1)):
+        task = replace(trace.task, channels={**trace.task.channels, "compass": (Component("north", unit),)})
+        named = replace(trace, episode=replace(trace.episode, task=task))
+        values = measurement_model_statistics(named, [], replace(named, innovation=nu.astype(np.float32)))
+        assert values["innovation turns/compass/all"] == pytest.approx(turns, abs=0.01)
     wide = replace(trace, innovation=(30.0 * nu).astype(np.float32))  # no angle
     assert measurement_model_statistics(trace, [], wide)["innovation turns/radar/all"] == 0.0
 
