@@ -178,6 +178,8 @@ def check_maximised_panels(page: Any) -> None:
     page.screenshot("maximised-maps")
     page.page.keyboard.press("ArrowRight")  # shortcuts still work
     page.until("() => beliefscope.state().step === 22")
+    page.page.keyboard.press("y")
+    page.until("() => document.querySelector('#messages').textContent.includes('Link to step 22 copied')")
     page.page.keyboard.press("Escape")
     page.until(f"() => ({side})() < {1.1 * before}")
     assert page.page.locator("#timeline").is_visible()

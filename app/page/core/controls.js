@@ -49,6 +49,7 @@ export function bindControls(page) {
     p: () => page.maps.switchQuantity(),
     s: () => page.save(),
     x: toggleMaximised,
+    y: () => page.copyLink(),
     '?': showHelp,
   });
   bindButtons(page, showHelp);

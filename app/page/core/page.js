@@ -29,6 +29,7 @@ import { connectPickers } from '../widgets/pickers.js';
 import { ReportDialog } from '../widgets/report_dialog.js';
 import { connectSaveButton } from '../widgets/save_button.js';
 import { Tour } from '../widgets/tour.js';
+import { copyText } from './clipboard.js';
 import { Clock } from './clock.js';
 import { commands, episodeCommands, stepCommand } from './commands.js';
 import { bindControls } from './controls.js';
@@ -37,11 +38,13 @@ import { DisplayedRun, delayed } from './displayed_run.js';
 import { element, html, messageOf } from './dom.js';
 import { layoutMenu } from './layouts.js';
 import { Splitters } from './splitters.js';
-import { parsePermalink } from './state.js';
+import { parsePermalink, permalink } from './state.js';
 import { stats } from './measurements.js';
 import { tabBar } from './tab_bar.js';
 import { Theme } from './theme.js';
 import { Undo } from './undo.js';
+
+const NOTICE_TIME = 3000; // ms
 
 export class Page {
   #store;
@@ -273,6 +276,15 @@ export class Page {
   markIntervention(end) {
     this.openTab('compare');
     this.tabs?.compare.mark(end, this.#store.state.step);
+  }
+
+  /** Copies a link to the displayed step. */
+  async copyLink() {
+    const { state } = this.#store;
+    const success = await copyText(new URL(permalink(state), location.href).href);
+    const text = success ? `Link to step ${state.step} copied` : 'Copy the address of the page';
+    this.#messages.show('link', text);
+    setTimeout(() => this.#messages.show('link'), NOTICE_TIME);
   }
 
   selectNextComponent() {

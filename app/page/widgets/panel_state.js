@@ -60,7 +60,7 @@ export class Messages {
   #append(key, text) {
     const close = createButton('', '×', () => line.remove(), { ariaLabel: 'Dismiss' });
     const line = create('p', {}, create('span', { textContent: text }), close);
-    if (key === 'failure') line.className = 'notice'; // no error
+    if (key === 'failure' || key === 'link') line.className = 'notice'; // no error
     line.dataset.key = key;
     this.#host.append(line);
   }
