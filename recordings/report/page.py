@@ -101,8 +101,10 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     episodes = ", ".join(str(trace.episode_index) for trace in report.traces)
     steps = plural(sum(map(len, report.traces)), "step")
     durations = durations_text([trace.episode for trace in report.traces])
+    base = {} if report.checkpoint is None else report.checkpoint.record.get("base") or {}
+    origin = f", fine-tuned from checkpoint {base['hash'][:12]}" if "hash" in base else ""
     facts = {
-        "Filter": f"{first.filter} ({first.kind if first.kind == 'external' else first.kind.upper()})",
+        "Filter": f"{first.filter} ({first.kind if first.kind == 'external' else first.kind.upper()}){origin}",
         "Task": first.task.name,
         "Modalities": ", ".join(first.modalities) or "not distinguished",
         "Episodes": f"{episodes}: {steps} in total, {durations}",

@@ -296,6 +296,14 @@ def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], t
     assert set(document["diagnostics"]) == {"consistency", "weights"}
 
 
+def test_a_fine_tuned_filter_is_called_so(run_: Trace, checkpoint: Checkpoint, tmp_path: Path) -> None:
+    record = dict(checkpoint.record) | {"base": {"name": checkpoint.name, "hash": "0123456789abcdef"}}
+    content = replace(compose([run_], checkpoint, steps=[]), checkpoint=replace(checkpoint, record=record), results={})
+    write_report(content, tmp_path / "report")
+    text = (tmp_path / "report" / "report.html").read_text()
+    assert f"{checkpoint.name} (EKF), fine-tuned from checkpoint 0123456789ab" in text
+
+
 def test_the_diagnosis_is_that_of_the_traces_and_links_to_its_moment(checkpoint: Checkpoint) -> None:
     faults = Faults.parse("image_frozen=5")
     with open_dataset(sample_path("door")) as data:
