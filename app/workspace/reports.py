@@ -74,10 +74,11 @@ def _read_entry(path: Path) -> ReportEntry:
         entry = {
             "name": name,
             "url": f"/api/reports/{name}.html",
-            **{key: manifest[key] for key in ("title", "task", "filter", "checkpoint_hash")},
+            **{key: manifest[key] for key in ("title", "task", "filter")},
+            "checkpoint_hash": manifest.get("checkpoint_hash", ""),
             "created": manifest["made"],
             "episode": run["episode"],
-            "data_hash": run["data_hash"],
+            "data_hash": run.get("data_hash", ""),
             "faults": str(Faults.from_json(run["faults"])),
             "bytes": disk_usage(path.parent),
             "pdf": f"/api/reports/{name}.pdf" if "report.pdf" in manifest["files"] else None,

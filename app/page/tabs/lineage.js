@@ -7,6 +7,10 @@ import { create } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { fixed } from '../core/units.js';
 
+const ERRORS =
+  'Errors of base checkpoints over the test episodes of their training data, and of fine-tuned ones over the ' +
+  'windows of their validation, before → after. Other episodes have other errors.';
+
 /**
  * Shows the lineage.
  * @param {HTMLElement} host hidden if the task has no fine-tuned checkpoint
@@ -38,7 +42,8 @@ export function showLineage(host, task, state, members) {
     return create('li', {}, line, ...(branches.length ? [create('ul', {}, ...branches)] : []));
   };
   const list = create('ul', {}, ...roots.map((root) => branch(root, null)));
-  host.replaceChildren(create('h4', { textContent: 'Lineage' }), list);
+  const note = create('p', { className: 'note', textContent: ERRORS });
+  host.replaceChildren(create('h4', { textContent: 'Lineage' }), note, list);
 }
 
 /**
