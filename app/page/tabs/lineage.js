@@ -9,7 +9,7 @@ import { fixed } from '../core/units.js';
 
 const ERRORS =
   'Errors of base checkpoints over the test episodes of their training data, and of fine-tuned ones over the ' +
-  'windows of their validation, before → after. Other episodes have other errors.';
+  'windows of their validation, before → after.';
 
 /**
  * Shows the lineage.
@@ -42,7 +42,7 @@ export function showLineage(host, task, state, members) {
     return create('li', {}, line, ...(branches.length ? [create('ul', {}, ...branches)] : []));
   };
   const list = create('ul', {}, ...roots.map((root) => branch(root, null)));
-  const note = create('p', { className: 'note', textContent: ERRORS });
+  const note = create('p', { className: 'help', textContent: ERRORS });
   host.replaceChildren(create('h4', { textContent: 'Lineage' }), note, list);
 }
 
