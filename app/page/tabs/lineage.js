@@ -42,7 +42,7 @@ export function showLineage(host, task, state, members) {
     return create('li', {}, line, ...(branches.length ? [create('ul', {}, ...branches)] : []));
   };
   const list = create('ul', {}, ...roots.map((root) => branch(root, null)));
-  const note = create('p', { className: 'help', textContent: ERRORS });
+  const note = create('p', { textContent: ERRORS });
   host.replaceChildren(create('h4', { textContent: 'Lineage' }), note, list);
 }
 
