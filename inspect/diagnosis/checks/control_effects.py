@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from beliefscope.datasets.task import axis_name
 from beliefscope.filters.external.load import ExternalFilter
@@ -22,6 +23,9 @@ LARGEST_STD = 1.0
 
 TWO = 2
 """Number of values of a control that is a flag."""
+
+NEEDED = 1e-3
+"""Probability of noise that is explained as well as the true effects, below which the features are needed."""
 
 OWN = 0.05
 """Smallest part of an effect that does not follow from the state and the other controls, which explain the rest."""
@@ -68,7 +72,11 @@ def control_effects(
 
 
 def _slopes(true: Array, predicted: Array, state: Array) -> Array:
-    """(n,) slopes of true on predicted effects (S, n) besides linear functions of features (S, F); NaN if unknown."""
+    """(n,) slopes of true on predicted effects (S, n) besides linear functions of features (S, F); NaN if unknown.
+
+    Besides a constant where the features explain no more of the rest than noise does (F test): controls that depend on
+    the state, and so on the noise before, bias the slope that has them in an episode of few steps.
+    """
     free = len(true) - state.shape[1] - 1
     if free < LEAST:
         return np.full(true.shape[1], np.nan)
@@ -76,6 +84,16 @@ def _slopes(true: Array, predicted: Array, state: Array) -> Array:
     basis = basis[:, sizes > 1e-6 * sizes[0]]
     y, d = (values - basis @ (basis.T @ values) for values in (true, predicted))
     power, total = np.square(d).sum(0), np.square(predicted - predicted.mean(0)).sum(0)
+    is_own = power > OWN**2 * total
+    (slopes, left), (others, left_of_others) = _line(y, d), _line(true - true.mean(0), predicted - predicted.mean(0))
+    variance, extra = left / free, max(basis.shape[1] - 1, 1)
+    needed = left_of_others - left > extra * fdtri(extra, free, 1.0 - NEEDED) * variance
+    slopes, power = np.where(needed, slopes, others), np.where(needed, power, total)
+    return np.where(is_own & (variance < LARGEST_STD**2 * power), slopes, np.nan)
+
+
+def _line(y: Array, d: Array) -> tuple[Array, Array]:
+    """(n,) slopes of y on d, both (S, n), and sums of the squares that are left; NaN where d is zero."""
+    power = np.square(d).sum(0)
     slopes = (d * y).sum(0) / np.where(power > 0.0, power, np.nan)
-    variance = np.square(y - slopes * d).sum(0) / free
-    return np.where((power > OWN**2 * total) & (variance < LARGEST_STD**2 * power), slopes, np.nan)
+    return slopes, np.square(y - slopes * d).sum(0)
