@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,8 +109,8 @@ def positions(task: Task, states: Array) -> Array:
 def landmark_features(places: Array, landmark: Array) -> Array:
     """(..., T, 3) distance of positions (T, p) to landmarks (..., p), and cosine and sine of their direction."""
     relative = landmark[..., None, :] - places
-    distance = np.linalg.norm(relative, axis=-1, keepdims=True)
-    plane = np.linalg.norm(relative[..., :2], axis=-1, keepdims=True)
+    squares = np.square(relative)
+    distance, plane = (np.sqrt(part.sum(-1, keepdims=True)) for part in (squares, squares[..., :2]))
     return np.concatenate([distance, relative[..., :2] / np.maximum(plane, 1e-12)], axis=-1)
 
 
@@ -127,19 +127,34 @@ def find_landmark(places: Array, targets: Array) -> Array:
     middle, size = places.mean(0), 2.0 * np.ptp(places, axis=0)
     for _ in range(ZOOMS):
         axes = [m + s * np.linspace(-0.5, 0.5, GRID) for m, s in zip(middle, size, strict=True)]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(middle))
-        middle = grid[_agreement(landmark_features(places, grid), targets).argmax()]
+        agreement = _agreement([axis[:, None] - x for axis, x in zip(axes, places.T, strict=True)], targets)
+        best = np.unravel_index(agreement.argmax(), agreement.shape)
+        middle = np.array([axis[i] for axis, i in zip(axes, best, strict=True)])
         size = ZOOM * size
     return middle
 
 
-def _agreement(inputs: Array, targets: Array) -> Array:
-    """(G,) squared correlation of readings with distances, or of angles with directions, for inputs (G, S, 3)."""
+def _agreement(offsets: Sequence[Array], targets: Array) -> Array:
+    """Squared correlation of readings with distances, or of angles with directions, for each place of a grid.
+
+    Args:
+        offsets: p arrays (G, S) of the places along each axis from the positions.
+
+    Returns: (G, ..., G) with p axes; the third one has the size 1 for directions, which do not depend on it.
+    """
     if targets.shape[1] > 1:  # directions may have the opposite sign
-        direction, angle = inputs[..., 1] + 1j * inputs[..., 2], targets[:, 0] + 1j * targets[:, 1]
-        return np.asarray(np.maximum(*(np.abs((angle * d).mean(1)) for d in (direction, direction.conj()))))
-    x, y = inputs[..., 0] - inputs[..., 0].mean(1, keepdims=True), targets[:, 0] - targets.mean()
-    return np.asarray(np.square(x @ y) / np.maximum(np.square(x).sum(1) * np.square(y).sum(), 1e-24))
+        direction = offsets[0][:, None] + 1j * offsets[1]
+        direction /= np.maximum(np.abs(direction), 1e-12)
+        angle = (targets[:, 0] + 1j * targets[:, 1]) / len(targets)
+        plane = np.maximum(np.abs(direction @ angle), np.abs(direction @ angle.conj()))
+        return np.asarray(plane.reshape(*plane.shape, *(1,) * (len(offsets) - 2)))
+    squared, y = np.square(offsets[0]), targets[:, 0] - targets.mean()
+    for offset in offsets[1:]:
+        squared = squared[..., None, :] + np.square(offset)
+    distance = np.sqrt(squared)
+    distance -= distance.mean(-1, keepdims=True)
+    power = np.einsum("...s,...s->...", distance, distance) * np.square(y).sum()
+    return np.asarray(np.square(distance @ y) / np.maximum(power, 1e-24))
 
 
 def _values(episode: Episode, with_controls: bool) -> tuple[Array, Array]:

@@ -260,21 +260,26 @@ def _fit(
     """
     kinds = {} if same is None else {m.index: m.kind for m in (*same.of_channels, *same.of_weak_channels)}
     y = [np.concatenate([option.targets(row) for option in options], axis=1) for row in rows]
+
+    def of_kind(has_landmark: bool, degree: int) -> list[Option]:
+        kind = has_landmark, degree
+        return [option for option in options if kinds.get(option.channel, kind) == kind]
+
     stages = [
         *(
-            (MORE_FEATURES, [option.fitted(rows, fit) for option in options])
+            (MORE_FEATURES, [option.fitted(rows, fit) for option in of_kind(False, 0)])
             for fit in _ridges([row.features for row in rows], y, groups)
         ),
-        (CLOSER, list(_landmark_fits(rows, y, options))),
+        (CLOSER, list(_landmark_fits(rows, y, of_kind(True, 0)))),
         *(
-            (share, _polynomial_fits(rows, y, options, degree))
+            (share, _polynomial_fits(rows, y, of_kind(False, degree), degree))
             for share, degree in zip((CURVED, CLOSER), DEGREES, strict=True)
         ),
     ]
     best: dict[int, _Fitted] = {}
     for share, fits in stages:
         for channel in {option.channel for option in options}:
-            own = [f for f in fits if f.option.channel == channel and kinds.get(channel, f.kind) == f.kind]
+            own = [fit for fit in fits if fit.option.channel == channel]
             least = min(own, key=lambda fitted: fitted.left, default=None)
             if least is not None and (channel not in best or least.left < share * best[channel].left):
                 best[channel] = least
@@ -318,7 +323,7 @@ def _landmark_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[O
 
 def _polynomial_fits(rows: Sequence[Rows], y: Sequence[Array], options: Sequence[Option], degree: int) -> list[_Fitted]:
     """Fits to a polynomial in state and controls; none with too many terms."""
-    if not (count := rows[0].monomials[degree].shape[1]):
+    if not options or not (count := rows[0].monomials[degree].shape[1]):
         return []
     (fit,) = _ridges([row.monomials[degree] for row in rows], y, [np.arange(count)], RIDGE_OF_MONOMIALS)
     return [option.fitted(rows, fit, degree=degree) for option in options]
