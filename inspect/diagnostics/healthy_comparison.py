@@ -69,8 +69,9 @@ COUNTED = ("steps", "gray levels")
 LARGE = 1e6
 """Magnitude from which numbers have an exponent, such as those of a filter that diverges."""
 
-MIN_EFFECT = 0.5
-"""Minimum difference of an alarm, in standard deviations between healthy episodes."""
+MIN_EFFECT, MIN_EFFECT_OF_CONTROLS = 0.5, 1.5
+"""Minimum difference of an alarm, in standard deviations between healthy episodes; and that of controls from the ones
+that the labels let expect: those of a controller, which episodes of the same speed or load do not vary around."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,8 @@ def compare(
     at_least = (largest[1:, None] >= np.abs(t[0])).sum(0)
     # All divisions with one tested episode are enumerated, including the actual one.
     p_value = at_least / len(values) if count == 1 else (1.0 + at_least) / len(divisions)
-    alarm = (p_value <= (SINGLE_SIGNIFICANCE if count == 1 else SIGNIFICANCE)) & (np.abs(effect[0]) >= MIN_EFFECT)
+    smallest = np.array([min_effect(name) for name in names])
+    alarm = (p_value <= (SINGLE_SIGNIFICANCE if count == 1 else SIGNIFICANCE)) & (np.abs(effect[0]) >= smallest)
     low, high = _ranges(values[count:], count, seed)
     mean, healthy = np.nanmean(values[:count], axis=0), np.nanmean(values[count:], axis=0)
     columns = [column.tolist() for column in (mean, healthy, low, high, p_value, alarm, t[0])]
@@ -259,10 +261,17 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_
     critical = limit * (own if own.ndim == 1 else np.maximum(t.max(0), SMALLEST_T))
     error = math.sqrt(1.0 / comparison.trajectories + 1.0 / profile.episodes)
     result = [
-        replace(d, t=d.t / c, alarm=bool(abs(d.t) >= max(c * alarm / limit, MIN_EFFECT / error)))
+        replace(d, t=d.t / c, alarm=bool(abs(d.t) >= max(c * alarm / limit, min_effect(d.statistic) / error)))
         for d, c in zip(comparison.deviations, critical, strict=True)
     ]
     return tuple(sorted(result, key=lambda deviation: -abs(deviation.t)))
+
+
+def min_effect(statistic: str) -> float:
+    """The smallest difference of an alarm, in standard deviations between healthy episodes."""
+    kind, subject, _ = statistic.split("/")
+    is_expected_control = kind.startswith("reading ") and subject.partition(" ")[0] == "control"
+    return MIN_EFFECT_OF_CONTROLS if is_expected_control else MIN_EFFECT
 
 
 def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
