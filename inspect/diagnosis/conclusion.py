@@ -239,8 +239,9 @@ def channels_text(case: Case, cause: Cause) -> str:
     """
     task, key, alarms = case.inputs.checkpoint.task, cause.component.rpartition(".")[2], symptoms_of(cause, case.alarms)
     if key == "dynamics":
-        patterns = cause.consequences, EFFECTS
-        key, alarms = "control", [a for a in case.alarms if all(matches(each, a.statistic) for each in patterns)]
+        explained = "|".join([cause.consequences, *(symptom.statistics for symptom in cause.symptoms)])
+        key = "control"
+        alarms = [a for a in case.alarms if matches(EFFECTS, a.statistic) and matches(explained, a.statistic)]
     largest: dict[str, float] = {}
     for alarm in alarms:
         if channel := channel_of(alarm.statistic.split("/")[1], task):

@@ -108,8 +108,8 @@ ESTIMATE = Cause(
 LARGE = Cause(
     "dynamics.large",
     "Predicted changes too large",
-    (Symptom("dynamics slope/*"),),
-    f"{_dynamics('effect', 'error', 'nis', 'spread')}|prediction jacobian/*|process noise/*|{FILTER}",
+    (Symptom("dynamics slope/*"), Symptom(EFFECTS, -1, target="shrunk", optional=True)),
+    f"{_dynamics('error', 'nis', 'spread')}|prediction jacobian/*|process noise/*|{FILTER}",
     "Check the time step, units and gains of the dynamics.",
 )
 """The opposite of ``dynamics.frozen``, such as with a time step that is too long."""
