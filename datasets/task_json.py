@@ -62,7 +62,7 @@ def task_from_json(values: Any) -> Task:
         )
         if not values["map_components"]:  # ``Task`` has chosen them; a stored definition names them
             raise BadInput("the definition's map components are [], expected one or two names.")
-        check_definition(task)
+        check_definition(task, stored=True)
     except BadInput:
         raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
@@ -134,12 +134,17 @@ def difference(task: Task, other: Task) -> str:
     return ""
 
 
-def check_definition(task: Task, where: str = "") -> None:
-    """Raise BadInput for a wrong type or inconsistent fields. where: origin of the task, for messages."""
+def check_definition(task: Task, where: str = "", stored: bool = False) -> None:
+    """Raise BadInput for a wrong type or inconsistent fields.
+
+    where: origin of the task, for messages. stored: it is of a file, whose names may be those of an earlier version.
+    """
     place = where or f"task {task.name!r:.200}"
     if not isinstance(task.name, str) or not task.name or len(task.name) > 100 or set(task.name) & set("/\\: "):
         raise BadInput(f"{place} is named {task.name!r:.200}, expected a name without spaces, colons and slashes.")
     _check_components(task, place)
+    if not stored:
+        _check_names(task, place)
     _check_sensors(task, place)
     _check_channels(task, place)
     _check_points(task, place)
@@ -179,9 +184,6 @@ def _check_components(task: Task, place: str) -> None:
 
 def _check_sensors(task: Task, place: str) -> None:
     """Observations, their shapes and periods, and the modalities that have them."""
-    for kind, names in (("observation", task.observations), ("modality", task.modalities)):
-        for name in names:
-            _check_name(name, f"{place}: {kind} {name!r:.200}", "/" if kind == "observation" else "/+")
     for key, shape in task.observations.items():
         if not shape or not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
@@ -205,6 +207,15 @@ def _check_sensors(task: Task, place: str) -> None:
             raise BadInput(f"{place}: modality {modality!r} has no observations.")
 
 
+def _check_names(task: Task, place: str) -> None:
+    """Names that statistics contain, or that are joined."""
+    components = [component.name for component in task.components]
+    kinds = ("component", components, "/"), ("observation", task.observations, "/"), ("modality", task.modalities, "/+")
+    for kind, names, excluded in kinds:
+        for name in names:
+            _check_name(name, f"{place}: {kind} {name!r:.200}", excluded)
+
+
 def _check_name(name: object, about: str, excluded: str = "/") -> None:
     """Raise BadInput for a name with a separator of statistics or files, or of joined modalities.
 
@@ -216,9 +227,8 @@ def _check_name(name: object, about: str, excluded: str = "/") -> None:
 
 def _check_component(component: Component, about: str) -> None:
     """about: start of the message."""
-    _check_name(component.name, about)
-    if component.static not in (0, 1):
-        raise BadInput(f"{about} is static {component.static!r:.200}, expected true or false.")
+    if not isinstance(component.name, str) or component.static not in (0, 1):
+        raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
     if not isinstance(component.unit, str) or len(component.unit) > 40:
         raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
     if component.wraps not in (0, 1) or (component.wraps and (component.unit != "rad" or component.rotation)):
@@ -236,7 +246,9 @@ def _check_channels(task: Task, place: str) -> None:
             expected = f"{shape[0]} names" if len(shape) == 1 else "an observation (d,) or control"
             raise BadInput(f"{place}: channels of {key!r:.200} are {len(channels)}, expected {expected}.")
         for channel in channels:
-            _check_component(channel, f"{place}: channel {channel.name!r:.200} of {key!r:.200}")
+            about = f"{place}: channel {channel.name!r:.200} of {key!r:.200}"
+            _check_component(channel, about)
+            _check_name(channel.name, about)
         if len({channel.name for channel in channels}) < len(channels):
             raise BadInput(f"{place}: channels of {key!r:.200} have equal names.")
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.catalog import TASKS, find_task, load_task
+from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task, axis_name
@@ -83,6 +84,24 @@ def test_parts_of_the_wrong_type_are_refused() -> None:
         replace(DOOR, components=("hinge_x",))  # type: ignore[arg-type]
     with pytest.raises(BadInput, match=r"covariate 'fix' is 'boolean', expected Covariate\("):
         check_definition(replace(DOOR, covariates={"fix": "boolean"}))  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"observations": {"imu/rate": (3,)}, "modalities": {"imu": ("imu/rate",)}}, "observation 'imu/rate' has an"),
+        ({"modalities": {"a+b": ("speed",)}}, r"modality 'a\+b' has an invalid name, expected a text without / and \+"),
+        ({"components": (Component("pose/x", "m"), Component("y", "m"))}, "component 'pose/x' has an invalid name"),
+        ({"covariates": {"a/b": Covariate("boolean")}}, "covariate 'a/b' has an invalid name"),
+    ],
+)
+def test_new_names_have_no_separators_and_stored_ones_open(change: dict[str, Any], message: str) -> None:
+    fields: dict[str, Any] = {"components": (Component("x", "m"), Component("y", "m")), "observations": {"speed": (2,)}}
+    task = Task(**fields | {"name": "own", "modalities": {"speed": ("speed",)}, "control_size": 0, "dt": 0.1} | change)
+    with pytest.raises(BadInput, match=message):
+        check_definition(task)
+    if "covariates" not in change:
+        assert task_from_json(task_to_json(task)) == task
 
 
 def test_the_file_of_a_task_imports_files_next_to_it(tmp_path: Path) -> None:
