@@ -53,20 +53,20 @@ def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quant
         return "it reports no covariance"
     if quantity == "likelihood" and has_likelihood(checkpoint):
         return None
+    wanted = np.arange(len(trace)) if steps is None else np.array(steps)
     if quantity == "likelihood":
         if trace.observation_mean is None or trace.observation_covariance is None:
             if trace.particles is not None:
                 return "its measurement model is known only at its particles"
             return "it reports no virtual observations (observation_mean and observation_covariance)"
-        covariances = trace.observation_covariance
+        covariances = trace.observation_covariance[wanted]
     elif has_layer_weights(trace):
         return None
     else:
-        covariances = trace.estimate_covariance[:, None]
+        covariances = trace.estimate_covariance[wanted][:, None]
         if trace.modalities_with_posterior:
-            covariances = np.concatenate([trace.modality_covariance, covariances], axis=1)
-    wanted = np.arange(len(covariances)) if steps is None else np.array(steps)
-    degenerate = np.linalg.eigvalsh(covariances[wanted].astype(np.float64)).min(axis=(1, 2)) <= 0.0
+            covariances = np.concatenate([trace.modality_covariance[wanted], covariances], axis=1)
+    degenerate = np.linalg.eigvalsh(covariances.astype(np.float64)).min(axis=(1, 2)) <= 0.0
     if not (degenerate.all() if steps is None else degenerate.any()):
         return None
     return f"a covariance of step {wanted[degenerate.argmax()]} is not positive definite"
