@@ -242,13 +242,18 @@ class RunMatcher:
         """Name in the catalog of the filter of a file, or its own name, with its hash if another filter has it."""
         return display_name(name, checkpoint_hash, self.filters(task), checkpoint_hash[:6])
 
-    def data_name(self, task: str, episode: int, data_hash: str) -> str | None:
-        """Name of the live run or data set with an episode; None if there is none."""
+    def live_data(self) -> dict[tuple[str, int, str], str]:
+        """Task, index and hash of the episodes of live runs -> name of their data; that of the newest run."""
+        names: dict[tuple[str, int, str], str] = {}
         for name in self._store.live.newest():
             with suppress(BadInput):
                 run = self._store.live[name]
-                if (run.task.name, run.template.episode_index, run.template.data_hash) == (task, episode, data_hash):
-                    return f"{LIVE_PREFIX}{name}"
+                episode = run.task.name, run.template.episode_index, run.template.data_hash
+                names.setdefault(episode, f"{LIVE_PREFIX}{name}")
+        return names
+
+    def data_name(self, task: str, episode: int, data_hash: str) -> str | None:
+        """Name of the data set with an episode; None if there is none."""
         with suppress(BadInput):
             return self._find_data(task, episode, data_hash)
         return None

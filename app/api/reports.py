@@ -60,15 +60,17 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
 
     @app.get("/api/reports")
     def list_reports() -> ReportList:
-        entries = [
-            replace(
-                entry,
-                filter=matcher.filter_name(entry.filter, entry.checkpoint_hash, entry.task),
-                data=matcher.data_name(entry.task, entry.episode, entry.data_hash) if entry.data_hash else None,
+        listed = reports.list_reports()
+        live = matcher.live_data() if listed else {}
+
+        def with_names(entry: ReportEntry) -> ReportEntry:
+            episode = entry.task, entry.episode, entry.data_hash
+            data = live.get(episode) or matcher.data_name(*episode) if entry.data_hash else None
+            return replace(
+                entry, filter=matcher.filter_name(entry.filter, entry.checkpoint_hash, entry.task), data=data
             )
-            for entry in reports.list_reports()
-        ]
-        return ReportList(reports=entries, deleted=reports.trash.list_deleted())
+
+        return ReportList(reports=[*map(with_names, listed)], deleted=reports.trash.list_deleted())
 
     @app.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def write_report(
