@@ -30,6 +30,9 @@ export function setPanelError(body, text, retry) {
   html('.note', body).append(createButton('text', 'Try again', retry));
 }
 
+/** Keys of messages that are no errors. */
+const NOTICES = new Set(['failure', 'link']);
+
 /** Messages at the top of the page, one per key; each stays until it is replaced, cleared or dismissed. */
 export class Messages {
   #host;
@@ -60,7 +63,7 @@ export class Messages {
   #append(key, text) {
     const close = createButton('', '×', () => line.remove(), { ariaLabel: 'Dismiss' });
     const line = create('p', {}, create('span', { textContent: text }), close);
-    if (key === 'failure' || key === 'link') line.className = 'notice'; // no error
+    if (NOTICES.has(key)) line.className = 'notice';
     line.dataset.key = key;
     this.#host.append(line);
   }

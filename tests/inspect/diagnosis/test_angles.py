@@ -24,27 +24,31 @@ def test_angles_are_those_that_jump_by_a_turn(bias: float, start: float) -> None
     assert not is_angle(0.01 * course), "no jump"
 
 
-def test_bearings_have_the_statistics_of_continuous_angles() -> None:
-    """A turn more or less in the readings changes nothing, also in windows and between absent readings."""
-    rng = np.random.default_rng(1)
-    course = np.cumsum(rng.normal(0.05, 0.05, (100, 2)), axis=0) + rng.normal(0.0, 0.02, (100, 2))
+def boat(bearings: np.ndarray, seen: np.ndarray) -> Episode:
+    """An episode with bearings (T, d) that may be absent, of which nothing else is known."""
     task = Task(
         "boat",
         (Component("x", "m"),),
-        observations={"bearing": (2,)},
+        observations={"bearing": bearings.shape[1:]},
         modalities={"radar": ("bearing",)},
         masks={"bearing": "seen"},
         covariates={"seen": Covariate("boolean")},
         control_size=0,
         dt=0.1,
     )
-    seen = (np.arange(100) % 7 != 0).astype(np.float32)
+    count = len(bearings)
+    covariates = {"seen": seen.astype(np.float32)}
+    return Episode(task, np.zeros((count, 1)), np.zeros((count, 0)), {"bearing": bearings}, covariates=covariates)
+
+
+def test_bearings_have_the_statistics_of_continuous_angles() -> None:
+    """A turn more or less in the readings changes nothing, also in windows and between absent readings."""
+    rng = np.random.default_rng(1)
+    course = np.cumsum(rng.normal(0.05, 0.05, (100, 2)), axis=0) + rng.normal(0.0, 0.02, (100, 2))
+    seen = np.arange(100) % 7 != 0
 
     def statistics(bearings: np.ndarray) -> dict[str, float]:
-        readings = {"bearing": np.where(seen[:, None] > 0.0, bearings, 9.0)}
-        return sensor_statistics(
-            Episode(task, np.zeros((100, 1)), np.zeros((100, 0)), readings, covariates={"seen": seen}), None
-        )
+        return sensor_statistics(boat(np.where(seen[:, None], bearings, 9.0), seen), None)
 
     continuous, jumping = statistics(course), statistics((course + np.pi) % (2.0 * np.pi) - np.pi)
     assert np.abs(np.diff(course, axis=0)).max() < 1.0 < np.ptp(course)
@@ -61,18 +65,6 @@ def test_bearings_in_bursts_are_angles_although_they_jump_between_them() -> None
     values = ((course + np.pi) % (2.0 * np.pi) - np.pi)[seen]
     assert not is_angle(values)
     assert is_angle(values, np.diff(np.flatnonzero(seen)) == 1)
-    task = Task(
-        "boat",
-        (Component("x", "m"),),
-        observations={"bearing": (1,)},
-        modalities={"radar": ("bearing",)},
-        masks={"bearing": "seen"},
-        covariates={"seen": Covariate("boolean")},
-        control_size=0,
-        dt=0.1,
-    )
     readings = np.zeros((120, 1))
     readings[seen, 0] = values
-    covariates = {"seen": seen.astype(np.float32)}
-    episode = Episode(task, np.zeros((120, 1)), np.zeros((120, 0)), {"bearing": readings}, covariates=covariates)
-    assert angle_channels(episode, "bearing") == [0]
+    assert angle_channels(boat(readings, seen), "bearing") == [0]
