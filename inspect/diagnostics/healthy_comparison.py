@@ -281,8 +281,10 @@ def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np
     logarithmic, lost = np.array([s[1] for s in settings]), np.array([kind in LOST for kind in kinds])
     floor = np.array([s[2] * (LEVER if "/torque " in n else 1.0) for n, s in zip(names, settings, strict=True)])
     for i, (kind, subject, _) in enumerate(name.split("/") for name in names):
-        if kind in OF_AXES and (size := f"size/{subject}/contact") in names:
-            floor[i] = min(floor[i], SMALLEST_SHARE * np.nanmedian(values[:, names.index(size)]))
+        own = (f"size/{subject}/contact", f"size/{subject}/all", f"size/{subject.rpartition(' ')[0]}/all")
+        sizes = [values[:, names.index(size)] for size in own if kind in OF_AXES and size in names]
+        if known := [np.nanmedian(size) for size in sizes if np.isfinite(size).any()]:
+            floor[i] = min(floor[i], SMALLEST_SHARE * known[0])
     rising = np.array([k in RISING or n.endswith("/range") for n, k in zip(names, kinds, strict=True)])
     scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
     return np.where(lost, -np.log(np.maximum(1.0 - values, SMALLEST_REST)), scaled), floor, rising

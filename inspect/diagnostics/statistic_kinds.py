@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from beliefscope.datasets.task import Component, Task, axis_name, display_name, display_unit
+from beliefscope.inspect.statistics.array_channels import CHANNELS
 
 KINDS = {
     "nees": ("NEES/n", True, 0.05),
@@ -117,6 +118,7 @@ KINDS = {
     "noise": ("noise", False, 0.02),
     "position noise": ("noise", False, 5e-4),
     "stuck": ("share of repeated readings", False, 0.02),
+    "dead": ("share of elements that never change", False, 0.002),
     "saturation": ("share of saturated readings", False, 0.01),
     "share": ("share of steps with the flag{of} set", False, 0.02),
     "toggles": ("share of steps at which the flag{of} changes", False, 0.01),
@@ -172,6 +174,7 @@ RISING = frozenset(
         "losses",
         "frozen",
         "stuck",
+        "dead",
         "saturation",
         "clipped",
         "absent",
@@ -282,6 +285,11 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
 def channel_of(subject: str, task: Task) -> tuple[str, Component] | None:
     """Name (``axis_name``) and channel of a statistic's subject, which may start with the modality; None without."""
     owners = {key: f"{modality} " for modality, keys in task.modalities.items() for key in keys}
+    for key in (key for key in task.arrays if key in subject):
+        for i, channel in enumerate(CHANNELS):
+            name = axis_name(key, i, len(CHANNELS))
+            if subject in (name, owners[key] + name):
+                return name, Component(f"{key} {channel}", "")
     for key, shape in {**task.observations, "control": (task.control_size,)}.items():
         for i in range(shape[0] if len(shape) == 1 and key in subject else 0):
             name = axis_name(key, i, shape[0])

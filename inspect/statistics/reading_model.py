@@ -1,4 +1,4 @@
-"""Model of a vector sensor or of the controls: values that the labels lead to expect, from healthy episodes.
+"""Model of a sensor or of the controls: values that the labels lead to expect, from healthy episodes.
 
 It shows what the readings of a sensor of unknown physics cannot show by themselves: channels that are inverted or
 exchanged, a gain, a bias, and a delay behind the labels.
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.inspect.statistics.array_channels import array_channels
 from beliefscope.inspect.statistics.reading_features import (
     CONTROL,
     FIRST_CHANGES,
@@ -265,8 +266,8 @@ class ReadingModel:
         _, (state, *_) = features(episode, self.key != CONTROL)
         of_features = (m for m in self.of_channels if not len(m.landmark) and not m.degree)
         others = (np.delete(model.coefficients, state, axis=0) for model in of_features)
-        count = readings_of(episode, self.key).shape[1]
-        return len(self.of_channels) == count and not any(values.any() for values in others)
+        readings = episode.controls if self.key == CONTROL else episode.observations[self.key]
+        return len(self.of_channels) == readings[0].size and not any(values.any() for values in others)
 
     def expected(self, episode: Episode) -> Array:
         """(T, A) expected readings of the states of an episode; NaN if the model has features of another version.
@@ -310,8 +311,9 @@ class ReadingModel:
 
 
 def readings_of(episode: Episode, key: str) -> Array:
-    """(T, d) readings of a vector sensor, or the controls."""
-    return (episode.controls if key == CONTROL else episode.observations[key]).astype(np.float64)
+    """(T, d) readings of a vector sensor, channels of an array, or the controls."""
+    readings = episode.controls if key == CONTROL else episode.observations[key]
+    return array_channels(readings) if readings.ndim > 2 else readings.astype(np.float64)
 
 
 def angle_of(columns: Array, states: Array, heading: Array) -> Array:

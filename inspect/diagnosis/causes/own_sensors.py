@@ -10,6 +10,7 @@ from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes import image
 from beliefscope.inspect.diagnosis.causes.consequences import LABELS, WEIGHTS, model_of
 from beliefscope.inspect.diagnosis.causes.image import OBJECT
+from beliefscope.inspect.diagnosis.causes.own_arrays import array_causes
 from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, has_labels_only
 from beliefscope.inspect.statistics.reference_images import HAND
@@ -95,8 +96,9 @@ def sensor_causes(task: Task) -> tuple[Cause, ...]:
             title = f"Readings of sensor {display_name(key)} lost"
             result.append(Cause(f"{key}.dropout", title, (lost,), changed, CONNECTION, f"drop {modality}"))
         result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
+        result += array_causes(key, _downstream(modality), f"drop {modality}") if key in task.arrays else []
         result += _changed_views(key, modality) if key in task.images else []
-    for key in modelled_sensors(task):
+    for key in (key for key in modelled_sensors(task) if key not in task.arrays):
         result += _wrong_channels(task, key)
     parts = (_moved_cameras, _delays, _delayed_modalities)
     return (*result, *(cause for part in parts for cause in part(task)))
@@ -239,13 +241,14 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
 
 
 def _delayed_sensors(task: Task) -> list[str]:
-    """Vector sensors whose delay labelled contact, if no sensor measures it, or the labels show."""
+    """Vector sensors and arrays whose delay labelled contact, if no sensor measures it, or the labels show."""
     vectors = [key for key, shape in task.observations.items() if len(shape) == 1 and key != HAND]
+    vectors += task.arrays
     return vectors if has_labels_only(task) else modelled_sensors(task)
 
 
 def _delays(task: Task) -> tuple[Cause, ...]:
-    """Delays of vector sensors behind the labels.
+    """Delays of vector sensors and arrays behind the labels.
 
     Force and torque are of one sensor: a delay of the force explains that of the torque, and the laws of both.
     """

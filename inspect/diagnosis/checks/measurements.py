@@ -62,11 +62,11 @@ def measurement_model_statistics(
 
 
 def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple[ReadingModel, list[int]]]:
-    """Models of the sensors of modality k, and the columns of their channels among its innovations.
+    """Models of the vector sensors of modality k, and the columns of their channels among its innovations.
 
     None if the innovations do not have the channels of all sensors.
     """
-    by_key, start = {model.key: model for model in models}, 0
+    by_key, start = {model.key: model for model in models if model.key not in trace.task.arrays}, 0
     sensors = []
     for key in trace.task.modalities.get(trace.modalities[k], ()):
         if (model := by_key.get(key)) is not None:

@@ -68,13 +68,13 @@ FITS = 9.0
 
 
 def modelled_sensors(task: Task) -> list[str]:
-    """Observation keys of the vector sensors of unknown physics, except lidars.
+    """Observation keys of the vector sensors of unknown physics, except lidars, and of arrays.
 
     A measured hand shows the physics of force and torque.
     """
     known = {CONTACT, *task.scans, *((HAND, FORCE, TORQUE) if HAND in task.observations else ())}
     sizes = {key: shape[0] for key, shape in task.observations.items() if len(shape) == 1 and key not in known}
-    return [key for key, size in sizes.items() if size <= MAX_CHANNELS]
+    return [*(key for key, size in sizes.items() if size <= MAX_CHANNELS), *task.arrays]
 
 
 def modelled_keys(task: Task) -> list[str]:

@@ -46,6 +46,7 @@ from beliefscope.inspect.diagnosis.checks.windows import (
     window_values,
 )
 from beliefscope.inspect.diagnostics.statistic_kinds import AROUND_EXPECTED, sensor_of
+from beliefscope.inspect.statistics.array_channels import element_statistics, with_array_channels
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.reference_images import Reference, image_keys, with_gray_images
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, deviating_interval, long_runs, repeats
@@ -61,8 +62,8 @@ def sensor_statistics(
     episode: Episode, reference: Reference | None, readings: Sequence[ReadingModel] = ()
 ) -> dict[str, float]:
     """All statistics of sensors and controls; some of images only with a reference, of others only with a model."""
-    episode = with_gray_images(with_continuous_angles(episode))
-    values: dict[str, float] = {}
+    values = element_statistics(episode)
+    episode = with_array_channels(with_gray_images(with_continuous_angles(episode)))
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference) | motion_statistics(episode, key, reference)
     values |= {f"absent/{key}/all": float(1.0 - episode.present(key).mean()) for key in episode.task.masks}
@@ -111,6 +112,7 @@ def localise(
         return None
     episode = with_continuous_angles(episode)
     episode = with_gray_images(episode) if key in episode.task.images else episode
+    episode = with_array_channels(episode) if axis else episode
     marked = _marked_steps(kind, key, axis, episode)
     if marked is not None:
         steps = np.flatnonzero(marked)
@@ -135,7 +137,7 @@ def covers_episode(statistic: str, episode: Episode) -> bool:
     key, axis = sensor_of(subject, episode.observations)
     if key not in episode.observations:
         return False
-    readings = episode.observations[key][episode.present(key)]
+    readings = (with_array_channels(episode) if axis else episode).observations[key][episode.present(key)]
     match kind:
         case "black" | "losses":
             return bool(lost_images(readings).all())
@@ -157,7 +159,7 @@ def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | No
             return _in_runs(stuck(episode, key, axis_index(axis)), present)
         case "stuck":
             return _in_runs(repeats(readings, episode.task.held_steps(key)), present)
-        case "saturation":
+        case "saturation" if axis:
             marked = np.zeros(len(present), dtype=bool)
             marked[present] = saturated(readings[present, axis_index(axis)].astype(np.float64))
             return marked
@@ -201,7 +203,8 @@ def _sizes(kind: str, key: str, axis: str, episode: Episode, reference: Referenc
     match kind:
         case "noise" | "position noise" if present.sum() > 2:
             chosen = readings[:, [axis_index(axis)]] if axis else readings.reshape(len(readings), -1)
-            size = np.median(np.abs(np.diff(chosen[present], n=2, axis=0)), axis=1)
+            middle = np.mean if key in episode.task.arrays else np.median  # of a tactile grid, most are at rest
+            size = middle(np.abs(np.diff(chosen[present], n=2, axis=0)), axis=1)
             if not is_image(episode.observations[key]):  # the median of many pixels varies less
                 size = median_filter(size, SMOOTH, mode="nearest")
             series = np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12)
