@@ -20,7 +20,7 @@ CHANNELS = ("mean", "spread", "row", "column")
 """Channels of an array: mean and standard deviation of its elements, and the centre along its first two axes."""
 
 MAX_ELEMENTS = 10_000
-"""Largest number of elements that all count; larger arrays are represented by every second row and column, and so on."""
+"""Largest number of elements that all count. Larger arrays count by every second row and column, and so on."""
 
 
 def array_keys(episode: Episode) -> list[str]:
