@@ -34,6 +34,9 @@ INTERNAL = r"innov|residual|(^|[._/])(nis|nees|ess|n_?eff)([._/]|$)|(^|[._/])(P|
 VARIANCE = r"(^|[./])(P|cov|covariance)[_.\[(]?(\d|[xyz]_?[xyz]$)"
 """Pattern of the elements of a covariance in columns of their own."""
 
+ROW_AND_COLUMN = re.compile(r"(\d|[xyz])[_,.]?(\d|[xyz])[\])]?$", re.I)
+"""Row and column of such an element, at the end of its name."""
+
 TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
 """Part of a column's name that marks a true value."""
 
@@ -93,7 +96,7 @@ def _table(every: Columns) -> list[str]:
     ensemble = _named(r"ensemble|particle|sample", [n for n in rows if rows[n].ndim == 3])[:1]
     square = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]]
     covariance = [n for n in square if rows[n].dtype.kind == "f"][:1]
-    covariance = covariance or (elements if len(elements) == len(mean) ** 2 else [])
+    covariance = covariance or _square(elements, len(mean))
     if not mean and not ensemble:  # of an estimate: without it, they are sensors
         std, covariance = [], []
     # Standard deviations of some components only cannot be imported.
@@ -149,6 +152,18 @@ def _estimate(
         mean = [names[name] for name in state]
     std = [short[name] for name in state if name in short] if len(short) >= len(std) else std
     return mean, state, std
+
+
+def _square(elements: Sequence[str], n: int) -> list[str]:
+    """Columns of all n times n elements of a covariance, from those of one triangle as well; none for other numbers."""
+    if len(elements) == n * n:
+        return [*elements]
+    places = [match.groups() for name in elements if (match := ROW_AND_COLUMN.search(name))]
+    column_of = {frozenset(place): name for place, name in zip(places, elements, strict=False)}
+    axes = [row for row, column in places if row == column]
+    is_triangle = len(places) == len(column_of) == n * (n + 1) // 2 and len(axes) == n
+    square = [column_of.get(frozenset({i, j}), "") for i in axes for j in axes]
+    return square if is_triangle and all(square) else []
 
 
 def _deviations(components: Iterable[str], flat: Sequence[str]) -> dict[str, str]:

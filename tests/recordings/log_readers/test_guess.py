@@ -55,6 +55,22 @@ def test_a_table_of_a_filter_has_its_estimate_covariance_and_controls(elements: 
     assert values["estimate"] == {"mean": ["ekf_x", "ekf_yaw"], "covariance": elements}
 
 
+@pytest.mark.parametrize(
+    ("elements", "square"),
+    [
+        (["Pxx", "Pxy", "Pyy"], ["Pxx", "Pxy", "Pxy", "Pyy"]),
+        (["P_0_0", "P_1_0", "P_1_1"], ["P_0_0", "P_1_0", "P_1_0", "P_1_1"]),
+        (["cov[0,0]", "cov[0,1]", "cov[1,1]"], ["cov[0,0]", "cov[0,1]", "cov[0,1]", "cov[1,1]"]),
+        (["Pxx", "Pxy", "Pxz"], None),
+        (["Pxx", "Pyy"], None),
+    ],
+)
+def test_a_triangle_of_a_covariance_is_completed(elements: list[str], square: list[str] | None) -> None:
+    names = ["t", "true_x", "true_y", "ekf_x", "ekf_y", *elements]
+    values = tomllib.loads(guess_map(Preview({name: np.ones(3) for name in names}), "drive"))
+    assert values["estimate"].get("covariance") == square
+
+
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
     (tmp_path / "drive.bag").touch()
     with pytest.raises(BadInput, match=r"drive.bag is a bag of ROS 1; convert it: .*--src drive.bag --dst drive"):
