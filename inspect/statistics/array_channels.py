@@ -65,6 +65,7 @@ def element_statistics(episode: Episode) -> dict[str, float]:
     ``noise`` and ``size``: mean over the elements of their noise and of their standard deviation, and ``roughness``,
     their ratio. ``stuck``: share of steps that repeat the whole array. ``dead``: share of elements that never change,
     other than those at the largest value, which are saturated. ``saturation``: share of readings at this value.
+    ``holes``: share of readings that are 0, such as those of a depth image without a return.
     """
     values: dict[str, float] = {}
     for key in array_keys(episode):
@@ -81,5 +82,6 @@ def element_statistics(episode: Episode) -> dict[str, float]:
             f"stuck/{key}/all": float(held[present].mean()),
             f"dead/{key}/all": float((constant & (readings[0] < largest)).mean()),
             f"saturation/{key}/all": float((readings == largest).mean()),
+            f"holes/{key}/all": float((readings == 0.0).mean()),
         }
     return values

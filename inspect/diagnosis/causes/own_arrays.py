@@ -23,6 +23,7 @@ TEXTS = {
     "drift": ("Sensor {} drifting", "Let the sensor warm up and tare it before each episode."),
     "gain": ("Sensor {} has a wrong gain", "Check the unit and the gain of the sensor."),
     "dead": ("Elements of sensor {} dead", "Replace the elements, or mask them in training as well."),
+    "holes": ("Elements of sensor {} without a value", "Check the light, the range and the surfaces that it sees."),
     "shift": ("Sensor {} moved", "Calibrate the place of the sensor again."),
     "sign": ("Values of sensor {} inverted", "Check the sign of the sensor."),
     "axes": ("Array of sensor {} mirrored or transposed", "Check the order of the rows and columns of the sensor."),
@@ -37,7 +38,7 @@ def of_channels(key: str, kinds: str, *channels: str) -> str:
 
 
 def array_causes(key: str, downstream: str, undo: str) -> list[Cause]:
-    """Noise, bias, drift, gain, dead elements, another view and a mirrored array of the sensor with this key.
+    """Causes of the array sensor with this key: values, elements, its place and the order of rows and columns.
 
     A bias moves the mean only, a gain scales mean and spread, and another place of the sensor moves the centre. Noise
     increases the spread as well and draws the centre to the middle.
@@ -70,6 +71,7 @@ def array_causes(key: str, downstream: str, undo: str) -> list[Cause]:
         ),
         "gain": ((scaled, louder), f"{of('[!ie]*', *size)}|{noises}|{limits}"),
         "dead": ((Symptom(f"dead/{key}/all"),), f"*/{key}/*|*/{key} */*"),
+        "holes": ((Symptom(f"holes/{key}/all"),), f"{of('*')}|noise/{key}/all|{elements}|{limits}"),
         "shift": ((moved,), f"{of(f'{BIASED}|reading scatter|size|change')}|{elements}"),
         "sign": ((Symptom(of("inverted", *mean), otherwise=(negated,)),), f"{of('*', *mean)}|{limits}"),
         "axes": ((Symptom(of("inverted|exchanged", *centre)),), of("*", *centre)),

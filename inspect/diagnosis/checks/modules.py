@@ -27,6 +27,7 @@ from beliefscope.inspect.diagnosis.checks.innovation_lags import innovation_lags
 from beliefscope.inspect.diagnosis.checks.innovations import innovation_statistics
 from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_statistics
 from beliefscope.inspect.diagnosis.checks.true_starts import with_innovations_near_truth, with_particles_near_truth
+from beliefscope.inspect.diagnosis.checks.used_readings import used_readings
 from beliefscope.inspect.diagnostics.kalman_equations import jacobian_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
@@ -66,7 +67,7 @@ def model_statistics(trace: Trace, checkpoint: Checkpoint, readings: Sequence[Re
         near_truth = trace
         if has_truth:
             near_truth = with_innovations_near_truth(with_particles_near_truth(trace, checkpoint), checkpoint)
-            values |= innovation_lags(trace, near_truth, checkpoint)
+            values |= innovation_lags(trace, near_truth, checkpoint) | used_readings(trace, checkpoint)
         values |= measurement_model_statistics(trace, readings, near_truth) | jacobian_statistics(trace, checkpoint)
         if isinstance(checkpoint, UnavailableFilter) or reports_estimates_only(trace):  # of others, its causes
             variance = np.diagonal(trace.estimate_covariance[measures.counted(trace)], axis1=-2, axis2=-1)

@@ -76,12 +76,17 @@ def dead(grid: np.ndarray) -> np.ndarray:
     return result
 
 
+def with_holes(grid: np.ndarray) -> np.ndarray:
+    return np.where(np.random.default_rng(0).random(grid.shape) < 0.15, 0.0, grid)
+
+
 CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "noise": noisy,
     "bias": lambda grid: grid + 0.15,
     "drift": lambda grid: grid + np.linspace(0.0, 0.3, len(grid))[:, None, None],
     "gain": lambda grid: 1.5 * grid,
     "dead": dead,
+    "holes": with_holes,
     "stuck": stuck,
     "saturation": lambda grid: np.minimum(grid, 1.0),
     "shift": lambda grid: np.roll(grid, 1, axis=2),

@@ -59,6 +59,7 @@ def test_statistics_of_elements() -> None:
     assert result["roughness/grid/all"] == pytest.approx(1.0, abs=0.03)
     assert result["saturation/grid/all"] == pytest.approx(0.0062 * 102 / 108, abs=0.001)
     assert result["stuck/grid/all"] == 0.0
+    assert result["holes/grid/all"] == 6 / 108
     values[200:300] = values[200]
     assert element_statistics(episode(values))["stuck/grid/all"] == 99 / 400
 
