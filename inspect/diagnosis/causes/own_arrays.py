@@ -30,6 +30,9 @@ TEXTS = {
 }
 """Mechanism -> title, next action."""
 
+UNDO = {"bias": "level", "gain": "divide", "sign": "negate", "axes": "reorder"}
+"""Mechanism -> intervention that brings back the values of the sensor."""
+
 
 def of_channels(key: str, kinds: str, *channels: str) -> str:
     """Patterns of the statistics of these kinds, joined by ``|``, about channels of an array; of all by default."""
@@ -45,7 +48,7 @@ def array_causes(key: str, downstream: str, undo: str) -> list[Cause]:
 
     Args:
         downstream: patterns of what a fault of the sensor changes downstream.
-        undo: intervention that undoes any of them.
+        undo: intervention that undoes any of them, by dropping the sensor.
     """
     name, of, elements = display_name(key), partial(of_channels, key), f"size/{key}/*|roughness/{key}/*"
     mean, size, centre = ("mean",), ("mean", "spread"), ("row", "column")
@@ -83,7 +86,7 @@ def array_causes(key: str, downstream: str, undo: str) -> list[Cause]:
             entries[mechanism][0],
             f"{entries[mechanism][1]}|{lags}|lag/*|{downstream}",
             action,
-            undo,
+            f"{UNDO[mechanism]} {key}|{undo}" if mechanism in UNDO else undo,
             prior=EXACT if mechanism == "sign" else 0.0,
         )
         for mechanism, (title, action) in TEXTS.items()

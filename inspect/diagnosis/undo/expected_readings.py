@@ -46,7 +46,7 @@ def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
 
 def detrend(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings without the line over time that fits their errors from the expected ones in all affected episodes."""
-    if (model := _reading_model(key, inputs)) is None:
+    if (model := reading_model(key, inputs)) is None:
         return None
     compared = [model.compare(inputs.episodes[index]) for index in inputs.affected]
     steps = np.concatenate([one.steps() for one in compared])
@@ -69,7 +69,7 @@ def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | No
 
 def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings with the order and the signs of channels that best agree with the labels; None if they have them."""
-    if (model := _reading_model(key, inputs)) is None:
+    if (model := reading_model(key, inputs)) is None:
         return None
     from scipy.optimize import linear_sum_assignment  # takes most of a second
 
@@ -99,7 +99,7 @@ def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], 
     Args:
         gain_of: g (A,) from readings and expected readings (S, A).
     """
-    if (model := _reading_model(key, inputs)) is None:
+    if (model := reading_model(key, inputs)) is None:
         return None
     pairs = (model.compare(inputs.episodes[index]).pairs() for index in inputs.affected)
     readings, expected = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
@@ -122,7 +122,7 @@ def _with_channels(inputs: RunInputs, model: ReadingModel, change: Callable[[Arr
     return with_readings(inputs, model.key, restored)
 
 
-def _reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:
+def reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:
     """The healthy record's model of a sensor; None if the labels explain none of its channels."""
     readings = () if inputs.healthy is None else inputs.healthy.readings
     return next((model for model in readings if model.key == key and model.channels), None)

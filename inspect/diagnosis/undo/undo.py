@@ -24,6 +24,7 @@ from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.weight_model import MAX_LOGIT
+from beliefscope.inspect.diagnosis.undo import arrays
 from beliefscope.inspect.diagnosis.undo.expected_readings import detrend, rearrange, scale, tare
 from beliefscope.inspect.diagnosis.undo.readings import READINGS, advance
 from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, Undo, without_sensor
@@ -286,6 +287,10 @@ BY_SUBJECT: dict[str, Callable[[str, RunInputs, Deviations], RunInputs | None]] 
     "scale": scale,
     "tare": tare,
     "detrend": detrend,
+    "level": arrays.level,
+    "divide": arrays.divide,
+    "negate": arrays.negate,
+    "reorder": arrays.reorder,
 }
 """Interventions that are followed by a modality or sensor."""
 

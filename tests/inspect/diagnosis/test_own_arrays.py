@@ -17,6 +17,8 @@ from beliefscope.inspect.diagnosis.checks.measurements import measurement_model_
 from beliefscope.inspect.diagnosis.checks.readings import without_explained
 from beliefscope.inspect.diagnosis.checks.sensors import localise, sensor_statistics
 from beliefscope.inspect.diagnosis.scoring import applicable, explain, probabilities
+from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
+from beliefscope.inspect.diagnosis.undo.undo import undo
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.diagnostics.statistic_kinds import label_of
@@ -96,6 +98,10 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+def still(*, observations: object, controls: np.ndarray) -> np.ndarray:
+    return np.zeros((*controls.shape[:-1], 3))
+
+
 @pytest.mark.first(4)
 @pytest.mark.slow
 @pytest.mark.parametrize("mechanism", CHANGES)
@@ -125,10 +131,35 @@ def test_channels_have_names_and_steps_of_the_fault_are_found() -> None:
     assert abs(last - 49) < 4
 
 
+@pytest.mark.parametrize(
+    ("name", "mechanism"), [("level", "bias"), ("divide", "gain"), ("negate", "sign"), ("reorder", "axes")]
+)
+def test_faults_of_arrays_are_undone(name: str, mechanism: str) -> None:
+    """Up to a tenth of the noise, 0.03, of the mean of all elements, and 2 % of the gain; other episodes stay."""
+    profile = HealthyProfile("palm", len(record().rows), None, {}, record().reference, record().readings)
+    episode, change = roll(50), CHANGES[mechanism]
+    wrong = replace(episode, observations={"grid": change(episode.observations["grid"]).astype(np.float32)})
+    inputs = RunInputs(as_external(still, "still", TASK), {0: wrong, 1: wrong}, 1, frozenset({0}), healthy=profile)
+    result = undo(f"{name} grid", inputs, {d.statistic: d for d in deviations_of(change)})
+    assert result is not None
+    np.testing.assert_allclose(result.episodes[0].observations["grid"], episode.observations["grid"], 0.02, 0.003)
+    assert result.episodes[1] is wrong
+    assert f"{name} grid" in next(c.undo for c in causes_of(TASK) if c.name == f"grid.{mechanism}")
+
+
+def test_the_right_order_and_unknown_channels_are_left() -> None:
+    profile = HealthyProfile("palm", len(record().rows), None, {}, record().reference, record().readings)
+    inputs = RunInputs(as_external(still, "still", TASK), {0: roll(50)}, 1, frozenset({0}), healthy=profile)
+    assert undo("reorder grid", inputs, {}) is None
+    assert undo("reorder grid", replace(inputs, healthy=None), {}) is None
+    assert undo("level grid", inputs, {}) is None
+    assert undo("divide grid", inputs, {}) is None
+
+
 def test_innovations_of_arrays_are_not_compared_with_their_channels() -> None:
     """An external filter may report an innovation of as many columns as the array has elements."""
 
-    def still(*, observations: dict[str, np.ndarray], controls: np.ndarray) -> dict[str, np.ndarray]:
+    def reports(*, observations: dict[str, np.ndarray], controls: np.ndarray) -> dict[str, np.ndarray]:
         leading = controls.shape[:-1]
         return {
             "estimate_mean": np.zeros((*leading, 3)),
@@ -139,5 +170,5 @@ def test_innovations_of_arrays_are_not_compared_with_their_channels() -> None:
             "innovation_covariance": np.tile(np.eye(48), (*leading, 1, 1, 1)),
         }
 
-    run = trace(as_external(still, "still", TASK), roll(0))
+    run = trace(as_external(reports, "reports", TASK), roll(0))
     assert not any("grid" in name for name in measurement_model_statistics(run, record().readings))
