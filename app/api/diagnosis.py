@@ -61,6 +61,7 @@ class Diagnosis(Reply):
     outdated: whether an earlier version measured the healthy record, which lacks statistics.
     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
     largest_error: of runs without a fault; None if the true state is unknown.
+    runs: data sets of several live runs by the indices of their episodes; None for episodes of one data set.
     """
 
     causes: list[DiagnosisCause]
@@ -77,6 +78,7 @@ class Diagnosis(Reply):
     alarm_rate: float
     restarts: dict[int, list[int]] | None = None
     largest_error: Encoded[LargestError] | None = None
+    runs: dict[int, str] | None = None
 
 
 class DiagnosisJob(JobReply):
@@ -121,7 +123,7 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
         responses={202: {"model": DiagnosisJob | Progress}},
     )
     def get_diagnosis(selection: RequestedRun, over: Over = "episode") -> Response:
-        if selection.data.startswith(LIVE_PREFIX):  # of no data set, whose episodes a job could run
+        if over == "episode" and selection.data.startswith(LIVE_PREFIX):  # no data set, whose episodes a job could run
             store.live.ended_run(selection.data)
             return JSONResponse({"job": None, "preliminary": preliminary_diagnosis(store, selection)}, status_code=202)
         job = jobs.find("diagnosis", _arguments(store, selection, over))
@@ -135,9 +137,14 @@ def add_routes(app: FastAPI, store: TraceStore, jobs: Jobs) -> None:
     @app.post("/api/diagnosis/{task}/{filter}/{episode}", status_code=202)
     def find_cause(selection: RequestedRun, over: Over = "episode") -> JobReply:
         arguments = _arguments(store, selection, over)
-        scope = "" if over == "episode" else plural(len(arguments["episodes"]), "held-out episode")
+        if over == "episode":
+            scope = ""
+        elif "selections" in arguments:
+            scope = f"all {plural(len(arguments['selections']), 'run')}"
+        else:
+            scope = plural(len(arguments["episodes"]), "held-out episode")
         title = f"Diagnosis of {selection.describe(scope)}"
-        link = replace(selection, data=arguments["data"]).link("diagnosis", over=over)
+        link = replace(selection, data=arguments.get("data", selection.data)).link("diagnosis", over=over)
         return JobReply(job=jobs.submit("diagnosis", title, arguments, link=link))
 
     @app.get(
@@ -199,6 +206,8 @@ def preliminary_diagnosis(store: TraceStore, selection: Selection) -> Any:
 
 def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, Any]:
     """Arguments of the job. Raises BadInput for an unknown name or invalid faults."""
+    if over == "held-out" and selection.data.startswith(LIVE_PREFIX):
+        return _arguments_of_runs(store, selection)
     name, data = store.dataset(selection.task, selection.data)
     checkpoint = store.checkpoint(selection.task, selection.filter)
     selection.faults.check(checkpoint.task)
@@ -206,6 +215,16 @@ def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, 
     episodes = [selection.episode, *(held_out if over == "held-out" else ())]
     others = {"faults": str(selection.faults), "record": store.record_version(checkpoint)}
     return arguments_over_episodes(store, selection.task, selection.filter, name, episodes, **others)
+
+
+def _arguments_of_runs(store: TraceStore, selection: Selection) -> dict[str, Any]:
+    """Arguments of the job that diagnoses the ended live runs of a filter, as they are."""
+    selections = store.live.of_same_filter(selection)
+    return {
+        "selections": [item.to_json() for item in selections],
+        "keys": [store.key(item) for item in selections],
+        "record": store.record_version(store.request(selection).checkpoint),
+    }
 
 
 def _repair_arguments(store: TraceStore, selection: Selection) -> dict[str, Any]:

@@ -6,16 +6,22 @@ from typing import Any
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import store_of_job
 from beliefscope.app.runs.worker import Report
+from beliefscope.app.workspace.healthy_records import with_record
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
+from beliefscope.filters.external.unavailable import UnavailableFilter
+from beliefscope.inspect.diagnosis.diagnose import diagnose, diagnose_traces, required_profile
 from beliefscope.inspect.diagnosis.undo.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.healthy_profile import pretrained_reference
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.traces.provenance import unavailable_filter
+from beliefscope.recordings.open_trace import of_one_task, with_distinct_indices
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> Any:
     """Compute the diagnosis; no traces are stored."""
+    if "selections" in arguments:
+        return _diagnosis_of_runs(arguments, report)
     with store_of_job(arguments) as store:
         data = store.dataset(arguments["task"], arguments["data"])[1]
         faults, seed = Faults.parse(arguments["faults"]), store.settings.seed
@@ -28,6 +34,28 @@ def run(arguments: Mapping[str, Any], report: Report) -> Any:
             progress=lambda share: report(share, "comparing with the healthy record"),
         )
     return as_json(result.to_json())
+
+
+def _diagnosis_of_runs(arguments: Mapping[str, Any], report: Report) -> Any:
+    """The diagnosis of live runs as they are, with the data set of each run by the index of its episode."""
+    selections = [Selection.from_json(values) for values in arguments["selections"]]
+    names = [selection.data for selection in selections]
+    with store_of_job(arguments) as store:
+        report(0.0, "reading the runs")
+        runs = [store.request(selection) for selection in selections]
+        traces = with_distinct_indices(of_one_task([run.trace for run in runs], names))
+        checkpoint = runs[0].checkpoint
+        if isinstance(checkpoint, UnavailableFilter) and checkpoint.healthy_profile:  # of the task of all runs
+            checkpoint = with_record(unavailable_filter(traces[0]), dict(checkpoint.healthy_profile))
+        result = diagnose_traces(
+            checkpoint,
+            traces,
+            seed=store.settings.seed,
+            particles=store.settings.particles,
+            progress=lambda share: report(share, "comparing with the healthy record"),
+        )
+    indices = [trace.episode_index for trace in traces]
+    return as_json(result.to_json()) | {"runs": dict(zip(map(str, indices), names, strict=True))}
 
 
 def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:

@@ -2,7 +2,12 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { isTrainable, placeLabel, recoveredText } from '../../app/page/tabs/diagnosis_cause.js';
+import {
+  EPISODES,
+  isTrainable,
+  placeLabel,
+  recoveredText,
+} from '../../app/page/tabs/diagnosis_cause.js';
 import { JobResults } from '../../app/page/widgets/job_results.js';
 
 const { signal } = new AbortController();
@@ -134,8 +139,10 @@ test('only a cause whose next action is a fine-tuning run offers one', () => {
 
 test('an evidence names its episode only among others', () => {
   const place = { episode: 9, step: 39, time: null };
-  assert.equal(placeLabel(place, false), 'episode 9, step 39');
-  assert.equal(placeLabel(place, true), 'step 39');
-  assert.equal(placeLabel({ ...place, step: null }, false), 'episode 9');
-  assert.equal(placeLabel({ ...place, step: null }, true), '');
+  assert.equal(placeLabel(place, EPISODES), 'episode 9, step 39');
+  assert.equal(placeLabel(place, null), 'step 39');
+  assert.equal(placeLabel({ ...place, step: null }, EPISODES), 'episode 9');
+  assert.equal(placeLabel({ ...place, step: null }, null), '');
+  const runs = { noun: 'run', name: (index) => `day_${index}` };
+  assert.equal(placeLabel(place, runs), 'run day_9, step 39');
 });

@@ -9,25 +9,35 @@
 
 import { SHOWN } from '../core/constants.js';
 import { create, createButton, html, pause, setOptions } from '../core/dom.js';
-import { displayName, percent, plural, sentence } from '../core/units.js';
+import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { affectedComponent, largestErrorStep } from '../step/finding.js';
 import { readingCharts } from '../timeline/reading_charts.js';
 import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
 import { choice } from '../widgets/pickers.js';
-import { causeItem, evidenceItem, isTrainable, largestError, withCode } from './diagnosis_cause.js';
+import {
+  EPISODES,
+  causeItem,
+  evidenceItem,
+  isTrainable,
+  largestError,
+  withCode,
+} from './diagnosis_cause.js';
+import { aboutOf, findingOf, wholeOptions } from './diagnosis_text.js';
+import { LIVE_PREFIX, liveRunState } from './live_runs.js';
 import { Repair } from './repair.js';
 
 /** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
 
 const OVER = { episode: 'this episode', 'held-out': 'held-out episodes' };
+/** Of live and imported runs. */
+const OVER_RUNS = { episode: 'this run', 'held-out': 'all its runs' };
 const UNLIKELY = `Every cause of the catalog has a probability below ${SHOWN} or no evidence.`;
 const WITHIN =
   'The largest deviations of all statistics; healthy episodes also have some outside these ranges.';
 const LIVE = { live: 'The live run is in progress. It is diagnosed when it has ended.' };
 const MEASURE = 'Measure a healthy record';
 const MAX_RESULTS = 24; // in the cache
-const LISTED = 3; // statistics that were not measured
 const SETTLING = { open: 500, closed: 2000 }; // ms until the job of a selection starts
 
 export class Diagnosis {
@@ -176,13 +186,14 @@ export class Diagnosis {
     return JSON.stringify([names, over === 'episode' ? episode : over]);
   }
 
-  /** Whether the run is or was a live run: it belongs to no data set, so that no job can confirm its diagnosis. */
+  /** Whether the run is or was a live run: it belongs to no data set. */
   get #isLive() {
-    return this.#trace?.selection.data.startsWith('live:') ?? false;
+    return this.#trace?.selection.data.startsWith(LIVE_PREFIX) ?? false;
   }
 
+  /** Whether a job can confirm the diagnosis: that of a live run alone remains preliminary. */
   get #canStart() {
-    return this.#starts && !this.#isLive;
+    return this.#starts && !(this.#isLive && this.#store.state.over === 'episode');
   }
 
   /** State of a live run without a diagnosis; null for any other run. @returns {Entry | null} */
@@ -214,7 +225,7 @@ export class Diagnosis {
     if (this.#trace && !this.#liveState && this.#trace.header.no_diagnosis)
       return this.#drawRecord(this.#trace, this.#trace.header.no_diagnosis);
     const set = (/** @type {string} */ value) => this.#store.set({ over: value });
-    choice(html('.choice', this.#host), this.#isLive ? [] : OVER, over, set);
+    choice(html('.choice', this.#host), this.#isLive ? OVER_RUNS : OVER, over, set);
     const result = entry.state === 'ready' ? entry.result : entry.preliminary;
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? findingOf(result) : '';
@@ -222,12 +233,15 @@ export class Diagnosis {
     const state = resultText(entry, LIVE);
     this.#writeHeadline(result?.headline ?? state);
     const { episode } = this.#store.state;
-    const preliminary = this.#isLive
-      ? 'From this live run alone: no cause is undone.'
-      : `Preliminary, from episode ${episode} alone and before any cause is undone.`;
+    const alone = over === 'episode';
+    const displayed = this.#isLive ? 'this run' : `episode ${episode}`;
+    const preliminary =
+      this.#isLive && alone
+        ? 'From this live run alone: no cause is undone.'
+        : `Preliminary, from ${displayed} alone and before any cause is undone.`;
     html('.status', this.#host).textContent = entry.preliminary ? `${preliminary} ${state}` : '';
     showJobButton(html('.doing', this.#host), entry, {
-      action: this.#trace && !this.#isLive ? jobAction(entry.state, 'Diagnose') : '',
+      action: this.#trace && !(this.#isLive && alone) ? jobAction(entry.state, 'Diagnose') : '',
       progress: 'Progress of the diagnosis',
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
@@ -239,25 +253,36 @@ export class Diagnosis {
     const causes = (result?.causes ?? []).filter(
       ({ probability, evidence }) => probability >= SHOWN && evidence.length > 0,
     );
-    const alone = over === 'episode';
+    const names = this.#namesOf(result);
     const charts = readingCharts(this.#store, () => this.#trace);
     /** @type {(cause?: DiagnosisCause) => import('./diagnosis_cause.js').OpenStep} */
     const open = (cause) => (e, s) => this.#openStep(e, s, cause);
     const rows = causes.map((cause, i) => {
-      const canTrain = this.#canStart && !i && isTrainable(cause);
-      return causeItem(cause, alone, open(cause), charts, canTrain ? [this.#finetuneButton()] : []);
+      const canTrain = this.#canStart && !this.#isLive && !i && isTrainable(cause);
+      return causeItem(cause, names, open(cause), charts, canTrain ? [this.#finetuneButton()] : []);
     });
     html('.causes', this.#host).replaceChildren(...rows);
     const deviations = causes.length ? [] : (result?.deviations ?? []);
     html('.deviations', this.#host).hidden = !deviations.length;
     const items = [...largestError(result), ...deviations].map((item) =>
-      evidenceItem(item, alone, open(), charts),
+      evidenceItem(item, names, open(), charts),
     );
     html('.deviations ul', this.#host).replaceChildren(...items);
     const isHealthy = result?.state === 'healthy';
     html('.deviations p', this.#host).textContent = isHealthy ? WITHIN : UNLIKELY;
     html('.gain', this.#host).hidden = !isHealthy || !this.#trace?.fuses;
     html('.about', this.#host).replaceChildren(...wholeOptions(result ? aboutOf(result) : ''));
+  }
+
+  /**
+   * Returns how texts name the episodes of a result; null if it is about the displayed one alone.
+   * @param {Result | null | undefined} result
+   * @returns {import('./diagnosis_cause.js').Names | null}
+   */
+  #namesOf(result) {
+    const runs = result?.runs;
+    if (runs) return { noun: 'run', name: (index) => runs[index].slice(LIVE_PREFIX.length) };
+    return this.#isLive || this.#store.state.over === 'episode' ? null : EPISODES;
   }
 
   /**
@@ -268,11 +293,18 @@ export class Diagnosis {
    * @param {DiagnosisCause} [cause]
    */
   #openStep(episode, step, cause) {
-    const { state } = this.#store;
-    const trace = episode === state.episode ? this.#trace : null;
+    const { state, catalog } = this.#store;
+    const name = this.#listed?.runs?.[episode];
+    const run = this.#store.task()?.data.find((set) => set.name === name)?.live;
+    if (name && !run) return; // deleted
+    const isDisplayed = run ? name === state.data : episode === state.episode;
+    const trace = isDisplayed ? this.#trace : null;
     const worst = trace && largestErrorStep(trace);
     const component = affectedComponent(this.#trace?.components ?? [], cause) ?? state.component;
-    this.#store.set({ episode, step: step ?? worst ?? 0, component, playing: false });
+    const selection = run && !isDisplayed ? liveRunState(catalog, run, state) : {};
+    const index = run ? run.episode : episode;
+    const position = { episode: index, step: step ?? worst ?? 0, component, playing: false };
+    this.#store.set({ ...selection, ...position });
   }
 
   /**
@@ -317,7 +349,7 @@ export class Diagnosis {
     const trace = this.#trace;
     const isOld = result?.outdated ?? false;
     const isShown = isInUse || isOld || ['active', 'ended', 'error'].includes(entry.state);
-    host.hidden = !this.#canStart || !isShown;
+    host.hidden = !this.#canStart || this.#isLive || !isShown;
     if (host.hidden || !trace) return;
     const { data } = trace.selection;
     const source = isOld
@@ -364,41 +396,3 @@ export class Diagnosis {
     return createButton('text', 'Fine-tune the filter …', open, { title });
   }
 }
-
-/**
- * The state of a finished diagnosis for its colour.
- * @param {Result} result
- */
-function findingOf({ state, masked, miscalibrated, episodes, largest_error }) {
-  const overconfident = episodes === 1 && largest_error?.overconfident;
-  if (state === 'healthy') return miscalibrated || overconfident ? 'miscalibrated' : state;
-  return masked ? 'masked' : state;
-}
-
-/** @param {Result} result */
-function aboutOf({
-  episodes,
-  healthy_episodes: healthy,
-  healthy_data: source,
-  alarm_rate: rate,
-  statistics,
-  unmeasured,
-}) {
-  const text = `${plural(episodes, 'episode')} compared with ${plural(healthy, 'healthy one')}`;
-  const numbers = Object.entries(statistics).map(
-    ([name, count]) => `${displayName(name)} ${count}`,
-  );
-  const listed = unmeasured.slice(0, LISTED).join('; ');
-  const more = unmeasured.length > LISTED ? `; and ${unmeasured.length - LISTED} more` : '';
-  const missing = listed && ` Not measured: ${listed}${more}.`;
-  return `${text}; statistics: ${numbers.join(', ')}; probability of a false alarm ${percent(rate)}.${missing}${source ? ` Healthy record: ${source}.` : ''}`;
-}
-
-/**
- * Keeps the options of a command from being broken after their hyphens.
- * @param {string} text
- */
-const wholeOptions = (text) =>
-  text
-    .split(/(--[\w-]+)/)
-    .map((part, i) => (i % 2 ? create('span', { className: 'option', textContent: part }) : part));

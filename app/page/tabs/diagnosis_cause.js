@@ -16,27 +16,33 @@ import {
 import { copyButton } from '../widgets/copy_button.js';
 
 /** @typedef {(episode: number, step: number | null) => void} OpenStep step: null if the evidence has none */
+/** How texts name several episodes. @typedef {{noun: string, name: (episode: number) => string | number}} Names */
+
+/** Episodes of one data set. @type {Names} */
+export const EPISODES = { noun: 'episode', name: (episode) => episode };
 
 const PRESENT = 'Probability that this cause is present, alone or together with another one';
 
 /**
  * @param {DiagnosisCause} cause
- * @param {boolean} alone whether the displayed episode is the only one
+ * @param {Names | null} names null if the displayed episode is the only one
  * @param {OpenStep} open
  * @param {ReadingCharts} charts
  * @param {HTMLElement[]} actions after the next action
  */
-export function causeItem(cause, alone, open, charts, actions) {
+export function causeItem(cause, names, open, charts, actions) {
   const { probability, recovered, evidence, steps } = cause;
   const bar = create('meter', { min: 0, max: 1, value: probability });
   bar.setAttribute('aria-label', `Probability of ${cause.title}`);
-  const noun = cause.episodes.length === 1 ? 'episode' : 'episodes';
-  const where = alone ? [] : [`${noun} ${cause.episodes.join(', ')}`];
+  const plural = cause.episodes.length === 1 ? '' : 's';
+  const where = names
+    ? [`${names.noun}${plural} ${cause.episodes.map(names.name).join(', ')}`]
+    : [];
   if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
   /** @type {HTMLElement[]} */
   const lines = [
     create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
-    create('ul', {}, ...evidence.map((item) => evidenceItem(item, alone, open, charts))),
+    create('ul', {}, ...evidence.map((item) => evidenceItem(item, names, open, charts))),
   ];
   if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
   lines.push(nextAction(cause.next), ...actions);
@@ -66,13 +72,13 @@ export function largestError(result) {
 
 /**
  * @param {Pick<Evidence, 'text' | 'episode' | 'step' | 'time' | 'sensor'>} evidence
- * @param {boolean} alone whether the displayed episode is the only one
+ * @param {Names | null} names null if the displayed episode is the only one
  * @param {OpenStep} open
  * @param {ReadingCharts} charts
  */
-export function evidenceItem({ text, episode, step, time, sensor }, alone, open, charts) {
+export function evidenceItem({ text, episode, step, time, sensor }, names, open, charts) {
   const item = create('li', { textContent: typeset(sentence(text)) });
-  const label = placeLabel({ episode, step, time }, alone);
+  const label = placeLabel({ episode, step, time }, names);
   if (episode !== null && label)
     item.append(
       ' ',
@@ -91,10 +97,10 @@ export function evidenceItem({ text, episode, step, time, sensor }, alone, open,
 /**
  * Names the episode and the step that show an evidence; empty without a step of the only episode.
  * @param {Pick<Evidence, 'episode' | 'step' | 'time'>} evidence
- * @param {boolean} alone whether the displayed episode is the only one
+ * @param {Names | null} names null if the displayed episode is the only one
  */
-export function placeLabel({ episode, step, time }, alone) {
-  const parts = alone ? [] : [`episode ${episode}`];
+export function placeLabel({ episode, step, time }, names) {
+  const parts = names && episode !== null ? [`${names.noun} ${names.name(episode)}`] : [];
   if (step !== null) parts.push(stepLabel(step, time));
   return parts.join(', ');
 }

@@ -20,6 +20,8 @@ import { liveStatus } from '../data/live_stream.js';
  * @property {(message: string) => void} message shows a message, or removes it if empty
  */
 
+/** Start of the name of a live run's data set. */
+export const LIVE_PREFIX = 'live:';
 const LIST_INTERVAL = 2000; // ms between two requests for the list
 const MIN_INTERVAL = 50; // ms between two requests for steps
 const MAX_LATENCIES = 1000;

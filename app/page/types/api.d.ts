@@ -182,6 +182,7 @@ export interface components {
          *     outdated: whether an earlier version measured the healthy record, which lacks statistics.
          *     restarts: steps of the episodes at which a filter that diverges was restarted, or None.
          *     largest_error: of runs without a fault; None if the true state is unknown.
+         *     runs: data sets of several live runs by the indices of their episodes; None for episodes of one data set.
          */
         Diagnosis: {
             /** Causes */
@@ -221,6 +222,10 @@ export interface components {
                 [key: string]: number[];
             } | null;
             largest_error?: components["schemas"]["LargestError"] | null;
+            /** Runs */
+            runs?: {
+                [key: string]: string;
+            } | null;
             /**
              * State
              * @enum {string}
