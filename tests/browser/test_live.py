@@ -89,6 +89,21 @@ def test_link_to_a_live_run_opens_it_when_it_starts(open_page: Any, request: pyt
     page.until("() => !document.querySelector('#messages').textContent")
 
 
+def test_page_leaves_a_run_whose_file_is_deleted(open_page: Any, server: Any) -> None:
+    with open_dataset(sample_path("door")) as data:
+        run = trace(load_checkpoint(pretrained_path("door", "image-ekf")), data[9], 9)
+    file = server.workspace / "live" / "gone.live"
+    file.parent.mkdir(exist_ok=True)
+    write_live(run, file)
+    page = open_page("?task=door&data=live:gone")
+    page.until("() => beliefscope.state().data === 'live:gone' && document.querySelector('#data').value")
+    file.unlink()
+    page.until("() => beliefscope.state().data === 'sample' && document.querySelector('#data').value === 'sample'")
+    assert "'gone' does not exist" in (message := page.page.inner_text("#messages"))
+    assert "Its file was deleted or moved; restore it to display the run. The page now shows sample." in message
+    page.errors.clear()  # the refused request for the run
+
+
 def test_long_names_of_runs_leave_room_for_their_filters(open_page: Any, server: Any) -> None:
     with open_dataset(sample_path("door")) as data:
         run = trace(load_checkpoint(pretrained_path("door", "image-ekf")), data[9], 9)

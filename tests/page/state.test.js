@@ -3,7 +3,7 @@ import test from 'node:test';
 
 import { isRecordedOnly } from '../../app/page/core/episodes.js';
 import { Store, completeLink, parsePermalink, permalink } from '../../app/page/core/state.js';
-import { addLiveRuns } from '../../app/page/tabs/live_runs.js';
+import { addLiveRuns, otherRun } from '../../app/page/tabs/live_runs.js';
 import { Undo } from '../../app/page/core/undo.js';
 import { history, runFrames } from './browser.js';
 import { CATALOG, TASK } from './fixtures.js';
@@ -78,6 +78,33 @@ test('live runs of one filter are all in the catalog', () => {
   );
   assert.equal(completeLink('', { ...catalog, examples: [] }, listed), '');
   assert.equal(completeLink('?task=door', { ...catalog, examples }, listed), '?task=door');
+});
+
+test('in place of a deleted run, the page shows another run of its task, or else a data set', () => {
+  const run = { kind: 'external', episode: 0, state: 'ended', message: '', filter: 'recorded' };
+  const [mon, tue] = ['mon', 'tue'].map((name) => ({
+    ...run,
+    name,
+    data: `live:${name}`,
+    steps: 5,
+  }));
+  const runs = /** @type {any} */ ([
+    { ...tue, steps: 0, name: 'empty', data: 'live:empty', task: 'rover' },
+    { ...tue, task: 'ship' },
+    { ...mon, task: 'rover' },
+  ]);
+  const rover = { ...TASK, name: 'rover', filters: [], data: [] };
+  const tasks = [rover, { ...rover, name: 'ship' }];
+  const catalog = { ...CATALOG, tasks: [TASK] };
+  addLiveRuns(catalog, { runs, tasks });
+  const state = { ...stateOf(''), task: 'rover', data: 'live:deleted', faults: 'blackout=0.4' };
+  assert.equal(otherRun(catalog, runs, state)?.data, 'live:mon');
+  assert.equal(otherRun(catalog, runs.slice(0, 2), state)?.data, 'live:tue');
+  addLiveRuns(catalog, { runs: [], tasks: [] });
+  assert.deepEqual(catalog.tasks, [TASK], 'the task without runs is not offered');
+  const first = otherRun(catalog, [], state);
+  assert.deepEqual([first?.task, first?.data, first?.faults], [TASK.name, TASK.data[0].name, '']);
+  assert.equal(otherRun({ ...catalog, tasks: [rover] }, [], state), null);
 });
 
 test('an episode opens at its finding, unless it is the first of its data set', () => {

@@ -277,6 +277,7 @@ export class DisplayedRun {
       },
       listed: refreshPickers,
       message: (/** @type {string} */ text) => this.#messages.show('live', text),
+      deleted: (/** @type {string} */ text) => this.#messages.show('deleted', text),
     };
   }
 }

@@ -6,7 +6,8 @@
 
 import { create, element, html, pause } from '../core/dom.js';
 import { filtersOf } from '../core/episodes.js';
-import { displayName, plural } from '../core/units.js';
+import { parsePermalink } from '../core/state.js';
+import { displayName, plural, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { liveStatus } from '../data/live_stream.js';
 
@@ -18,6 +19,7 @@ import { liveStatus } from '../data/live_stream.js';
  * @property {(trace: Trace) => void} ended called when the run of a trace has ended
  * @property {() => void} listed called when the list of runs has changed
  * @property {(message: string) => void} message shows a message, or removes it if empty
+ * @property {(message: string) => void} deleted shows why the page has left a run
  */
 
 /** Start of the name of a live run's data set. */
@@ -54,6 +56,28 @@ export function addLiveRuns(catalog, { runs, tasks }) {
     if (!filtersOf(task, run.data).some(({ name }) => name === run.filter))
       task.filters.push({ name: run.filter, kind: run.kind, live: run.data });
   }
+  const left = catalog.tasks.filter(({ data }) => data.length); // others had only deleted runs
+  if (left.length) catalog.tasks = left;
+}
+
+/**
+ * Returns the changes of the state that leave a run without a file: for the newest run of the task or of any other, or
+ * else the first episode of a data set; null if the catalog has neither.
+ * @param {Catalog} catalog
+ * @param {ListedRun[]} runs
+ * @param {State} state
+ * @returns {Partial<State> | null}
+ */
+export function otherRun(catalog, runs, state) {
+  const others = runs.filter(isReadable).filter(({ steps }) => steps);
+  const run = others.find(({ task }) => task === state.task) ?? others[0];
+  if (run) return liveRunState(catalog, run, state);
+  if (!catalog.tasks[0]?.data.length) return null;
+  const name = catalog.tasks.find((task) => task.name === state.task)?.name ?? '';
+  const first = parsePermalink(name && `?${new URLSearchParams({ task: name })}`, catalog).state;
+  const { task, filter, data, episode, step, component } = first;
+  const reset = { faults: '', against: '', angle: null, window: '', playing: false, follow: false };
+  return { task, filter, data, episode, step, component, ...reset };
 }
 
 /**
@@ -241,7 +265,37 @@ export class Live {
 
   async #refreshList() {
     const list = await api.liveRuns().catch(() => null);
-    if (list) this.#setList(list);
+    const run = this.#selectedRun;
+    const isListed = list?.runs.some((other) => isReadable(other) && other.data === run?.data);
+    const reason = list && run && !isListed ? await this.#refusal() : '';
+    if (!list || run !== this.#selectedRun) return; // another run or list since then
+    if (run && !isListed && !reason) list.runs.push(run); // older than the listed ones
+    this.#setList(list);
+    if (run && reason) this.#leave(run, reason);
+  }
+
+  /** Returns why the server cannot display the selected run; empty if it can. */
+  #refusal() {
+    const isRefused = (/** @type {unknown} */ error) =>
+      error instanceof api.ServerError && error.isRefusal ? error.message : '';
+    return api.checkSelection({ ...this.#store.state, against: '' }).then(() => '', isRefused);
+  }
+
+  /**
+   * Displays another run in place of one whose file was deleted or damaged.
+   * @param {ListedLiveRun} run
+   * @param {string} reason
+   */
+  #leave({ name }, reason) {
+    const { catalog, state } = this.#store;
+    const isDamaged = this.#runs.some((run) => run.name === name);
+    const next = otherRun(catalog, this.#runs, state);
+    const shown = next ? `The page now shows ${next.data}.` : 'There is no other run to display.';
+    const advice = isDamaged
+      ? ''
+      : 'Its file was deleted or moved; restore it to display the run. ';
+    this.#handlers.deleted(`${sentence(reason)} ${advice}${shown}`);
+    if (next) this.#store.set(next);
   }
 
   /** @param {LiveList} list */

@@ -31,7 +31,7 @@ export function setPanelError(body, text, retry) {
 }
 
 /** Keys of messages that are no errors. */
-const NOTICES = new Set(['failure', 'link']);
+const NOTICES = new Set(['deleted', 'failure', 'link']);
 
 /** Messages at the top of the page, one per key; each stays until it is replaced, cleared or dismissed. */
 export class Messages {
