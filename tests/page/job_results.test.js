@@ -64,6 +64,21 @@ test('a job is started, followed and cancelled; its result is loaded again when 
   await results.load('run', '/run', signal);
 });
 
+test('a job that another page starts is followed', async () => {
+  const { results, finished, update } = setUp();
+  answer({ job: null });
+  await results.load('run', '/run', signal);
+  update();
+  assert.equal(results.get('run').state, 'absent');
+  answer({ job: job('running') });
+  update(job('running'));
+  await new Promise(setImmediate);
+  assert.equal(results.get('run').state, 'active');
+  answer(null);
+  update(job('done'));
+  assert.deepEqual(finished, ['run']);
+});
+
 test('a preliminary result is kept until the result replaces it', async () => {
   const { results, update } = setUp();
   const preliminary = { value: 0 };

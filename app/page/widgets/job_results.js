@@ -27,6 +27,10 @@ export class JobResults {
   #changed;
   /** @type {Map<string, JobResult<T>>} least recently changed first */
   #results = new Map();
+  /** Arguments of the last load. @type {Parameters<JobResults<T>['load']> | null} */
+  #loaded = null;
+  /** Ids of all jobs; null before the first list. @type {Set<string> | null} */
+  #ids = null;
 
   /**
    * @param {Jobs} jobs
@@ -65,6 +69,7 @@ export class JobResults {
    * @param {AbortSignal} signal of the request
    */
   async load(key, url, signal) {
+    this.#loaded = [key, url, signal];
     if (!this.#results.has(key)) this.#set(key, { state: 'loading' });
     this.#changed([]);
     if (this.get(key).state === 'ready') return;
@@ -109,6 +114,19 @@ export class JobResults {
       } else this.#wait(key, jobState(update));
     }
     this.#changed(finished);
+    this.#findStarted(list);
+  }
+
+  /**
+   * Loads the state of the displayed result if its job may have been started by another page.
+   * @param {Job[]} list
+   */
+  #findStarted(list) {
+    const known = this.#ids;
+    this.#ids = new Set(list.map(({ id }) => id));
+    if (!known || !this.#loaded || list.every(({ id }) => known.has(id))) return;
+    const [key, , signal] = this.#loaded;
+    if (this.get(key).state === 'absent' && !signal.aborted) this.load(...this.#loaded);
   }
 
   /**

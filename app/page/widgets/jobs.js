@@ -7,6 +7,7 @@ import { percent, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 
 const POLL_INTERVAL = 500; // ms, while a job is active
+const IDLE_INTERVAL = 3000; // ms, otherwise: other pages and other users of the server start jobs too
 
 /**
  * Returns whether a job is waiting or running.
@@ -35,6 +36,7 @@ export class Jobs {
     button.addEventListener('click', () => this.toggle());
     this.#closeButton.addEventListener('click', () => this.toggle());
     drawer.addEventListener('keydown', (event) => event.key === 'Escape' && this.toggleByKey());
+    document.addEventListener('visibilitychange', () => document.hidden || this.refresh());
     this.refresh();
   }
 
@@ -94,13 +96,15 @@ export class Jobs {
     if (this.#drawer.hidden) this.#button.blur();
   }
 
-  /** Gets the jobs from the server, and again at intervals while one is active. */
+  /** Gets the jobs from the server, and again at intervals: short ones while a job is active. */
   async refresh() {
     clearTimeout(this.#timer);
     const list = await api.jobs().catch(() => null);
     if (list) this.#update(list);
     clearTimeout(this.#timer);
-    if (this.#list.some(isActive)) this.#timer = setTimeout(() => this.refresh(), POLL_INTERVAL);
+    const isBusy = this.#list.some(isActive);
+    if (document.hidden && !isBusy) return; // until it is visible
+    this.#timer = setTimeout(() => this.refresh(), isBusy ? POLL_INTERVAL : IDLE_INTERVAL);
   }
 
   /**
