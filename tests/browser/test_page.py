@@ -346,6 +346,26 @@ SMALLEST_GAP = """(tabs) => {
 """Returns the smallest distance between the names of two tabs, px."""
 
 
+def test_a_page_at_200_percent_scrolls_and_cuts_no_name(open_page: Any) -> None:
+    """In a window of 1280 x 800, the page then has 640 x 400 px."""
+    page = open_page("?task=push&filter=crossmodal-ekf&episode=9", size=(640, 400))
+    assert page.page.locator(".pickers select:visible").evaluate_all(CUT) == []
+    finding = page.page.locator("#finding .sentence > :not([hidden])")
+    assert finding.evaluate_all("(texts) => texts.filter((e) => e.scrollHeight > e.clientHeight + 1).length") == 0
+    assert page.page.locator(".pickers label span").first.bounding_box()["y"] >= 0
+    panels = [page.page.locator(panel).bounding_box() for panel in ("#views", "#maps", "#step", "#timeline")]
+    for upper, lower in zip(panels, panels[1:], strict=False):
+        assert upper["y"] + upper["height"] <= lower["y"], "panels overlap"
+    page.page.locator("#timeline .bar").scroll_into_view_if_needed()
+    page.page.mouse.move(320, 200)
+    window = page.page.evaluate("() => beliefscope.state().window")
+    page.page.mouse.wheel(0, 5000)  # with any panel under the pointer
+    page.until("() => innerHeight - document.querySelector('#timeline').getBoundingClientRect().bottom > 0")
+    assert page.page.evaluate("() => beliefscope.state().window") == window
+    bar = page.page.locator("#timeline > .bar > :visible")
+    assert bar.evaluate_all("(items) => items.every((e) => e.getBoundingClientRect().right <= innerWidth)")
+
+
 def test_a_failed_run_is_reported_and_tried_again_and_names_are_whole(open_page: Any) -> None:
     page = open_page(size=(1280, 720))
     names = page.page.locator(".pickers select:visible")

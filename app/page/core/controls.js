@@ -2,7 +2,7 @@
 
 /** @import { Page } from './page.js' */
 
-import { element, html } from './dom.js';
+import { element, html, pageScrolls } from './dom.js';
 import { bindKeys } from './keys.js';
 import { bindMaximise, toggleMaximised } from './maximise.js';
 
@@ -77,6 +77,7 @@ function bindButtons(page, showHelp) {
     html(selector).addEventListener(
       'wheel',
       (event) => {
+        if (pageScrolls()) return;
         event.preventDefault();
         page.stepBy(Math.sign(event.deltaY || event.deltaX), event.timeStamp);
       },

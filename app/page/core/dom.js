@@ -174,3 +174,6 @@ export function svgElement(tag, attributes, ...children) {
   node.append(...children);
   return node;
 }
+
+/** Returns whether the page scrolls, as in a low window; the wheel then scrolls it, whatever is under the pointer. */
+export const pageScrolls = () => document.documentElement.scrollHeight > innerHeight;

@@ -2,6 +2,8 @@
 
 /** @import { StepWindow } from './step_window.js' */
 
+import { pageScrolls } from '../core/dom.js';
+
 /**
  * @typedef {object} Target of gestures
  * @property {() => boolean} isReady
@@ -119,7 +121,7 @@ export class Gestures {
 
   /** @param {WheelEvent} event */
   #turnWheel(event) {
-    if (!this.#target.isReady()) return;
+    if (!this.#target.isReady() || pageScrolls()) return;
     event.preventDefault();
     const { deltaX, deltaY, shiftKey, clientX } = event;
     const horizontal = shiftKey && !deltaX ? deltaY : deltaX;
