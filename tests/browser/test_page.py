@@ -346,6 +346,16 @@ SMALLEST_GAP = """(tabs) => {
 """Returns the smallest distance between the names of two tabs, px."""
 
 
+def test_the_legend_of_the_maps_names_the_end_effector_in_small_windows(open_page: Any) -> None:
+    page = open_page("?task=push&filter=crossmodal-ekf&episode=9", size=(1024, 768))
+    marks, name = page.page.locator("#maps .marks"), page.page.locator(".marks .if-effector")
+    for size in ((1024, 768), (1280, 720)):
+        page.page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+        box, inner = marks.bounding_box(), name.bounding_box()
+        assert inner is not None
+        assert inner["y"] + inner["height"] <= box["y"] + box["height"]
+
+
 def test_a_page_at_200_percent_scrolls_and_cuts_no_name(open_page: Any) -> None:
     """In a window of 1280 x 800, the page then has 640 x 400 px."""
     page = open_page("?task=push&filter=crossmodal-ekf&episode=9", size=(640, 400))

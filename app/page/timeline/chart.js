@@ -48,6 +48,7 @@ import { STEPS } from './step_axis.js';
 
 /** px beside and below the plot; a label of the step axis needs more. */
 export const GUTTER = { left: scaled(46), right: scaled(12), axis: scaled(19) };
+const TICK_HALF = scaled(6); // px above and below the plot, for half of a tick's label
 const BLACKOUT_HEIGHT = scaled(8); // px
 const STRIP_HEIGHT = scaled(12); // px, of the labelled strips for contact and blackout over areas
 const AREA_GRID_OPACITY = 0.3; // of the grid over areas
@@ -91,7 +92,7 @@ export function chart(parent, track, shading, frame) {
     {
       width: frame.width,
       height: frame.height,
-      padding: [4, GUTTER.right, frame.withAxis ? 0 : 4, 0],
+      padding: [TICK_HALF, GUTTER.right, frame.withAxis ? 0 : TICK_HALF, 0],
       ...PLAIN,
       scales: {
         x: { time: false, range },
