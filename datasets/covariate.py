@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -66,3 +66,17 @@ class Covariate:
 
 CONTACT = Covariate("boolean", ("free motion", "contact"))
 """Whether the robot touches the object."""
+
+STATES = frozenset({"contact", "free motion", "blackout"})
+"""Phases whose names follow *in*."""
+
+
+def in_phase(phase: str, covariates: Mapping[str, Covariate]) -> str:
+    """Where a phase is, for sentences: ``in contact``, ``at steps with no fix``; ``in phase`` with the name of a group.
+
+    covariates: of the task, by name.
+    """
+    if phase in STATES:
+        return f"in {phase}"
+    is_derived = any(not c.groups and phase in c.group_names(name) for name, c in covariates.items())
+    return f"at steps with {phase}" if is_derived else f"in phase {phase}"

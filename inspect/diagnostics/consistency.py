@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.task import display_name
 from beliefscope.datasets.text import capitalised, plural
 from beliefscope.filters.checkpoint import Checkpoint
@@ -118,9 +119,9 @@ class Consistency(RunDiagnostic):
         worst = max((entry for entry in entries if entry.inconsistent), key=inconsistency, default=None)
         if worst is None:
             return "All single-modality updates are consistent."
-        where = "all steps" if worst.phase == ALL else worst.phase
+        where = "in all steps" if worst.phase == ALL else in_phase(worst.phase, self.task.covariates)
         return (
-            f"Least consistent single-modality update: {display_name(worst.layer)} in {where}, {worst.assessment} "
+            f"Least consistent single-modality update: {display_name(worst.layer)} {where}, {worst.assessment} "
             f"(NEES/n {number(worst.nees)}). {self.updates_note}"
         ).strip()
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.datasets.text import percent
 from beliefscope.filters.belief import Gaussian
@@ -83,7 +84,7 @@ class ErrorSources(RunDiagnostic):
             f"({parts_text(self.task, self.sources, self.worst)})."
         ]
         shares = [
-            ("" if phase.phase == "all" else f"in {phase.phase} ")
+            ("" if phase.phase == "all" else f"{in_phase(phase.phase, self.task.covariates)} ")
             + ", ".join(f"{title} {percent(share)}" for title, share in named_parts(self.sources, phase.shares))
             for phase in self.phases
         ]

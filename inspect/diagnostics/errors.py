@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.task import Task, display_name, with_unit
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
@@ -91,7 +92,7 @@ class Errors(Diagnostic):
         if others:
             worst = max(others, key=lambda group: group.position)
             steps = worst.steps / total.steps
-            text += f"; largest in {worst.name}: {self._text(worst.position)}"
+            text += f"; largest {in_phase(worst.name, self.task.covariates)}: {self._text(worst.position)}"
             text += f" ({percent(worst.share)} of the squared error in {percent(steps)} of the steps)"
         parts = [f"{text}."]
         if total.position >= self.stay:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.text import percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.covariance_floor import with_floor
@@ -138,7 +139,8 @@ class ParticleHealth(Diagnostic):
         phases = [entry for entry in self.phases[1:] if entry.degenerate > 1.5 * total.degenerate > 0.0]
         if phases:
             most = max(phases, key=lambda entry: entry.degenerate)
-            parts.append(f"Degeneracy is most frequent in {most.phase}: {percent(most.degenerate, '.1f')} of steps.")
+            where = in_phase(most.phase, {})
+            parts.append(f"Degeneracy is most frequent {where}: {percent(most.degenerate, '.1f')} of steps.")
         if total.outside > 0.0:
             share = percent(total.outside, ".1f")
             parts.append(f"The true state is outside of all predicted particles in {share} of steps.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.task import Component, Task, axis_name, display_name, display_unit
 from beliefscope.inspect.statistics.array_channels import CHANNELS
 
@@ -253,7 +254,11 @@ def label_of(statistic: str, task: Task | None = None) -> str:
     owner = f" of {display_name(name)}" if name else ""
     axis = f" ({display_name(axis)})" if axis and axis != name else ""
     title = title.format(of=owner + axis, axis=axis) if "{" in title else title + owner + axis
-    before, after = PHASES.get(phase, ("", f" in {phase}"))
+    group = phase.replace("\N{DIVISION SLASH}", "/")  # see ``measures.long_phases``
+    covariates = {} if task is None else task.covariates
+    is_phase = any(group in covariate.group_names(key) for key, covariate in covariates.items())
+    where = in_phase(group, covariates) if is_phase else f"in {group}"  # such as a component
+    before, after = PHASES.get(phase, ("", f" {where}"))
     return f"{before}{title}{after}"
 
 

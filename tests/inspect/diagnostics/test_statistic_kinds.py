@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from beliefscope.datasets.catalog import TASKS
+from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.checkpoint import load_checkpoint, pretrained_path
 from beliefscope.inspect.diagnosis.diagnose import required_profile
@@ -19,6 +20,28 @@ from beliefscope.inspect.diagnostics.statistic_kinds import (
     label_of,
     unit_of,
 )
+
+
+@pytest.mark.parametrize(
+    ("phase", "where"),
+    [
+        ("contact", "in contact"),
+        ("no beacon reading", "at steps with no beacon reading"),
+        ("speed below 0.5 m\N{DIVISION SLASH}s", "at steps with speed below 0.5 m/s"),
+        ("slide", "in phase slide"),
+        ("x", "in x"),
+    ],
+)
+def test_phases_of_own_tasks_are_named_in_sentences(phase: str, where: str) -> None:
+    """Names of covariates and of their groups do not all follow *in*."""
+    covariates = {
+        "contact": CONTACT,
+        "beacon reading": Covariate("boolean"),
+        "speed": Covariate("continuous", cuts=(0.5,), unit="m/s"),
+        "stage": Covariate("categorical", ("reach", "slide")),
+    }
+    task = replace(TASKS["door"], covariates=covariates)
+    assert label_of(f"nees/fused/{phase}", task) == f"NEES/n of fused {where}"
 
 
 @pytest.mark.parametrize(
