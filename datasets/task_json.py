@@ -144,7 +144,7 @@ def check_definition(task: Task, where: str = "", stored: bool = False) -> None:
         raise BadInput(f"{place} is named {task.name!r:.200}, expected a name without spaces, colons and slashes.")
     _check_components(task, place)
     if not stored:
-        _check_names(task, place)
+        check_names(task, place)
     _check_sensors(task, place)
     _check_channels(task, place)
     _check_points(task, place)
@@ -207,8 +207,12 @@ def _check_sensors(task: Task, place: str) -> None:
             raise BadInput(f"{place}: modality {modality!r} has no observations.")
 
 
-def _check_names(task: Task, place: str) -> None:
-    """Names that statistics contain, or that are joined."""
+def check_names(task: Task, where: str = "") -> None:
+    """Raise BadInput for a name with a slash or plus sign where statistics contain it or names are joined.
+
+    where: origin of the task, for messages.
+    """
+    place = where or f"task {task.name!r:.200}"
     components = [component.name for component in task.components]
     kinds = ("component", components, "/"), ("observation", task.observations, "/"), ("modality", task.modalities, "/+")
     for kind, names, excluded in kinds:

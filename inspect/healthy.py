@@ -10,6 +10,7 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task_json import check_names
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Progress
 from beliefscope.filters.external.load import ExternalFilter
@@ -59,7 +60,11 @@ def sensor_record(
     Args:
         reference: images of other clean episodes of the same camera; default: measured, which takes most of the time.
         progress: called with the completed fraction, 0..1.
+
+    Raises BadInput for a name with a slash in a task of an earlier version.
     """
+    if episodes:
+        check_names(episodes[0].task)
     keys = modelled_keys(episodes[0].task) if episodes else []
     report, parts = progress or (lambda share: None), FOLDS + 2
     images, models = reference or measure_reference(episodes), fit_reading_models(episodes, keys)

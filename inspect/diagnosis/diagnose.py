@@ -13,6 +13,7 @@ from functools import partial
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task_json import check_names
 from beliefscope.datasets.text import capitalised
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.engine import Engine, Progress, run_all, run_blocks
@@ -246,7 +247,8 @@ def _diagnosed(
 
 
 def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
-    """The healthy profile of a filter. Raises BadInput without one."""
+    """The healthy profile of a filter. Raises BadInput without one, and for a task whose names have a slash."""
+    check_names(checkpoint.task)
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None and isinstance(checkpoint, UnavailableFilter):
         raise BadInput(no_diagnosis(checkpoint) or "")

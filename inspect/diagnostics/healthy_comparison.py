@@ -16,6 +16,7 @@ import numpy as np
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, with_unit
+from beliefscope.datasets.task_json import check_names
 from beliefscope.datasets.text import plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.unavailable import UnavailableFilter
@@ -356,6 +357,10 @@ def _amount(number: str, unit: str) -> str:
 
 def no_diagnosis(checkpoint: Checkpoint) -> str | None:
     """Reason why a filter has no diagnosis; None if it has one."""
+    try:
+        check_names(checkpoint.task)
+    except BadInput as error:  # a definition of an earlier version
+        return f"{str(error).removesuffix('.')}: rename it to diagnose its runs"
     lacking = "no healthy record"
     if (document := profile_document(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)) is not None:
         count = document.get("episodes") if isinstance(document, dict) else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 import beliefscope as bs
@@ -11,7 +13,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.unavailable import UnavailableFilter
 from beliefscope.inspect.diagnosis.diagnose import required_profile
-from beliefscope.inspect.healthy import overlap_warning
+from beliefscope.inspect.diagnostics.healthy_comparison import no_diagnosis
+from beliefscope.inspect.healthy import overlap_warning, sensor_record
 
 
 def test_diagnosed_episodes_in_the_healthy_record_are_counted() -> None:
@@ -36,3 +39,15 @@ def test_diagnosed_episodes_in_the_healthy_record_are_counted() -> None:
 def test_the_command_for_a_healthy_record_names_a_filter_that_it_can_open(checkpoint: Checkpoint, command: str) -> None:
     with pytest.raises(BadInput, match=f"beliefscope {command}"):
         required_profile(checkpoint)
+
+
+def test_a_task_of_an_earlier_version_with_a_slash_in_a_name_has_no_diagnosis() -> None:
+    """Statistics use the slash as a separator; files with such names open."""
+    task = replace(DOOR, observations={"gps/fix": (2,)}, modalities={"gps": ("gps/fix",)})
+    filter_ = UnavailableFilter("live", "", task)
+    message = "observation 'gps/fix' has an invalid name, expected a text without /"
+    assert f"{message}: rename it to diagnose its runs" in str(no_diagnosis(filter_))
+    with pytest.raises(BadInput, match=message):
+        required_profile(filter_)
+    with open_dataset(sample_path("door")) as data, pytest.raises(BadInput, match=message):
+        sensor_record([replace(data[9], task=task)])
