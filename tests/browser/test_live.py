@@ -73,7 +73,7 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
     page.until("() => document.querySelectorAll('#diagnostics .list li').length > 3")
     page.page.click("#tab-diagnosis")
     for _ in range(2):
-        page.until("() => /this live run alone/.test(document.querySelector('#diagnosis .status').textContent)")
+        page.until("() => /this run alone/.test(document.querySelector('#diagnosis .status').textContent)")
         assert page.page.locator("#diagnosis .doing button:visible").count() == 0
         page.page.reload()  # the run is then no longer followed
 

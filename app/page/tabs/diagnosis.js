@@ -237,7 +237,7 @@ export class Diagnosis {
     const displayed = this.#isLive ? 'this run' : `episode ${episode}`;
     const preliminary =
       this.#isLive && alone
-        ? 'From this live run alone: no cause is undone.'
+        ? 'From this run alone: no cause is undone.'
         : `Preliminary, from ${displayed} alone and before any cause is undone.`;
     html('.status', this.#host).textContent = entry.preliminary ? `${preliminary} ${state}` : '';
     showJobButton(html('.doing', this.#host), entry, {
