@@ -277,7 +277,10 @@ export class DisplayedRun {
       },
       listed: refreshPickers,
       message: (/** @type {string} */ text) => this.#messages.show('live', text),
-      deleted: (/** @type {string} */ text) => this.#messages.show('deleted', text),
+      deleted: (/** @type {string} */ text) => {
+        this.#messages.show('cursor'); // about the same run
+        this.#messages.show('deleted', text);
+      },
     };
   }
 }
