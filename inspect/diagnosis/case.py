@@ -23,8 +23,15 @@ from beliefscope.inspect.diagnosis.checks.sensors import localise, sensor_statis
 from beliefscope.inspect.diagnosis.checks.windows import RANGE
 from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, explain
 from beliefscope.inspect.diagnosis.undo.run_inputs import RunInputs
-from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY, Deviation, compare, with_critical_values
+from beliefscope.inspect.diagnostics.healthy_comparison import (
+    MIN_HEALTHY,
+    Deviation,
+    compare,
+    scaled_values,
+    with_critical_values,
+)
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.trace import Trace
 
 ALARM_RATE = 0.02
@@ -36,6 +43,13 @@ SHARED = 0.25
 CERTAIN = 2.0
 """Ratio to its critical value from which a deviation of most episodes is significant by itself. The test by divisions
 cannot show it if the record is small: too many divisions hold all episodes with the fault."""
+
+OF_ERRORS = ("error/", "angle error/", "component error/", "nees/fused/all")
+"""Starts of the names of statistics that a single episode far outside of the record shows."""
+
+FAR, OWN_GAPS = 1.5, 2.0
+"""Smallest distance of an episode from the record's range that is a fault by itself, in widths of this range, and in
+distances of the record's own extreme value from the next one."""
 
 REPEATED = ("frozen/", "stuck/")
 """Statistics of the share of repeated readings of a sensor in an episode."""
@@ -171,13 +185,51 @@ def focus(case: Case) -> Case:
     others = [value for value in values if np.isfinite(value)]
     if not others or not alarm.low <= np.mean(others) <= alarm.high:
         return case
-    traces = list(compress(case.traces, hit))
-    rows, sensors = (list(compress(rows, hit)) for rows in (case.rows, case.sensors))
+    part = replace(_part(case, hit), p_value=case.p_value)
+    return part if part.alarms else case
+
+
+def _part(case: Case, chosen: np.ndarray) -> Case:
+    """Some of the episodes, by a mask (E,), with deviations of their own and a p-value of 0."""
+    traces = list(compress(case.traces, chosen))
+    rows, sensors = (list(compress(rows, chosen)) for rows in (case.rows, case.sensors))
     episodes = {trace.episode_index: case.inputs.episodes[trace.episode_index] for trace in traces}
     inputs = replace(case.inputs, episodes=episodes, affected=frozenset(episodes))
-    part = compared(inputs, traces, rows, sensors, case.profile, case.alarm_rate)
-    part = replace(part, p_value=case.p_value)
-    return part if part.alarms else case
+    return replace(compared(inputs, traces, rows, sensors, case.profile, case.alarm_rate), p_value=0.0)
+
+
+def outlying(case: Case) -> Case | None:
+    """The episodes with errors or NEES far outside of the record's range, as a case with alarms; None without.
+
+    A test by divisions cannot find one faulty episode among many: it is among the tested ones in too many divisions.
+    Other statistics have healthy values far from all others too often.
+    """
+    names = [n for n in case.by_statistic if n.startswith(OF_ERRORS) and n in case.profile.statistics]
+    tested = np.array([[row.get(name, np.nan) for name in names] for row in case.grouped])
+    record = np.stack([case.profile.statistics[name] for name in names], axis=1) if names else tested[:0]
+    values, floor, rising = scaled_values(names, np.concatenate([record, tested]))
+    far = np.asarray(_far_outside(values[: len(record)], values[len(record) :], floor, rising).any(1))
+    if not far.any() or far.all():
+        return None
+    part = _part(case, far)
+    return part if part.alarms else None
+
+
+def _far_outside(record: Array, values: Array, floor: Array, rising: np.ndarray) -> np.ndarray:
+    """(E, S): values further outside of the range of the record (R, S) than ``FAR`` times its width.
+
+    Of statistics with rare large values, the width includes the distance of the record's own extreme from the others.
+    """
+    ordered = np.sort(record, axis=0)  # NaN last
+    count = np.isfinite(record).sum(0)
+    known = count >= MIN_HEALTHY
+    columns = np.arange(record.shape[1])
+    low, second = ordered[0], ordered[1]
+    high, last = ordered[np.maximum(count - 1, 0), columns], ordered[np.maximum(count - 2, 0), columns]
+    width = FAR * np.maximum(high - low, floor)
+    above = values - high > width + OWN_GAPS * (high - last)
+    below = (low - values > width + OWN_GAPS * (second - low)) & ~rising
+    return np.asarray(known & (above | below))
 
 
 def explain_all(case: Case) -> dict[str, Explanation]:

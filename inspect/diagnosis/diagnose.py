@@ -31,6 +31,7 @@ from beliefscope.inspect.diagnosis.case import (
     explain_all,
     focus,
     observe,
+    outlying,
     symptoms_of,
 )
 from beliefscope.inspect.diagnosis.cause import Diagnosis
@@ -236,10 +237,12 @@ def _diagnosed(
     progress: Callable[[float], None],
 ) -> Diagnosis:
     """Confirm the probable causes of a case by undoing them."""
-    if not case.alarms:
+    affected = focus(case) if case.alarms else outlying(case)
+    if affected is None:
         progress(1.0)
         return healthy(case)
-    affected = focus(case)
+    if not case.alarms:
+        case = replace(case, deviations=affected.deviations, p_value=affected.p_value)
     explanations = explain_all(affected)
     effects = confirm(case, affected, explanations, seed, base, engine, workers, progress)
     progress(1.0)
