@@ -32,7 +32,7 @@ from beliefscope.inspect.traces.live_file import SUFFIX
 from beliefscope.inspect.traces.live_run import LiveRun
 
 LIVE_PREFIX = "live:"
-LISTED_RUNS = 30  # most recent ones
+LISTED_RUNS = 100  # most recent ones; each keeps its file open
 RUNS_IN_MEMORY = 4  # most recent ones
 
 
