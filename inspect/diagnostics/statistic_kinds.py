@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.task import Component, Task, axis_name, display_name, display_unit
-from beliefscope.inspect.statistics.array_channels import CHANNELS
+from beliefscope.inspect.statistics.array_channels import CHANNELS, array_keys
 
 KINDS = {
     "nees": ("NEES/n", True, 0.05),
@@ -292,7 +292,7 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
 def channel_of(subject: str, task: Task) -> tuple[str, Component] | None:
     """Name (``axis_name``) and channel of a statistic's subject, which may start with the modality; None without."""
     owners = {key: f"{modality} " for modality, keys in task.modalities.items() for key in keys}
-    for key in (key for key in task.arrays if key in subject):
+    for key in (key for key in array_keys(task) if key in subject):
         for i, channel in enumerate(CHANNELS):
             name = axis_name(key, i, len(CHANNELS))
             if subject in (name, owners[key] + name):

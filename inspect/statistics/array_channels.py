@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.statistics.signals import Array, noise_level, repeats
 
 CHANNELS = ("mean", "spread", "row", "column")
@@ -23,9 +24,9 @@ MAX_ELEMENTS = 10_000
 """Largest number of elements that all count. Larger arrays count by every second row and column, and so on."""
 
 
-def array_keys(episode: Episode) -> list[str]:
-    """Observation keys of arrays (T, H, W, ...) of numbers, other than point clouds, whose rows have no order."""
-    return [key for key in episode.task.arrays if episode.observations[key].ndim > 2]
+def array_keys(task: Task) -> list[str]:
+    """Observation keys of arrays (H, W, ...) of numbers, other than point clouds, whose rows have no order."""
+    return [key for key in task.arrays if len(task.observations[key]) > 1]
 
 
 def array_channels(readings: NDArray[Any]) -> Array:
@@ -55,7 +56,7 @@ def _thinned(readings: NDArray[Any]) -> tuple[Array, int]:
 
 def with_array_channels(episode: Episode) -> Episode:
     """The episode with vectors (T, 4) of ``CHANNELS`` in place of its arrays."""
-    changed = {key: array_channels(episode.observations[key]) for key in array_keys(episode)}
+    changed = {key: array_channels(episode.observations[key]) for key in array_keys(episode.task)}
     return replace(episode, observations={**episode.observations, **changed}) if changed else episode
 
 
@@ -68,7 +69,7 @@ def element_statistics(episode: Episode) -> dict[str, float]:
     ``holes``: share of readings that are 0, such as those of a depth image without a return.
     """
     values: dict[str, float] = {}
-    for key in array_keys(episode):
+    for key in array_keys(episode.task):
         present, (all_readings, _) = episode.present(key), _thinned(episode.observations[key])
         if present.sum() < 3:
             continue

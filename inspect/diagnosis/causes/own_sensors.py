@@ -13,6 +13,7 @@ from beliefscope.inspect.diagnosis.causes.image import OBJECT
 from beliefscope.inspect.diagnosis.causes.own_arrays import array_causes
 from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, has_labels_only
+from beliefscope.inspect.statistics.array_channels import array_keys
 from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")
@@ -80,6 +81,7 @@ PREFERRED = -0.1
 
 def sensor_causes(task: Task) -> tuple[Cause, ...]:
     """Causes in the sensors of a task that have none in the catalog."""
+    arrays = array_keys(task)
     known = KNOWN if HAND in task.observations else ("image", "contact")  # the physics of force and torque
     keys = {key: modality for modality, keys in task.modalities.items() for key in keys if key not in known}
     result = []
@@ -96,9 +98,9 @@ def sensor_causes(task: Task) -> tuple[Cause, ...]:
             title = f"Readings of sensor {display_name(key)} lost"
             result.append(Cause(f"{key}.dropout", title, (lost,), changed, CONNECTION, f"drop {modality}"))
         result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
-        result += array_causes(key, _downstream(modality), f"drop {modality}") if key in task.arrays else []
+        result += array_causes(key, _downstream(modality), f"drop {modality}") if key in arrays else []
         result += _changed_views(key, modality) if key in task.images else []
-    for key in (key for key in modelled_sensors(task) if key not in task.arrays):
+    for key in (key for key in modelled_sensors(task) if key not in arrays):
         result += _wrong_channels(task, key)
     parts = (_moved_cameras, _delays, _delayed_modalities)
     return (*result, *(cause for part in parts for cause in part(task)))
@@ -243,7 +245,7 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
 def _delayed_sensors(task: Task) -> list[str]:
     """Vector sensors and arrays whose delay labelled contact, if no sensor measures it, or the labels show."""
     vectors = [key for key, shape in task.observations.items() if len(shape) == 1 and key != HAND]
-    vectors += task.arrays
+    vectors += array_keys(task)
     return vectors if has_labels_only(task) else modelled_sensors(task)
 
 

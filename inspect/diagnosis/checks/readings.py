@@ -12,6 +12,7 @@ from beliefscope.datasets.task import Task, axis_name
 from beliefscope.inspect.diagnosis.checks.reading_noise import delayed, noise_around_expected
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, commands_hand
 from beliefscope.inspect.diagnostics.statistic_kinds import AROUND_EXPECTED, EXPECTED
+from beliefscope.inspect.statistics.array_channels import array_keys
 from beliefscope.inspect.statistics.reading_features import CONTROL, FIRST_CHANGES
 from beliefscope.inspect.statistics.reading_model import (
     ComparedReadings,
@@ -74,7 +75,7 @@ def modelled_sensors(task: Task) -> list[str]:
     """
     known = {CONTACT, *task.scans, *((HAND, FORCE, TORQUE) if HAND in task.observations else ())}
     sizes = {key: shape[0] for key, shape in task.observations.items() if len(shape) == 1 and key not in known}
-    return [*(key for key, size in sizes.items() if size <= MAX_CHANNELS), *task.arrays]
+    return [*(key for key, size in sizes.items() if size <= MAX_CHANNELS), *array_keys(task)]
 
 
 def modelled_keys(task: Task) -> list[str]:

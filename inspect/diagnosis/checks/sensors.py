@@ -192,7 +192,7 @@ def _without_lost(series: Array, readings: NDArray[Any]) -> Array:
     """A series (T,) interpolated at lost images and beside them, which have differences of their own."""
     if not is_image(readings):
         return series
-    lost = np.convolve(lost_images(readings), np.ones(3), mode="same") > 0.0
+    lost = np.convolve(lost_images(readings), np.ones(3))[1:-1] > 0.0
     steps = np.arange(len(series))
     return np.interp(steps, steps[~lost], series[~lost]) if not lost.all() else series
 

@@ -266,7 +266,7 @@ def free_motion(episode: Episode) -> Mask:
     """(T,): steps without ``contact_flag``, and their neighbours without it, since readings are means over a step."""
     flag = contact_flag(episode)
     touched = np.zeros(len(episode), dtype=bool) if flag is None else flag
-    return np.convolve(touched, np.ones(3), mode="same") == 0
+    return np.convolve(touched, np.ones(3))[1:-1] == 0
 
 
 def angle_channels(episode: Episode, key: str) -> list[int]:

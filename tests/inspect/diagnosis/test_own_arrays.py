@@ -156,6 +156,19 @@ def test_the_right_order_and_unknown_channels_are_left() -> None:
     assert undo("divide grid", inputs, {}) is None
 
 
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_short_episodes_have_statistics(steps: int) -> None:
+    values = sensor_statistics(roll(0, steps), record().reference, record().readings)
+    assert ("noise/grid/all" in values) == (steps > 2)
+
+
+def test_a_vector_among_the_arrays_has_the_causes_of_vectors() -> None:
+    vector = replace(TASK, observations={"grid": (6,)})
+    names = [cause.name for cause in causes_of(vector)]
+    assert names.count("grid.bias") == names.count("grid.sign") == 1
+    assert "grid.dead" not in names
+
+
 def test_innovations_of_arrays_are_not_compared_with_their_channels() -> None:
     """An external filter may report an innovation of as many columns as the array has elements."""
 
