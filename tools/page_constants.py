@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 from beliefscope.app.protocol import map_format, messages
+from beliefscope.app.runs.live_runs import LIVE_PREFIX
 from beliefscope.app.runs.result_filters import HASH_DIGITS
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.diagnosis.cause import LARGEST, SHOWN
@@ -45,6 +46,7 @@ def constants() -> dict[str, tuple[str, object]]:
         "MAX_SIGMAS": ("Largest consistent deviation of one component, in standard deviations.", MAX_SIGMAS),
         "MAX_STEPS": ("Largest number of steps of a run whose sources of the error are always computed.", MAX_STEPS),
         "MIN_SHARE": ("Share of an error, positive or negative, from which a source is named.", MIN_SHARE),
+        "LIVE_PREFIX": ("Start of the name of the data set of a live run.", LIVE_PREFIX),
         "HASH_DIGITS": ("Digits of its hash at the end of the name of a checkpoint of a sweep.", HASH_DIGITS),
         "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning run.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),

@@ -29,6 +29,9 @@ export const MAX_STEPS = /** @type {const} */ (1000);
 /** Share of an error, positive or negative, from which a source is named. */
 export const MIN_SHARE = /** @type {const} */ (0.1);
 
+/** Start of the name of the data set of a live run. */
+export const LIVE_PREFIX = /** @type {const} */ ("live:");
+
 /** Digits of its hash at the end of the name of a checkpoint of a sweep. */
 export const HASH_DIGITS = /** @type {const} */ (8);
 

@@ -7,7 +7,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
-import { SHOWN } from '../core/constants.js';
+import { LIVE_PREFIX, SHOWN } from '../core/constants.js';
 import { create, createButton, html, pause, setOptions } from '../core/dom.js';
 import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -24,7 +24,7 @@ import {
   withCode,
 } from './diagnosis_cause.js';
 import { aboutOf, findingOf, wholeOptions } from './diagnosis_text.js';
-import { LIVE_PREFIX, liveRunState } from './live_runs.js';
+import { liveRunState } from './live_runs.js';
 import { Repair } from './repair.js';
 
 /** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */

@@ -6,6 +6,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
+import { LIVE_PREFIX } from '../core/constants.js';
 import { create, createButton, element, focusedIn, html, isAbort, messageOf } from '../core/dom.js';
 import { typeset } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -218,7 +219,7 @@ export class Diagnostics {
   /** Shows the selected diagnostic, or the list of all. */
   #showSelected() {
     const { diagnostic, over, data } = this.#store.state;
-    const runs = data.startsWith('live:') ? OVER_RUNS : OVER;
+    const runs = data.startsWith(LIVE_PREFIX) ? OVER_RUNS : OVER;
     const selected = this.#selected;
     const names = this.#entries.map(({ name }) => name).join(', ');
     html('.top h3', this.#host).textContent =

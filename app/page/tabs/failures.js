@@ -7,6 +7,7 @@
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
+import { LIVE_PREFIX } from '../core/constants.js';
 import { element, html } from '../core/dom.js';
 import { fixed, percent, sentence, significant } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -181,7 +182,7 @@ export class Failures {
   }
 
   get #isLive() {
-    return this.#store.state.data.startsWith('live:');
+    return this.#store.state.data.startsWith(LIVE_PREFIX);
   }
 
   /** State of a live run that is not complete; null for any other run. @returns {Result | null} */

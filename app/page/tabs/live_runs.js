@@ -4,6 +4,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Catalog, ListedLiveRun, LiveList } from '../types/server.js' */
 
+import { LIVE_PREFIX } from '../core/constants.js';
 import { create, element, html, pause } from '../core/dom.js';
 import { filtersOf } from '../core/episodes.js';
 import { parsePermalink } from '../core/state.js';
@@ -22,8 +23,6 @@ import { liveStatus } from '../data/live_stream.js';
  * @property {(message: string) => void} deleted shows why the page has left a run
  */
 
-/** Start of the name of a live run's data set. */
-export const LIVE_PREFIX = 'live:';
 const LIST_INTERVAL = 2000; // ms between two requests for the list
 const MIN_INTERVAL = 50; // ms between two requests for steps
 const MAX_LATENCIES = 1000;
@@ -86,7 +85,8 @@ export function otherRun(catalog, runs, state) {
  * @param {LiveList} list
  */
 export function awaitedRun(search, { runs }) {
-  const [, name] = /^live:(.+)/.exec(new URLSearchParams(search).get('data') ?? '') ?? [];
+  const data = new URLSearchParams(search).get('data') ?? '';
+  const name = data.startsWith(LIVE_PREFIX) ? data.slice(LIVE_PREFIX.length) : '';
   return name && !runs.some((run) => run.name === name) ? name : '';
 }
 

@@ -5,6 +5,7 @@
 /** @import { SmallestRepair } from '../types/server.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
+import { LIVE_PREFIX } from '../core/constants.js';
 import { html } from '../core/dom.js';
 import * as api from '../data/api.js';
 import { JobResults, jobAction, resultText, showJobButton } from '../widgets/job_results.js';
@@ -50,7 +51,7 @@ export class Repair {
     this.#trace = trace;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    const isLive = trace.selection.data.startsWith('live:'); // of no data set, which a search needs
+    const isLive = trace.selection.data.startsWith(LIVE_PREFIX); // of no data set, which a search needs
     const { kind, no_diagnosis } = trace.header;
     this.#host.hidden = isLive || kind === 'external' || Boolean(no_diagnosis); // no steps without a sensor
     if (this.#host.hidden) return;
