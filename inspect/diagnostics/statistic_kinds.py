@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from beliefscope.datasets.covariate import in_phase
 from beliefscope.datasets.task import Component, Task, axis_name, display_name, display_unit
-from beliefscope.inspect.statistics.array_channels import CHANNELS, array_keys
+from beliefscope.inspect.statistics.array_channels import channel_names
 
 KINDS = {
     "nees": ("NEES/n", True, 0.05),
@@ -120,7 +120,7 @@ KINDS = {
     "position noise": ("noise", False, 5e-4),
     "stuck": ("share of repeated readings", False, 0.02),
     "dead": ("share of elements{of} that never change", False, 0.002),
-    "holes": ("share of elements{of} without a value", False, 0.01),
+    "holes": ("share{of} without a value", False, 0.01),
     "saturation": ("share of saturated readings", False, 0.01),
     "share": ("share of steps with the flag{of} set", False, 0.02),
     "toggles": ("share of steps at which the flag{of} changes", False, 0.01),
@@ -292,9 +292,9 @@ def unit_of(statistic: str, task: Task) -> tuple[str, float]:
 def channel_of(subject: str, task: Task) -> tuple[str, Component] | None:
     """Name (``axis_name``) and channel of a statistic's subject, which may start with the modality; None without."""
     owners = {key: f"{modality} " for modality, keys in task.modalities.items() for key in keys}
-    for key in (key for key in array_keys(task) if key in subject):
-        for i, channel in enumerate(CHANNELS):
-            name = axis_name(key, i, len(CHANNELS))
+    for key in (key for key in task.observations if key in subject):
+        for i, channel in enumerate(channels := channel_names(task, key)):
+            name = axis_name(key, i, len(channels))
             if subject in (name, owners[key] + name):
                 return name, Component(f"{key} {channel}", "")
     for key, shape in {**task.observations, "control": (task.control_size,)}.items():

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.statistics.array_channels import array_channels
+from beliefscope.inspect.statistics.array_channels import reading_channels
 from beliefscope.inspect.statistics.reading_features import (
     CONTROL,
     FIRST_CHANGES,
@@ -311,9 +311,9 @@ class ReadingModel:
 
 
 def readings_of(episode: Episode, key: str) -> Array:
-    """(T, d) readings of a vector sensor, channels of an array, or the controls."""
+    """(T, d) readings of a vector sensor, channels of an array or a point cloud, or the controls."""
     readings = episode.controls if key == CONTROL else episode.observations[key]
-    return array_channels(readings) if readings.ndim > 2 else readings.astype(np.float64)
+    return reading_channels(episode.task, key, readings)
 
 
 def angle_of(columns: Array, states: Array, heading: Array) -> Array:

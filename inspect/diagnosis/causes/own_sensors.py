@@ -13,7 +13,7 @@ from beliefscope.inspect.diagnosis.causes.image import OBJECT
 from beliefscope.inspect.diagnosis.causes.own_arrays import array_causes
 from beliefscope.inspect.diagnosis.checks.readings import modelled_sensors
 from beliefscope.inspect.diagnosis.checks.vectors import FORCE, TORQUE, has_labels_only
-from beliefscope.inspect.statistics.array_channels import array_keys
+from beliefscope.inspect.statistics.array_channels import array_keys, channel_names
 from beliefscope.inspect.statistics.reference_images import HAND
 
 KNOWN = ("image", "force", "torque", "effector_position", "contact")
@@ -97,7 +97,9 @@ def sensor_causes(task: Task) -> tuple[Cause, ...]:
             lost = Symptom(_patterns(key, "absent"))
             title = f"Readings of sensor {display_name(key)} lost"
             result.append(Cause(f"{key}.dropout", title, (lost,), changed, CONNECTION, f"drop {modality}"))
-        result += _changed_readings(key, modality) if len(task.observations[key]) == 1 else []
+        is_vector = len(task.observations[key]) == 1 or key in task.clouds
+        result += _changed_readings(key, modality) if is_vector else []
+        result += _sparse_cloud(key, modality) if key in task.clouds else []
         result += array_causes(key, _downstream(modality), f"drop {modality}") if key in arrays else []
         result += _changed_views(key, modality) if key in task.images else []
     for key in (key for key in modelled_sensors(task) if key not in arrays):
@@ -156,12 +158,20 @@ def _wrong_channels(task: Task, key: str) -> list[Cause]:
     changed = f"{_patterns(key, '*')}|lever/*|axes/*|direction/*|{_downstream(modality)}"
     name, action = display_name(key), "Check the axes and signs of the sensor."
     entries = [("sign", f"Sensor {name} has inverted channels", "inverted")]
-    entries += [("axes", f"Channels of sensor {name} exchanged", "exchanged")] if task.observations[key][0] > 1 else []
+    count = len(channel_names(task, key)) or task.observations[key][0]
+    entries += [("axes", f"Channels of sensor {name} exchanged", "exchanged")] if count > 1 else []
     undo = f"rearrange {key}|drop {modality}"
     return [
         Cause(f"{key}.{m}", title, (Symptom(_patterns(key, kind)),), changed, action, undo)
         for m, title, kind in entries
     ]
+
+
+def _sparse_cloud(key: str, modality: str) -> list[Cause]:
+    """Absent points of a point cloud."""
+    changed = f"{_patterns(key, '*')}|lag/*|{_downstream(modality)}"
+    title, action = f"Points of sensor {display_name(key)} lost", "Check the range and the surfaces that it sees."
+    return [Cause(f"{key}.holes", title, (Symptom(f"holes/{key}/all"),), changed, action, f"drop {modality}")]
 
 
 def _changed_views(key: str, modality: str) -> list[Cause]:
@@ -243,14 +253,14 @@ def _delayed_modalities(task: Task) -> tuple[Cause, ...]:
 
 
 def _delayed_sensors(task: Task) -> list[str]:
-    """Vector sensors and arrays whose delay labelled contact, if no sensor measures it, or the labels show."""
+    """Sensors other than images whose delay labelled contact, if no sensor measures it, or the labels show."""
     vectors = [key for key, shape in task.observations.items() if len(shape) == 1 and key != HAND]
-    vectors += array_keys(task)
+    vectors += [*array_keys(task), *task.clouds]
     return vectors if has_labels_only(task) else modelled_sensors(task)
 
 
 def _delays(task: Task) -> tuple[Cause, ...]:
-    """Delays of vector sensors and arrays behind the labels.
+    """Delays of vector sensors, arrays and point clouds behind the labels.
 
     Force and torque are of one sensor: a delay of the force explains that of the torque, and the laws of both.
     """

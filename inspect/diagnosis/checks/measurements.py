@@ -17,7 +17,7 @@ from beliefscope.inspect.diagnosis.checks.likelihoods import (
     likelihoods_at_truth,
 )
 from beliefscope.inspect.diagnosis.checks.true_starts import has_true_starts, run_from_truth, smallest_std, some_steps
-from beliefscope.inspect.statistics.array_channels import array_keys
+from beliefscope.inspect.statistics.array_channels import channel_names
 from beliefscope.inspect.statistics.innovations import channels_of, prediction
 from beliefscope.inspect.statistics.measures import Mask, absent, counted
 from beliefscope.inspect.statistics.reading_model import ReadingModel, readings_of
@@ -67,8 +67,7 @@ def _sensors(trace: Trace, k: int, models: Sequence[ReadingModel]) -> list[tuple
 
     None if the innovations do not have the channels of all sensors.
     """
-    arrays, start = array_keys(trace.task), 0
-    by_key = {model.key: model for model in models if model.key not in arrays}
+    by_key, start = {model.key: model for model in models if not channel_names(trace.task, model.key)}, 0
     sensors = []
     for key in trace.task.modalities.get(trace.modalities[k], ()):
         if (model := by_key.get(key)) is not None:

@@ -69,13 +69,13 @@ FITS = 9.0
 
 
 def modelled_sensors(task: Task) -> list[str]:
-    """Observation keys of the vector sensors of unknown physics, except lidars, and of arrays.
+    """Observation keys of the vector sensors of unknown physics, except lidars, and of arrays and point clouds.
 
     A measured hand shows the physics of force and torque.
     """
     known = {CONTACT, *task.scans, *((HAND, FORCE, TORQUE) if HAND in task.observations else ())}
     sizes = {key: shape[0] for key, shape in task.observations.items() if len(shape) == 1 and key not in known}
-    return [*(key for key, size in sizes.items() if size <= MAX_CHANNELS), *array_keys(task)]
+    return [*(key for key, size in sizes.items() if size <= MAX_CHANNELS), *array_keys(task), *task.clouds]
 
 
 def modelled_keys(task: Task) -> list[str]:

@@ -13,6 +13,7 @@ from beliefscope.inspect.diagnosis.checks.readings import delayed_errors
 from beliefscope.inspect.diagnosis.checks.sensors import biased_steps
 from beliefscope.inspect.diagnosis.checks.vectors import free_motion
 from beliefscope.inspect.diagnosis.undo.run_inputs import Deviations, RunInputs, with_readings
+from beliefscope.inspect.statistics.array_channels import channel_names
 from beliefscope.inspect.statistics.reading_model import ReadingModel
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, wrapped
 
@@ -23,8 +24,10 @@ SMALLEST_GAIN = 0.01
 def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Force or torque without its excess level in free motion; that of some steps only is removed from these.
 
-    Other sensors without their mean error from the expected readings.
+    Other vector sensors without their mean error from the expected readings.
     """
+    if channel_names(inputs.checkpoint.task, key):
+        return None
     levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
     if None in levels:
         return _as_expected(key, inputs, lambda readings, expected: np.ones(readings.shape[1]))
@@ -46,7 +49,7 @@ def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
 
 def detrend(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings without the line over time that fits their errors from the expected ones in all affected episodes."""
-    if (model := reading_model(key, inputs)) is None:
+    if (model := _vector_model(key, inputs)) is None:
         return None
     compared = [model.compare(inputs.episodes[index]) for index in inputs.affected]
     steps = np.concatenate([one.steps() for one in compared])
@@ -69,7 +72,7 @@ def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | No
 
 def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
     """Readings with the order and the signs of channels that best agree with the labels; None if they have them."""
-    if (model := reading_model(key, inputs)) is None:
+    if (model := _vector_model(key, inputs)) is None:
         return None
     from scipy.optimize import linear_sum_assignment  # takes most of a second
 
@@ -99,7 +102,7 @@ def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], 
     Args:
         gain_of: g (A,) from readings and expected readings (S, A).
     """
-    if (model := reading_model(key, inputs)) is None:
+    if (model := _vector_model(key, inputs)) is None:
         return None
     pairs = (model.compare(inputs.episodes[index]).pairs() for index in inputs.affected)
     readings, expected = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
@@ -126,3 +129,8 @@ def reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:
     """The healthy record's model of a sensor; None if the labels explain none of its channels."""
     readings = () if inputs.healthy is None else inputs.healthy.readings
     return next((model for model in readings if model.key == key and model.channels), None)
+
+
+def _vector_model(key: str, inputs: RunInputs) -> ReadingModel | None:
+    """The same of a vector sensor; None for arrays and point clouds, whose channels are no readings."""
+    return None if channel_names(inputs.checkpoint.task, key) else reading_model(key, inputs)

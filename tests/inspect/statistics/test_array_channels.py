@@ -9,7 +9,12 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.statistics.array_channels import array_channels, element_statistics, with_array_channels
+from beliefscope.inspect.statistics.array_channels import (
+    array_channels,
+    cloud_channels,
+    element_statistics,
+    with_array_channels,
+)
 
 ARRAYS = np.random.default_rng(0).gamma(1.0, 1.0, (20, 6, 9, 2))
 TASK = Task("hand", (Component("x", "m"),), {"grid": (6, 9, 2)}, {"touch": ("grid",)}, 0, 0.1, arrays=("grid",))
@@ -71,3 +76,19 @@ def test_only_arrays_become_vectors() -> None:
     image = Task("view", TASK.components, {"image": (6, 9)}, {"image": ("image",)}, 0, 0.1)
     seen = Episode(image, np.zeros((3, 1)), observations={"image": np.zeros((3, 6, 9), np.uint8)})
     assert with_array_channels(seen) is seen
+
+
+def test_channels_of_a_point_cloud() -> None:
+    rng = np.random.default_rng(2)
+    points = np.concatenate([rng.normal(size=(3, 50, 3)) + np.array([5.0, -2.0, 1.0]), np.zeros((3, 10, 3))], axis=1)
+    points[1] = 0.0  # the sensor sees nothing
+    result = cloud_channels(points)
+    np.testing.assert_allclose(result[0, :3], points[0, :50].mean(0))
+    np.testing.assert_allclose(result[0, 3] ** 2, points[0, :50].var(0).sum())
+    np.testing.assert_array_equal(result[1], result[0])
+    np.testing.assert_allclose(cloud_channels(3.0 * points), 3.0 * result)
+    moved = cloud_channels(np.where(points == 0.0, 0.0, points + np.array([1.0, 2.0, 3.0])))
+    np.testing.assert_allclose(moved - result, np.tile([1.0, 2.0, 3.0, 0.0], (3, 1)), atol=1e-12)
+    order = rng.permutation(60)
+    np.testing.assert_allclose(cloud_channels(points[:, order]), result)
+    assert cloud_channels(points[..., :2]).shape == (3, 3)
