@@ -43,7 +43,7 @@ export function addLiveRuns(catalog, { runs, tasks }) {
     const task = entry ?? tasks.find(({ name }) => name === run.task);
     if (!task) continue;
     if (!entry) catalog.tasks.push(task);
-    const label = `${run.episode} · ${run.state === 'running' ? 'live' : 'live, ended'}`;
+    const label = `${run.episode} · ${run.state === 'running' ? 'live' : 'recorded'}`;
     task.data.push({
       name: run.data,
       first: run.episode,
