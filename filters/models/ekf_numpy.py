@@ -15,6 +15,8 @@ from beliefscope.filters.models.networks import Residual
 Layer = tuple[np.ndarray, np.ndarray]
 """Transposed weight, bias."""
 
+_ZERO = np.zeros((), np.float32)
+
 
 def is_usual(dynamics: nn.Module) -> bool:
     """Whether a dynamics model has the equations below: no static or wrapping components, and no replaced method."""
@@ -80,14 +82,14 @@ def _residuals(stack: Iterable[nn.Module]) -> list[tuple[Layer, Layer]]:
 
 
 def _linear(x: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    y = x @ weight
+    y = x.dot(weight)  # faster than ``@``
     y += bias
     return y
 
 
 def _rectified(x: np.ndarray) -> np.ndarray:
     """``relu_with_tangents``, in place."""
-    x *= x[-1] > 0.0
+    x *= np.heaviside(x[-1], _ZERO)  # faster than a mask, which would be converted
     return x
 
 
