@@ -74,6 +74,10 @@ MIN_EFFECT, MIN_EFFECT_OF_CONTROLS = 0.5, 1.5
 """Minimum difference of an alarm, in standard deviations between healthy episodes; and that of controls from the ones
 that the labels let expect: those of a controller, which episodes of the same speed or load do not vary around."""
 
+OF_CONTROLS = {"reading gain": 0.05, "reading ratio": 0.05, "reading noise": 0.2}
+"""Smallest standard deviations of statistics of controls that other motions change: the expected controls are linear in
+the changes of the state, with coefficients that are means over the motions of the record."""
+
 
 @dataclass(frozen=True)
 class Deviation:
@@ -270,9 +274,21 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, alarm_
 
 def min_effect(statistic: str) -> float:
     """The smallest difference of an alarm, in standard deviations between healthy episodes."""
-    kind, subject, _ = statistic.split("/")
-    is_expected_control = kind.startswith("reading ") and subject.partition(" ")[0] == "control"
-    return MIN_EFFECT_OF_CONTROLS if is_expected_control else MIN_EFFECT
+    is_of_controls = statistic.startswith("reading ") and _is_of_controls(statistic)
+    return MIN_EFFECT_OF_CONTROLS if is_of_controls else MIN_EFFECT
+
+
+def _is_of_controls(statistic: str) -> bool:
+    return statistic.split("/")[1].partition(" ")[0] == "control"
+
+
+def _smallest_std(statistic: str) -> float:
+    """That of the statistic's kind; larger ones of torques, and of the slopes of controls on the expected ones."""
+    kind = statistic.split("/")[0]
+    _, _, smallest = KINDS.get(kind, ("", False, 1e-9))
+    if kind in OF_CONTROLS and _is_of_controls(statistic):
+        return OF_CONTROLS[kind]
+    return smallest * (LEVER if "/torque " in statistic else 1.0)
 
 
 def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
@@ -280,7 +296,7 @@ def scaled_values(names: Sequence[str], values: Array) -> tuple[Array, Array, np
     kinds = [name.split("/")[0] for name in names]
     settings = [KINDS.get(kind, ("", False, 1e-9)) for kind in kinds]
     logarithmic, lost = np.array([s[1] for s in settings]), np.array([kind in LOST for kind in kinds])
-    floor = np.array([s[2] * (LEVER if "/torque " in n else 1.0) for n, s in zip(names, settings, strict=True)])
+    floor = np.array([_smallest_std(name) for name in names])
     for i, (kind, subject, _) in enumerate(name.split("/") for name in names):
         own = (f"size/{subject}/contact", f"size/{subject}/all", f"size/{subject.rpartition(' ')[0]}/all")
         sizes = [values[:, names.index(size)] for size in own if kind in OF_AXES and size in names]

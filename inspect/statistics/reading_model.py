@@ -6,6 +6,7 @@ exchanged, a gain, a bias, and a delay behind the labels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -129,6 +130,8 @@ class ChannelModel:
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
         degree: of the ``monomials`` that are the features; 0 for others.
         gain_spread: standard deviation between these episodes of the slope of the readings on the expected ones.
+        explained: share of the variance of the readings within these episodes that the labels explain; NaN in records of
+            earlier versions.
         limits: (2, V) range in the record of the V values that the monomials are products of, or of the V = F features;
             V is 0 without limits, as of landmarks and in records of earlier versions.
     """
@@ -142,6 +145,7 @@ class ChannelModel:
     bias: float
     degree: int = 0
     gain_spread: float = 0.0
+    explained: float = math.nan
     limits: Array = field(default_factory=lambda: np.empty((2, 0)))
 
     @property
@@ -188,7 +192,8 @@ class ChannelModel:
         noise, bias = float(value["noise"]), float(value["bias"])
         degree, spread = int(value.get("degree", 0)), float(value.get("gain_spread", 0.0))  # absent in earlier versions
         limits = np.array(value.get("limits", [[], []]), dtype=np.float64)
-        own = coefficients.T, constants, heading, landmark, noise, bias, degree, spread, limits
+        explained = float(value.get("explained", math.nan))
+        own = coefficients.T, constants, heading, landmark, noise, bias, degree, spread, explained, limits
         return cls(int(value["index"]), *own)
 
 
@@ -229,6 +234,11 @@ class ReadingModel:
         return np.array([model.gain_spread for model in self.of_channels])
 
     @property
+    def explained(self) -> Array:
+        """(A,) shares of the variance of the readings that the labels explain; NaN if unknown."""
+        return np.array([model.explained for model in self.of_channels])
+
+    @property
     def is_angle(self) -> Mask:
         """(A,): channels that are angles which wrap around."""
         return np.array([model.is_angle for model in self.of_channels])
@@ -255,6 +265,10 @@ class ReadingModel:
         models = (value["of_channels"], value.get("of_weak_channels", ()))
         strong, weak = (tuple(map(ChannelModel.from_json, of)) for of in models)
         return cls(str(value["key"]), strong, weak, float(value.get("outliers", 0.0)))
+
+    def of_weak(self) -> ReadingModel:
+        """The model with the channels that the labels explain in part only."""
+        return ReadingModel(self.key, self.of_weak_channels, outliers=self.outliers)
 
     def with_weak_channels(self) -> ReadingModel:
         """The model with all channels that the labels explain at least in part, in their order."""

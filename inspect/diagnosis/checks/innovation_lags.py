@@ -50,7 +50,7 @@ def innovation_lags(trace: Trace, near_truth: Trace, checkpoint: ExternalFilter)
     lags: dict[str, float] = {}
     for k, modality in enumerate(trace.modalities):
         keep = ~measures.absent(trace, modality)[steps]
-        angles = angle_columns(trace, modality)
+        angles = [i for i in angle_columns(trace, modality) if i < nu.shape[-1]]  # fewer channels: it is never used
         own = nu[keep, k], change[keep, k]
         for values in own:
             values[:, angles] = wrapped(values[:, angles])

@@ -60,9 +60,12 @@ ONSETS = 20
 CLEARLY = 0.5
 """Largest ratio of the squares that a bias in an interval leaves to those of a drift or a gain."""
 
-EXPLAINED = ("level", "drift", "size", "roughness")
-"""Kinds of statistics that another healthy motion changes: the level of readings, and their standard deviation. It also
-changes the noise of all readings, but not that around the expected ones."""
+EXPLAINED = {"level": "reading bias", "drift": "reading bias", "size": "reading gain", "roughness": "reading bias"}
+"""Kinds of statistics that another healthy motion changes: the level of readings, and their standard deviation; and the
+kinds that take their place. It also changes the noise of all readings, but not that around the expected ones."""
+
+UNCERTAIN = 1.0
+"""Largest standard error of a short delay, steps; that of a sensor is larger where its expected readings hardly vary."""
 
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
@@ -97,8 +100,16 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     fit (``FITS``), hardly worse than with biases (``SIMPLER``). ``exchanged``: likewise, of the errors of two channels
     to those with these channels exchanged, whatever their signs, for the best other channel; or of one channel to those
     of a channel without a model.
+
+    Of channels that the labels explain in part only, bias and drift.
     """
     values: dict[str, float] = {}
+    for model in (model.of_weak() for model in models if is_expected(model.of_weak(), episode)):
+        compared, count = model.compare(episode), readings_of(episode, model.key).shape[1]
+        line = _line(*compared.pairs(), compared.steps() / len(episode), model.gain_spreads)
+        for i, channel in enumerate(model.channels):
+            axis = axis_name(model.key, channel, count)
+            values |= {f"reading {kind}/{axis}/all": float(line[kind][i] / model.noise[i]) for kind in ("bias", "drift")}
     for model in (model for model in models if is_expected(model, episode)):
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)
@@ -108,7 +119,7 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
             read = compared.present | compared.outliers
             values[f"reading outliers/{model.key}/all"] = float(compared.outliers.sum() / max(read.sum(), 1))
         whole = 0 if np.isnan(delay) else int(delay)
-        line = _line(*compared.pairs(whole), compared.steps(whole) / len(episode), model.gain_spreads)
+        line = _line(*_pairs(compared, whole), compared.steps(whole) / len(episode), model.gain_spreads)
         least, biased = errors.min(0), compared.errors_with_biases(whole)
         own = np.diagonal(least)
         exchanged = _evidence(own[:, None] + own, least + least.T, 2.0 * FITS, biased[:, None] + biased)
@@ -176,7 +187,7 @@ def _is_explained(statistic: str, row: Mapping[str, float]) -> bool:
     kind, subject, phase = statistic.split("/")
     if kind == "noise":
         return phase not in AROUND_EXPECTED and f"noise/{subject}/{EXPECTED}" in row
-    return kind in EXPLAINED and f"reading bias/{subject}/all" in row
+    return kind in EXPLAINED and f"{EXPLAINED[kind]}/{subject}/all" in row
 
 
 def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingModel]) -> tuple[int, int] | None:
@@ -184,7 +195,7 @@ def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingMode
 
     None if the other steps have it as well, if the interval is short, or if no model expects readings of the channel.
     """
-    for model in models:
+    for model in (model.with_weak_channels() for model in models):
         count = 0 if model.key not in (*episode.observations, CONTROL) else readings_of(episode, model.key).shape[1]
         axes = [axis_name(model.key, channel, count) for channel in model.channels]
         if subject not in axes:
@@ -200,6 +211,24 @@ def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingMode
         if len(inside) >= MIN_STEPS and len(others) and others.mean() < CLEARLY * inside.mean():
             return int(steps[first]), int(steps[last])
     return None
+
+
+def _pairs(compared: ComparedReadings, delay: int) -> tuple[Array, Array]:
+    """``ComparedReadings.pairs``; those of controls with a slope that the size of the motion does not change.
+
+    Process noise in the labels flattens the slope of the controls on the expected ones, the more the less they vary.
+    It does not change the opposite slope, of the expected controls on the others, which the noise of measured controls
+    flattens. A scale changes both: the slope is that of the two which is nearer to 1, or 1 between them.
+    """
+    readings, expected = compared.pairs(delay)
+    if compared.model.key != CONTROL or not len(readings):
+        return readings, expected
+    x, y = expected - expected.mean(0), readings - readings.mean(0)
+    product = (x * y).sum(0)
+    slope = product / np.maximum(np.square(x).sum(0), 1e-24)
+    other = compared.model.explained * np.square(y).sum(0) / np.where(product > 0.0, product, np.nan)
+    nearer = np.where(slope < 1.0, np.clip(other, slope, 1.0), np.clip(other, 1.0, slope))
+    return readings + np.where(np.isnan(other), 0.0, nearer - slope) * x, expected
 
 
 def _short_delay(compared: ComparedReadings) -> float:
@@ -222,8 +251,12 @@ def _short_delay(compared: ComparedReadings) -> float:
 
 
 def _delay(error: Array, change: Array) -> float:
-    """Steps by which readings follow expected ones, from their errors and the changes of the latter (S, A)."""
-    return -float((error * change).sum() / np.maximum(np.square(change).sum(), 1e-12))
+    """Steps by which readings follow expected ones, from their errors and the changes of the latter (S, A).
+
+    Both in standard deviations of the noise; NaN if its standard error is above ``UNCERTAIN``.
+    """
+    power = float(np.square(change).sum())
+    return -float((error * change).sum()) / power if power * UNCERTAIN**2 > 1.0 else np.nan
 
 
 def _line(readings: Array, expected: Array, times: Array, spread: Array) -> dict[str, Array]:

@@ -30,7 +30,8 @@ def tare(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | Non
         return None
     levels = [deviations.get(f"level/{key} {axis}/free motion") for axis in "xyz"]
     if None in levels:
-        return _as_expected(key, inputs, lambda readings, expected: np.ones(readings.shape[1]))
+        model = _vector_model(key, inputs, weak=True)
+        return _as_expected(model, inputs, lambda readings, expected: np.ones(readings.shape[1]))
 
     def unbiased(readings: NDArray[Any], episode: Episode) -> NDArray[Any]:
         free = free_motion(episode) & episode.present(key)
@@ -67,7 +68,7 @@ def scale(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | No
         around = expected - expected.mean(0)
         return np.asarray((around * readings).sum(0) / np.maximum(np.square(around).sum(0), 1e-24))
 
-    return _as_expected(key, inputs, slope)
+    return _as_expected(_vector_model(key, inputs), inputs, slope)
 
 
 def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs | None:
@@ -94,7 +95,9 @@ def rearrange(key: str, inputs: RunInputs, deviations: Deviations) -> RunInputs 
     return with_readings(inputs, key, arranged)
 
 
-def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], Array]) -> RunInputs | None:
+def _as_expected(
+    model: ReadingModel | None, inputs: RunInputs, gain_of: Callable[[Array, Array], Array]
+) -> RunInputs | None:
     """Readings (z - c) / g, which agree with the expected ones in the mean of the affected episodes.
 
     None without a model of the sensor, and for a gain of about 0.
@@ -102,7 +105,7 @@ def _as_expected(key: str, inputs: RunInputs, gain_of: Callable[[Array, Array], 
     Args:
         gain_of: g (A,) from readings and expected readings (S, A).
     """
-    if (model := _vector_model(key, inputs)) is None:
+    if model is None:
         return None
     pairs = (model.compare(inputs.episodes[index]).pairs() for index in inputs.affected)
     readings, expected = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
@@ -125,12 +128,16 @@ def _with_channels(inputs: RunInputs, model: ReadingModel, change: Callable[[Arr
     return with_readings(inputs, model.key, restored)
 
 
-def reading_model(key: str, inputs: RunInputs) -> ReadingModel | None:
-    """The healthy record's model of a sensor; None if the labels explain none of its channels."""
+def reading_model(key: str, inputs: RunInputs, weak: bool = False) -> ReadingModel | None:
+    """The healthy record's model of a sensor; None if the labels explain none of its channels.
+
+    weak: with channels that they explain in part only.
+    """
     readings = () if inputs.healthy is None else inputs.healthy.readings
-    return next((model for model in readings if model.key == key and model.channels), None)
+    models = (model.with_weak_channels() if weak else model for model in readings if model.key == key)
+    return next((model for model in models if model.channels), None)
 
 
-def _vector_model(key: str, inputs: RunInputs) -> ReadingModel | None:
+def _vector_model(key: str, inputs: RunInputs, weak: bool = False) -> ReadingModel | None:
     """The same of a vector sensor; None for arrays and point clouds, whose channels are no readings."""
-    return None if channel_names(inputs.checkpoint.task, key) else reading_model(key, inputs)
+    return None if channel_names(inputs.checkpoint.task, key) else reading_model(key, inputs, weak)
