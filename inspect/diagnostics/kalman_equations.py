@@ -16,7 +16,12 @@ from beliefscope.datasets.text import capitalised, percent, plural
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.kalman_updates import Updates, correction_slopes, expected_updates
+from beliefscope.inspect.diagnostics.kalman_updates import (
+    Updates,
+    component_slopes,
+    correction_slopes,
+    expected_updates,
+)
 from beliefscope.inspect.diagnostics.repeated_steps import (
     RepeatedSteps,
     known_median,
@@ -185,7 +190,8 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
 
     ``prediction jacobian``, by component: relative difference of E from its value by the derivative of the predicted
     mean. ``measurement jacobian``, by modality: that of ``H E H^T`` from its value by that of the innovations.
-    ``correction slope``, by modality: of ``correction_slopes``. ``covariance update``: ``Updates.covariance_slope`` of
+    ``correction slope``, by modality: of ``correction_slopes``. ``component correction``: ``component_slopes``.
+    ``covariance update``: ``Updates.covariance_slope`` of
     nearly linear steps, of filters without fusion weights.
     """
     has_truth = bool(np.isfinite(trace.episode.states).all())
@@ -198,6 +204,7 @@ def jacobian_statistics(trace: Trace, checkpoint: ExternalFilter) -> dict[str, f
         columns["measurement jacobian"] = (list(trace.modalities), known_median(repeated.measurement_errors()))
         updates = expected_updates(repeated)
         columns["correction slope"] = (list(trace.modalities), correction_slopes(repeated, updates))
+        columns["component correction"] = (components, component_slopes(repeated, updates))
         if trace.weights is None:
             linear = repeated.linear()
             slope = math.nan if linear is None else expected_updates(linear).covariance_slope

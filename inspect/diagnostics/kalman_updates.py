@@ -74,6 +74,16 @@ def correction_slopes(steps: RepeatedSteps, updates: Updates) -> Array:
     return np.where(np.abs(columns).max(0) > 0.0, np.clip(slopes, -1.0, 1.0), np.nan)
 
 
+def component_slopes(steps: RepeatedSteps, updates: Updates) -> Array:
+    """(n,) slopes of the filter's corrections of each component on the expected ones, -1 to 1; NaN for tiny ones."""
+    scale = inverse_std(steps.covariance[:, 0])
+    expected, correction = scale * updates.corrections.sum(1), scale * steps.correction
+    size = np.square(expected).sum(0)
+    is_known = size > len(expected) * SMALLEST_UPDATE**2
+    slopes = (expected * correction).sum(0) / np.where(is_known, size, np.nan)
+    return np.asarray(np.clip(slopes, -1.0, 1.0))
+
+
 def _size(errors: Array) -> float:
     known = errors[np.isfinite(errors)]
     return float(known.mean()) if len(known) else 0.0

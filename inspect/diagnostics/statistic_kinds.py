@@ -50,6 +50,7 @@ KINDS = {
     "prediction jacobian": ("error of the Jacobian of the dynamics", False, 0.02),
     "measurement jacobian": ("error of the Jacobian of the measurement function", False, 0.15),
     "correction slope": ("slope of the corrections{of} on those of a correct update", False, 0.2),
+    "component correction": ("slope of the corrections{of} on those of a correct update", False, 0.2),
     "covariance update": ("reduction of the covariance by updates, relative to that of correct ones,", False, 0.05),
     "inverted likelihood": ("likelihood{of} that grows with the error of the reading", False, 0.1),
     "ignored start": ("independence of the belief at the start", False, 0.1),

@@ -17,7 +17,7 @@ def _dynamics(*kinds: str) -> str:
     return "|".join(f"dynamics {kind}/*" for kind in kinds)
 
 
-JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*|covariance update/*"
+JACOBIANS = "prediction jacobian/*|measurement jacobian/*|correction slope/*|component correction/*|covariance update/*"
 """Statistics of repeated steps (``RepeatedSteps``)."""
 
 EFFECTS = "dynamics effect/*"
@@ -71,6 +71,16 @@ COVARIANCE = Cause(
 )
 """The update of the mean is correct, that of the covariance is not."""
 
+CONSIDERED = Cause(
+    "updates.component",
+    "Updates correct a component too little",
+    (Symptom("component correction/*", -1, target="shrunk"),),
+    f"{JACOBIANS}|dynamics offset/*|dynamics scatter/*|measurement noise/*|{FILTER}",
+    "Check the rows of the gain, and the cross-covariances of the component: biases and parameters need them.",
+    prior=-0.3,  # a gain of one sensor that is too small also corrects some components too little
+)
+"""Such as a bias without a row of the gain, which keeps its first value."""
+
 WEIGHTS = Cause(
     "weights.lost",
     "Particle weights not kept without resampling",
@@ -122,6 +132,7 @@ def external_causes(task: Task) -> tuple[Cause, ...]:
         JACOBIAN,
         LARGE,
         COVARIANCE,
+        CONSIDERED,
         ESTIMATE,
         START,
         LATE,
@@ -188,7 +199,7 @@ def _with_true_starts(cause: Cause) -> Cause:
 def _in_predictions_of_run(cause: Cause) -> Cause:
     others = f"{DYNAMICS}|process noise/*|measurement function/*"
     changed = {
-        "weights": f"{others}|correction slope/*|covariance update/*|measurement noise/*",
+        "weights": f"{others}|correction slope/*|component correction/*|covariance update/*|measurement noise/*",
         "dynamics": "dynamics bias/*|dynamics offset/*|dynamics scatter/*|measurement function/*",
         "process_noise": _dynamics("bias", "error", "offset", "scatter", "spread"),
         "measurement_noise": f"{DYNAMICS}|process noise/*",

@@ -59,13 +59,13 @@ def _labels(task: Task) -> tuple[Cause, ...]:
     sensors = [Symptom(f"reading lag/{key}/*", -1, optional=True) for key in modelled_sensors(task)]
     (offset,) = (cause for cause in data.CAUSES if cause.name == "labels.offset")
     objects, *_, common = offset.symptoms
-    objects = replace(objects, otherwise=(Symptom("label shift/*"),))
+    shift = Symptom("label shift/*", unmeasured=(objects,))  # without it, a moved camera shows the object elsewhere, too
     biases = [offset_of(modality, 0.3) for modality in task.modalities]
     return (
         replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls, *sensors)),
         replace(
             offset,
-            symptoms=(objects, replace(common, optional=True), *biases),
+            symptoms=(shift, replace(objects, optional=True), replace(common, optional=True), *biases),
             consequences=f"{offset.consequences}|reading */*|measurement function/*|innovation spread/*",
         ),
     )

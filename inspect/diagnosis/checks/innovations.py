@@ -41,7 +41,9 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     correct gate may reject (``REJECTABLE``), such as that of a filter that has lost the state. ``absent updates``:
     share of the steps without a reading of the modality that have an accepted one. ``measurement noise``: geometric
     mean of the standard deviations R (``measurement_noise``). ``innovation share``: innovation std relative to that of
-    all modalities, where the measurement noise of some is unknown.
+    all modalities, which shows whose measurement noise is wrong where only the mean of all is known.
+
+    Modalities of the task that are not among those of the filter have no updates.
     """
     if trace.innovation is None or (pair := innovations(trace)) is None:
         return {}
@@ -52,7 +54,8 @@ def innovation_statistics(trace: Trace) -> dict[str, float]:
     accepted = used_channels(trace, np.isfinite(nu), keep)
     squared = None if trace.accepted is None else squared_innovations(trace)
     rejectable = np.zeros(used.shape[:2], bool) if squared is None else are_extreme(*squared, REJECTABLE)[keep]
-    values: dict[str, float] = {}
+    own, all_names = set(trace.modalities), set(trace.task.modalities)
+    values = {f"updates/{name}/all": 0.0 for name in sorted(all_names - own) if own < all_names}
     names = channel_names(trace, pair[0])
     for k, modality in enumerate(trace.modalities):
         updated = np.asarray(accepted[:, k].any(-1))
@@ -92,7 +95,8 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     An update has ``det P / det P+ = det S / det R``, whatever the measurement function, and several updates in turn
     have the product of these ratios: the logarithms of the steps are linear equations for those of the modalities. For
     modalities that are always used together, they only give the mean of all, ``measurement noise//all``, at the steps
-    at which all are used: it would change with the share of rejected measurements. Several updates at once lack the
+    at which all are used: it would change with the share of rejected measurements. Known ones do not replace it: a
+    measurement that only a faulty filter rejects is known there, and not in its record. Several updates at once lack the
     covariances between the measurements in ``det S``: where the filter also reports the single-modality updates from
     the common prediction, each has an equation of its own.
 
@@ -122,7 +126,7 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
         return {}
     values = _by_modality(trace.modalities, channels[keep].astype(np.float64), total[keep])
     complete = keep & (channels == np.isfinite(nu).sum(-1).max(0)).all(-1) & (channels > 0).all(-1)
-    if len(values) < (channels[keep] > 0).any(0).sum() and complete.sum() >= MIN_STEPS:
+    if complete.sum() >= MIN_STEPS:
         values[""] = float(np.mean(total[complete] / channels.sum(-1)[complete]))
     return _deviations(values)
 

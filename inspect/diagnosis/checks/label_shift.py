@@ -16,13 +16,16 @@ from beliefscope.inspect.statistics.signals import MIN_STEPS, Array
 STEP = 0.1
 """Shift of the difference quotients, in standard deviations of the component."""
 
+DEPENDENT = 0.3
+"""Smallest change of the readings by one standard deviation of the position, relative to their noise."""
+
 
 def label_shift_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict[str, float]:
     """``label shift//all``: half the log-ratio of the squared errors of readings to those with shifted labels.
 
     The shift of the position on the map has the least squared errors of all sensors together. The value is that of the
     modality with the second largest ratio, and at least 0: a bias of one sensor is no shift of the labels, which would
-    increase the errors of the other sensors. Absent unless two modalities have models, and without a position.
+    increase the errors of the other sensors. Absent unless two modalities depend on the position, and without one.
     """
     task = episode.task
     components = [i for i in task.map_indices if task.components[i].unit in LENGTHS]
@@ -32,7 +35,8 @@ def label_shift_statistics(episode: Episode, models: Sequence[ReadingModel]) -> 
     for model in (model for model in models if model.channels and model.key != CONTROL):
         modality = next((name for name, keys in task.modalities.items() if model.key in keys), "")
         errors, slopes = _errors_and_slopes(episode, model, components)
-        if modality and len(errors) >= MIN_STEPS:
+        variation = slopes * episode.states.astype(np.float64).std(0)[components]
+        if modality and len(errors) >= MIN_STEPS and np.square(variation).sum(1).mean() > DEPENDENT**2:
             known = parts.get(modality, (np.empty(0), np.empty((0, len(components)))))
             parts[modality] = np.concatenate([known[0], errors]), np.concatenate([known[1], slopes])
     if len(parts) < 2:

@@ -141,7 +141,9 @@ def is_of_readings(trace: Trace, checkpoint: ExternalFilter, models: Sequence[Re
     if before is None or after is None:
         return True
     gains = (after - before)[:, k, column] / model.noise[i]
-    middle = float(np.nanmedian(gains)) if np.isfinite(gains).any() else 1.0
+    if not np.isfinite(gains).any():
+        return True
+    middle = float(np.nanmedian(gains))
     spread = float(np.nanmedian(np.abs(gains - middle)))
     return abs(middle - 1.0) < OWN_GAIN or spread < CONSTANT * abs(middle)
 
