@@ -210,7 +210,10 @@ def _of_changes(
         inverse = (around * distance).sum(0) / power  # slope of the true on the predicted changes
         bias = np.where(varies, inverse * predicted.mean(0) - change.mean(0), bias)
         spread = (inverse * distance - around).std(0)
-        gain = np.where(varies, np.sign(inverse) / np.maximum(np.abs(inverse), 1.0 / LARGEST_GAIN), gain)
+        # The mean of 1 / inverse is too large by this variance of its noise, relative to the square of the inverse.
+        squared = np.square(inverse) + np.square(spread) / power
+        own = np.clip(inverse / np.maximum(squared, 1e-12), -LARGEST_GAIN, LARGEST_GAIN)
+        gain = np.where(varies, own, gain)
     columns = {
         "dynamics bias": bias,
         "dynamics error": np.sqrt(np.square(residual).mean(0)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,6 +47,22 @@ def test_a_bias_is_no_delay() -> None:
 def test_delayed_labels_are_common_to_all_modalities() -> None:
     clean = sail(3, every=1)
     assert max(map(abs, lags(replace(clean, states=np.roll(clean.states, 2, axis=0))).values())) < 0.5
+
+
+class Blind(Boat):
+    """Never uses the radar, whose second channel is an angle."""
+
+    def __call__(self, *, observations: dict[str, Any], controls: Any) -> dict[str, Any]:
+        return super().__call__(observations=observations | {"radar.present": 0.0}, controls=controls)
+
+
+def test_a_filter_that_never_uses_a_sensor_has_the_innovations_of_the_others_only() -> None:
+    checkpoint = loaded(Blind(), every=1)
+    assert isinstance(checkpoint, ExternalFilter)
+    run = bs.trace(checkpoint, [sail(3, every=1)])
+    assert run.innovation is not None
+    assert run.innovation.shape[-1] == 1
+    assert innovation_lags(run, with_innovations_near_truth(run, checkpoint), checkpoint) == {}
 
 
 def test_filters_without_innovations_have_no_such_lags() -> None:
