@@ -16,7 +16,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.adjustment import with_adjusted
 from beliefscope.inspect.diagnosis.catalog import causes_in
 from beliefscope.inspect.diagnosis.cause import Cause
-from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnosis.checks.episode_statistics import episode_statistics, with_scatter, with_slopes
 from beliefscope.inspect.diagnosis.checks.modules import reports_estimates_only
 from beliefscope.inspect.diagnosis.checks.readings import without_explained
 from beliefscope.inspect.diagnosis.checks.sensors import localise, sensor_statistics
@@ -147,7 +147,7 @@ def compared(
     inputs: RunInputs, traces: Sequence[Trace], rows: Rows, sensors: Rows, profile: HealthyProfile, alarm_rate: float
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
-    scattered, grouped = with_scatter(*with_adjusted(profile, rows, sensors))
+    scattered, grouped = with_scatter(*with_slopes(*with_adjusted(profile, rows, sensors)))
     grouped = [without_explained(row) for row in grouped]
     comparison = compare(scattered, grouped, task=inputs.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)

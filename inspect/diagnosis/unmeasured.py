@@ -18,6 +18,9 @@ from beliefscope.inspect.diagnostics.healthy_comparison import MIN_HEALTHY
 from beliefscope.inspect.diagnostics.statistic_kinds import AROUND_EXPECTED, label_of, sensor_of
 from beliefscope.inspect.statistics.innovations import prediction
 
+OF_SOME_RUNS = ("lost weights/", "absent updates/", "innovation share/", "measurement noise/")
+"""Statistics of filters that need steps which a run may not have, such as those without resampling."""
+
 LENGTHS = 1.5
 """Largest ratio of the number of steps of an episode to those of the record that is not mentioned."""
 
@@ -146,4 +149,5 @@ def missing_statistics(case: Case) -> int:
     kinds = {kind(name) for name in case.profile.statistics}
     finite = {name for row in case.rows for name, value in row.items() if np.isfinite(value)}
     models = () if case.profile.readings else (n for n in case.profile.statistics if n.startswith("reading "))
-    return sum(kind(name) not in kinds for name in finite) + len([*models])
+    new = (name for name in finite if kind(name) not in kinds and not name.startswith(OF_SOME_RUNS))
+    return len([*new, *models])

@@ -32,6 +32,7 @@ KINDS = {
     "dynamics scatter": ("variation between episodes of the mean error of the dynamics model", False, 2e-5),
     "dynamics nis": ("squared error over process noise of the dynamics model", True, 0.05),
     "dynamics slope": ("slope of the predicted on the true change", False, 0.02),
+    "dynamics response": ("slope of the predicted on the true change, without that of the opposite one", False, 0.02),
     "dynamics effect": ("true effect{of} relative to the predicted one", False, 0.05),
     "dynamics spread": ("error beyond bias and slope of the dynamics model", True, 0.02),
     "process noise": ("process noise", True, 0.02),

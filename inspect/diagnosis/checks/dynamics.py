@@ -57,7 +57,8 @@ def dynamics_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2, where the q of an information filter
     grows with the motion. ``dynamics slope``: slope of the predicted on the true change, for components that move
     enough; of predictions from true states, the inverse of that of the true on the predicted one, which the process
-    noise does not decrease. ``dynamics bias`` and ``dynamics spread``: mean and standard deviation of r that the slope
+    noise does not decrease, and ``dynamics response``, the former, which noise in the controls does not decrease.
+    ``dynamics bias`` and ``dynamics spread``: mean and standard deviation of r that the slope
     does not explain.
     ``process noise``: q. ``lag/dynamics``: steps by which the true changes follow the predicted ones.
 
@@ -200,6 +201,7 @@ def _of_changes(
     excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
     bias, spread = residual.mean(0) - excess * change.mean(0), (centred - excess * around).std(0)
     gain = 1.0 + excess
+    more = dict(more) if random is None else {"dynamics response": np.where(moved, gain, np.nan), **more}
     if random is not None:
         predicted = residual + change
         distance = predicted - predicted.mean(0)

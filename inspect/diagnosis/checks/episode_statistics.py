@@ -59,6 +59,37 @@ def _distance(values: Array, kind: str) -> Array:
     return np.maximum(np.abs(values - mean) - (abs(mean) if kind == "reading lag" else 0.0), 0.0)
 
 
+def with_slopes(
+    profile: HealthyProfile, rows: Sequence[Mapping[str, float]]
+) -> tuple[HealthyProfile, list[dict[str, float]]]:
+    """The profile and the episodes' statistics with slopes that neither noise nor the size of the motion changes.
+
+    Process noise in the true changes decreases ``dynamics response``, noise in the controls the inverse of
+    ``dynamics slope``, both the more the slower the motion. A wrong gain changes both by its factor. So the slope is that
+    of the two which is nearer to the healthy one, relative to the healthy medians, or the healthy one between them. The
+    responses are left out.
+    """
+    columns, result = dict(profile.statistics), [dict(row) for row in rows]
+    for name in [name for name in columns if name.startswith("dynamics response/")]:
+        slope = name.replace("response", "slope", 1)
+        if slope in columns:
+            middle, of_response = (float(np.nanmedian(columns[n])) for n in (slope, name))
+            columns[slope] = _nearer(columns[slope], columns[name], middle, of_response)
+            for row in result:
+                row[slope] = float(_nearer(row.get(slope, np.nan), row.get(name, np.nan), middle, of_response))
+        del columns[name]
+        for row in result:
+            row.pop(name, None)
+    return replace(profile, statistics=columns), result
+
+
+def _nearer(slope: float | Array, response: float | Array, middle: float, of_response: float) -> Array:
+    """The slope, or a response times the ratio of their healthy values, if it is nearer to the healthy ``middle``."""
+    other = np.asarray(response) * (middle / of_response) if abs(of_response) > 0.0 else np.nan
+    other = np.where(np.isfinite(other), other, slope)
+    return np.where(np.less(slope, middle), np.clip(other, slope, middle), np.clip(other, middle, slope))
+
+
 def with_scatter(
     profile: HealthyProfile, rows: Sequence[Mapping[str, float]]
 ) -> tuple[HealthyProfile, list[dict[str, float]]]:

@@ -101,10 +101,12 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
     to those with these channels exchanged, whatever their signs, for the best other channel; or of one channel to those
     of a channel without a model.
 
-    Of channels that the labels explain in part only, bias and drift.
+    Of channels of sensors that the labels explain in part only, bias and drift.
     """
     values: dict[str, float] = {}
-    for model in (model.of_weak() for model in models if is_expected(model.of_weak(), episode)):
+    for model in (model.of_weak() for model in models if model.key != CONTROL):
+        if not is_expected(model, episode):
+            continue
         compared, count = model.compare(episode), readings_of(episode, model.key).shape[1]
         line = _line(*compared.pairs(), compared.steps() / len(episode), model.gain_spreads)
         for i, channel in enumerate(model.channels):
@@ -356,8 +358,12 @@ def _evidence(error: Array, other: Array, limit: float, biased: Array) -> Array:
 
 
 def _is_own_arrangement(errors: Array) -> bool:
-    """Whether all channels have the smallest errors (2, A, A) with their own sign and order."""
-    return bool((errors.min((0, 2)) == np.diagonal(errors[0])).all())
+    """Whether neither the opposite sign of a channel nor the exchange of two has smaller errors (2, A, A).
+
+    A channel alone may have a smaller error as another one with more noise, to which it is relative.
+    """
+    own, least = np.diagonal(errors[0]), errors.min(0)
+    return bool((own <= np.diagonal(errors[1])).all() and (own[:, None] + own <= least + least.T).all())
 
 
 def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]:
@@ -379,5 +385,14 @@ def delayed_errors(compared: ComparedReadings, dt: float) -> tuple[float, Array]
     if delay == 0.0:
         return delay, errors
     delayed = compared.errors(int(delay))
-    is_arranged = errors.min((0, 2)).sum() < SIMPLER * np.diagonal(delayed[0]).sum()
+    is_arranged = _least_of_orders(errors.min(0)) < SIMPLER * np.diagonal(delayed[0]).sum()
     return (0.0, errors) if is_arranged else (delay, delayed)
+
+
+def _least_of_orders(errors: Array) -> float:
+    """Least sum of errors (A, A) of readings as those of the channels, each of another one; NaN if some are unknown."""
+    if not np.isfinite(errors).all():
+        return np.nan
+    from scipy.optimize import linear_sum_assignment  # takes most of a second
+
+    return float(errors[linear_sum_assignment(errors)].sum())

@@ -10,8 +10,15 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Component, Task
-from beliefscope.inspect.diagnosis.checks.readings import UNCERTAIN, reading_statistics, without_explained
+from beliefscope.inspect.diagnosis.checks.episode_statistics import with_slopes
+from beliefscope.inspect.diagnosis.checks.readings import (
+    UNCERTAIN,
+    _is_own_arrangement,
+    reading_statistics,
+    without_explained,
+)
 from beliefscope.inspect.diagnosis.checks.sensors import sensor_statistics
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.reading_features import CONTROL
 from beliefscope.inspect.statistics.reading_fit import fit_reading_models
 from beliefscope.inspect.statistics.reading_model import ReadingModel
@@ -93,6 +100,14 @@ def test_levels_without_an_expected_value_count() -> None:
     assert "level/level y/free motion" in without_explained(sensor_statistics(episode, None, ()))
 
 
+def test_a_noisy_channel_does_not_hide_a_short_delay() -> None:
+    """Relative to its noise, the error of an exact reading is small as that of a noisy channel."""
+    errors = np.array([[[4.0, 0.5], [900.0, 4.0]], [[9.0, 0.6], [900.0, 9.0]]])
+    assert _is_own_arrangement(errors)
+    errors[1, 0, 0] = 1.0
+    assert not _is_own_arrangement(errors), "the opposite sign fits better"
+
+
 def test_a_short_delay_is_unknown_where_the_readings_hardly_vary() -> None:
     """The standard error of a delay is the noise over the root of the summed squares of the changes by step."""
     (model,) = (model for model in models() if model.key == "level")
@@ -102,3 +117,32 @@ def test_a_short_delay_is_unknown_where_the_readings_hardly_vary() -> None:
         error = NOISE / math.sqrt(np.square(change).sum())
         delay = reading_statistics(episode, [model])["reading lag/level/all"]
         assert math.isnan(delay) == (error > UNCERTAIN)
+
+
+@pytest.mark.parametrize(
+    ("slope", "response", "expected"),
+    [
+        (1.1, 0.8, 1.1),  # healthy: noise in the controls, and process noise
+        (1.02, 0.8, 1.1),  # faster: less effect of noise in the controls
+        (1.1, 0.6, 1.1),  # slower: more effect of the process noise
+        (1.5, 0.6, 1.1),  # delayed
+        (0.55, 0.4, 0.55),  # half of the changes
+        (2.2, 1.6, 2.2),
+        (-1.1, -0.8, -1.1),
+        (1.5, math.nan, 1.5),
+    ],
+)
+def test_a_gain_changes_the_slopes_on_both_changes(slope: float, response: float, expected: float) -> None:
+    names = [f"dynamics {kind}/x/all" for kind in ("slope", "response")]
+    columns = {names[0]: np.full(20, 1.1), names[1]: np.full(20, 0.8), "nees/x/all": np.ones(20)}
+    record = HealthyProfile("", 20, None, columns)
+    healthy, (row,) = with_slopes(record, [{names[0]: slope, names[1]: response, "nees/x/all": 2.0}])
+    assert row == {names[0]: pytest.approx(expected), "nees/x/all": 2.0}
+    assert sorted(healthy.statistics) == [names[0], "nees/x/all"]
+    assert healthy.statistics[names[0]] == pytest.approx(1.1)
+
+
+def test_records_of_earlier_versions_have_the_slope_alone() -> None:
+    record = HealthyProfile("", 20, None, {"dynamics slope/x/all": np.full(20, 1.1)})
+    _, (row,) = with_slopes(record, [{"dynamics slope/x/all": 0.7, "dynamics response/x/all": 0.8}])
+    assert row["dynamics slope/x/all"] == 0.7
