@@ -56,7 +56,7 @@ KINDS = {
     "inverted likelihood": ("likelihood{of} that grows with the error of the reading", False, 0.1),
     "ignored start": ("independence of the belief at the start", False, 0.1),
     "late readings": ("number of readings by which the used ones{of} are late", False, 0.3),
-    "innovation turns": ("share of innovations of about a full turn", False, 0.002),
+    "innovation turns": ("share of innovations of about a full turn", False, 2e-4),  # one is decisive
     "updates": ("share of steps with an accepted measurement, or one that a correct gate rejects,", False, 0.02),
     "absent updates": ("share of steps without a reading that have a measurement", False, 0.02),
     "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
@@ -78,6 +78,7 @@ KINDS = {
     ),
     "innovation offset": ("mean of the innovations at true states, in their standard deviations,", False, 0.05),
     "ancestors": ("share of particles with offspring", False, 0.01),
+    "relative ancestors": ("share of particles with offspring, relative to that by the weights,", False, 0.02),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),
     "black": ("share of lost readings", False, 0.02),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 FILTER = (
     "error/*|angle error/*|component error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*"
-    "|ancestors/*|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*|belief variance/*"
+    "|*ancestors/*|offspring/*|updates/*|innovation bias/*|innovation std/*|innovation share/*|belief variance/*"
 )
 """Belief of the filter, and the use of its modules."""
 

@@ -85,7 +85,7 @@ WEIGHTS = Cause(
     "weights.lost",
     "Particle weights not kept without resampling",
     (Symptom("lost weights/*", 1),),
-    f"ancestors/*|offspring/*|prior ess/*|likelihood share/*|{FILTER}",
+    f"*ancestors/*|offspring/*|prior ess/*|likelihood share/*|{FILTER}",
     "Multiply the likelihood by the weights of the previous step; make them equal only after resampling.",
 )
 
@@ -168,6 +168,8 @@ def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str],
         images: modality by the component of causes in image sensors, whose networks have another R for other images.
     """
     cause = _in_predictions_of_run(cause)
+    of_weights = (replace(s, statistics=s.statistics.replace("ancestors/", "relative ancestors/")) for s in cause.symptoms)
+    cause = replace(cause, symptoms=tuple(of_weights))
     if has_true_starts:
         cause = _with_true_starts(cause)
     if cause.component in inputs:
