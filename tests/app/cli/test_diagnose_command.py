@@ -43,7 +43,8 @@ def test_the_command_that_measures_a_record_is_the_users(
     code, _, error = run(line.replace("--episode 9 --data", "--episode 0 --data"))
     assert code == 2
     message, _, command = error.rpartition(": ")
-    assert message.endswith("no healthy record; measure it on clean data with 10 or more held-out episodes")
+    assert "no healthy record; measure it on clean data with 10 or more held-out episodes" in message
+    assert message.endswith("by an earlier version with --profile-filter OLD")
     assert command.startswith("beliefscope diagnose door")
     assert command.rstrip().endswith(clean)
 
