@@ -146,3 +146,26 @@ def test_records_of_earlier_versions_have_the_slope_alone() -> None:
     record = HealthyProfile("", 20, None, {"dynamics slope/x/all": np.full(20, 1.1)})
     _, (row,) = with_slopes(record, [{"dynamics slope/x/all": 0.7, "dynamics response/x/all": 0.8}])
     assert row["dynamics slope/x/all"] == 0.7
+
+
+FINGER = Task("finger", (Component("x", "m"), Component("y", "m")), {"gps": (2,)}, {"gps": ("gps",)}, 4, 0.1)
+
+
+def slide(seed: int, delay: int = 0) -> Episode:
+    """Controls: position of a finger, whose sensor drifts, and its exact change by step, both on two axes."""
+    rng = np.random.default_rng(seed)
+    goals = np.repeat(rng.normal(0.0, 0.05, (STEPS // 10, 2)), 10, axis=0)
+    response = [0.3 * 0.7**k for k in range(40)]
+    states = np.stack([np.convolve(goal, response)[:STEPS] for goal in goals.T], axis=1)
+    change = np.diff(states, axis=0, prepend=states[:1]) + rng.normal(0.0, 0.001, (STEPS, 2))
+    finger = states + np.cumsum(rng.normal(0.0, 0.006, (STEPS, 2)), axis=0)
+    controls = np.concatenate([finger, change], axis=1)[np.maximum(np.arange(STEPS) - delay, 0)]
+    return Episode(FINGER, states, controls, {"gps": states + rng.normal(0.0, 0.01, (STEPS, 2))})
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_noisy_controls_do_not_hide_the_delay_of_exact_ones(delay: int) -> None:
+    """Relative to the noise of a position, a change by step is as near to it as to its own expected value."""
+    record = fit_reading_models([slide(seed) for seed in range(20)], [CONTROL])
+    lags = [reading_statistics(slide(seed, delay), record)["reading lag/control/all"] for seed in range(100, 106)]
+    assert np.mean(lags) == pytest.approx(delay, abs=0.35)
