@@ -187,6 +187,19 @@ def test_python_of_the_diagnostics_runs(
     assert "(32, 32)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_python_of_external_filters_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    examples = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "own_filter.md").read_text(), re.DOTALL)
+    monkeypatch.chdir(ROOT)
+    names: dict[str, object] = {}
+    for example in examples:
+        exec(compile(example, "own_filter.md", "exec"), names)
+
+    (tmp_path / "mine.py").write_text(examples[0])
+    metrics = bs.evaluate(f"{tmp_path / 'mine.py'}:Mine", "door", [9])
+    assert metrics.rmse["position_cm"] == 0.0  # as stated, it keeps its start
+
+
 def test_key_help_is_complete() -> None:
     page = ROOT / "app" / "page"
     (table,) = re.findall(r"  bindKeys\(\{\n(.*?)\n  \}\);", (page / "core" / "controls.js").read_text(), re.DOTALL)
