@@ -1,4 +1,4 @@
-"""How fusion rules degrade under sensor faults that no training contained, as a Markdown table.
+"""How fusion rules degrade under sensor faults absent from the training data, as a Markdown table.
 
     python bench/fault_table.py push crossmodal-ekf unimodal-ekf feature-ekf image-ekf haptics-ekf
     python bench/fault_table.py push-field DIR/a.safetensors DIR/b.safetensors --data DIR/outages.h5 --seeds 3
