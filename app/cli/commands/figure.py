@@ -99,7 +99,7 @@ def figure(
 ) -> console.Result:
     """Draw a figure for a paper from a filter run.
 
-    The run is over an episode, or a recorded one, such as that of an imported log.
+    The run is over an episode of a task, or a recorded one, such as that of an imported log.
 
     maps: likelihood or posterior of each modality around the true position, in free motion and in contact. For a task
     without contact, the maps are at one step; for a state with one map component, they are curves.

@@ -23,7 +23,8 @@ def import_(
     ),
     output: Path | None = opt.option(
         "RUN.trace|RUN.live|DATA.h5|DIR",
-        "A trace, a data set, a run for the folder 'live' of a workspace, or a folder of traces, named 'live' of runs.",
+        "Trace, data set, or run for the folder 'live' of a workspace; or a folder of traces, or of runs if it is "
+        "named 'live'.",
         None,
         "-o",
         "--output",

@@ -44,7 +44,7 @@ def sweep(
     DIR/results.parquet has one row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES/n,
     coverage, fusion weights and the provenance of the episode. DIR/checkpoints.parquet has one row for each checkpoint,
     with the provenance from the JSON file beside it (runs/a.json for runs/a.safetensors). Finished cells are stored, so
-    the same command resumes an interrupted sweep. The tables have the same bits with any engine and number of workers.
+    the same command resumes an interrupted sweep. The tables are bit-identical for any engine and number of workers.
     Read them with beliefscope experiments, DuckDB, pandas or Polars (docs/sweep.md).
 
     \b
