@@ -57,8 +57,8 @@ def _start_note(metrics: Mapping[str, Any]) -> str:
     if not names:
         return ""
     return (
-        f"No better than {STAY}: rmse {', '.join(names)}. Of a state that hardly moves, a start at the true state hides"
-        " the errors of a filter that keeps it; --start-offset starts elsewhere."
+        f"No better than {STAY}: rmse {', '.join(names)}. For a state that hardly moves, a start at the true state "
+        "hides the errors of a filter that keeps it; --start-offset starts elsewhere."
     )
 
 

@@ -78,8 +78,8 @@ def _jumping(case: Case) -> list[str]:
     """Angles whose jumps models of expected readings and dynamics take for motions."""
     jumps, count = jumping_angles([trace.episode for trace in case.traces]), len(case.traces)
     return [
-        f"what depends on {display_name(name)}, which jumps by a turn in {number} of {count} episodes: declare it with "
-        "wraps=True, and measure the healthy record again"
+        f"statistics that depend on {display_name(name)}, which jumps by a turn in {number} of {count} episodes: "
+        "declare it with wraps=True, and measure the healthy record again"
         for name, number in jumps.items()
     ]
 

@@ -24,7 +24,7 @@ TEXTS = {
     "gain": ("Sensor {} has a wrong gain", "Check the unit and the gain of the sensor."),
     "dead": ("Elements of sensor {} dead", "Replace the elements, or mask them in training as well."),
     "holes": ("Elements of sensor {} without a value", "Check the light, the range and the surfaces that it sees."),
-    "shift": ("Sensor {} moved", "Calibrate the place of the sensor again."),
+    "shift": ("Sensor {} moved", "Calibrate the pose of the sensor again."),
     "sign": ("Values of sensor {} inverted", "Check the sign of the sensor."),
     "axes": ("Array of sensor {} mirrored or transposed", "Check the order of the rows and columns of the sensor."),
 }

@@ -49,7 +49,7 @@ CONNECTION = "Check the connection of the sensor and the load of the computer th
 SLOW = -0.1
 """Prior of a drift: slow readings with a delay or a gain also drift."""
 
-TARE = "Tare the sensor, or register the frame of the labels with it: only other sensors tell which of them is wrong."
+TARE = "Tare the sensor, or register the frame of the labels with it: only other sensors can show which is wrong."
 """Next action of a bias."""
 
 WARM = "Let the sensor warm up and tare it before each episode."

@@ -38,7 +38,7 @@ CAUSES = (
         "Resampling biased: offspring is not proportional to the weights",
         (Symptom("offspring/*", 1), Symptom("ancestors/*", 1, 0.5)),
         FILTER,
-        "Check the implementation of the resampling: the ancestors, and that the weights after it are theirs.",
+        "Check the implementation of the resampling: the choice of the ancestors, and the weights after it.",
         "restore equations",
         lowers="prior ess/*",
     ),

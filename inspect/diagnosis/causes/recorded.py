@@ -30,8 +30,8 @@ RECORDED = (
         "Filter changed, while its readings show no fault",
         (Symptom(ERRORS),),
         FILTER,
-        "Compare the code and parameters of the filter with those of the healthy runs; as an external filter "
-        "(docs/own_filter.md), the fault of its equations is named.",
+        "Compare the code and parameters of the filter with those of the healthy runs; to find a fault of its "
+        "equations, diagnose it as an external filter (docs/own_filter.md).",
         prior=-0.3,  # wrong noises and faulty readings change the errors as well
     ),
 )
