@@ -98,7 +98,7 @@ def check_trainable(definition: Task, task: str, text: str) -> None:
         raise unknown_name("filter", text, names)
     file = text.rpartition(":")[0] if is_code(text) else text
     if (file.endswith(".py") or is_path(file)) and not Path(file).is_file():
-        problem = f"is no filter that this command trains, and no file {file!r} exists"
+        problem = f"is not a filter that this command trains, and no file {file!r} exists"
     elif is_external:
         source = text if is_code(text) else f"{text}:{_build_function(_functions(text))}"
         problem = "is an external filter, which this command does not train; fine-tune it: "
@@ -106,7 +106,7 @@ def check_trainable(definition: Task, task: str, text: str) -> None:
     elif text.endswith(".safetensors"):
         problem = f"is a checkpoint; fine-tune it: beliefscope finetune {text} -o finetuned.safetensors"
     else:
-        problem = "is no filter that this command trains"
+        problem = "is not a filter that this command trains"
     raise BadInput(f"filter {text!r} {problem}. Filters that can be trained: {', '.join(names)}.")
 
 

@@ -35,4 +35,4 @@ def with_kept_record(checkpoint: Checkpoint, workspace: Path) -> Checkpoint:
     try:
         return with_record(checkpoint, read_record(dict[str, Any], path))
     except (OSError, ValueError) as error:
-        raise BadInput(f"{path} is no healthy record: {error}; measure it again with --profile-from") from None
+        raise BadInput(f"{path} is not a healthy record: {error}; measure it again with --profile-from") from None

@@ -45,7 +45,7 @@ class Trash:
                 os.rename(path, entry / path.name)
             except FileNotFoundError:
                 entry.rmdir()
-                raise NotFound(f"{path.name!r} does not exist any more.") from None
+                raise NotFound(f"{path.name!r} no longer exists.") from None
         return id
 
     def restore(self, id: str) -> Path:
@@ -53,7 +53,7 @@ class Trash:
         with self._lock:
             path = self._path(id)
             if path is None:
-                raise NotFound(f"Deleted file {id!r} does not exist any more.")
+                raise NotFound(f"Deleted file {id!r} no longer exists.")
             target = self._target / path.name
             if os.path.lexists(target):
                 raise NameTaken(f"A file {path.name!r} already exists: rename it first.")

@@ -56,7 +56,7 @@ def csv_format(path: Path) -> tuple[str, str]:
     try:
         header = first.decode("utf-8-sig", "strict" if len(first) < MAX_HEADER else "ignore")
     except UnicodeDecodeError as error:
-        code = "UTF-16" if first[:2] in UTF_16 else f"no UTF-8, with the byte 0x{first[error.start]:02x} in line 1"
+        code = "UTF-16" if first[:2] in UTF_16 else f"not UTF-8, with the byte 0x{first[error.start]:02x} in line 1"
         raise BadInput(f"{path.name} is {code}: expected a CSV file in UTF-8") from None
     separator = max(SEPARATORS, key=header.count)
     if "," in header or separator not in header:

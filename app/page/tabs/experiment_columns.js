@@ -15,7 +15,7 @@ import { faultsText, numberOf, numbersOf, valueOf } from './experiment_rows.js';
 const SEEDS = {
   key: 'seeds',
   title: 'seeds',
-  help: 'Number of checkpoints; their standard deviation is behind ±. Repeated: several have the same seed, so that they differ in something else',
+  help: 'Number of checkpoints; ± is their standard deviation. Repeated: several have the same seed, so they differ in something else',
   number: true,
   content: (row) =>
     `${'members' in row ? row.members.length : 1}${repeatsSeed(row) ? ', repeated' : ''}`,

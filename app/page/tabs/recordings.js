@@ -261,7 +261,7 @@ export class Recordings {
       if (recording !== this.#store.state.recording) return;
       const files = recording.split('/').map((name) => {
         const file = recordings.find((entry) => entry.name === name);
-        if (!file) throw new Error(`The recording ${name} does not exist any more.`);
+        if (!file) throw new Error(`The recording ${name} no longer exists.`);
         return { ...file, isOf: recordedRun(file) };
       });
       this.#rerun.files(files);

@@ -148,4 +148,4 @@ def test_an_invalid_record_of_the_workspace_is_named(run: Run, tmp_path: Path) -
     path.parent.mkdir()
     path.write_text("[]")
     code, _, error = run("diagnose", "door", "--filter", "crossmodal-ekf", "--workspace", tmp_path)
-    assert (code, f"{path} is no healthy record: " in " ".join(error.split())) == (2, True)
+    assert (code, f"{path} is not a healthy record: " in " ".join(error.split())) == (2, True)

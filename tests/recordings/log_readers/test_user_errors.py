@@ -70,7 +70,7 @@ def refused(run: Run, log: Path, mapping: str) -> str:
     [
         (text().replace("2.0,", "", 1).encode(), "Row #22: Expected 5 columns, got 4"),
         (text().encode("utf-16"), "is UTF-16: expected a CSV file in UTF-8"),
-        (text().replace("gx", "größe").encode("latin1"), "is no UTF-8, with the byte 0xf6 in line 1"),
+        (text().replace("gx", "größe").encode("latin1"), "is not UTF-8, with the byte 0xf6 in line 1"),
         (text().replace("gy", "gx").encode(), "has 2 columns 'gx', expected unique names"),
         ("\n".join(text().splitlines()[:2]).encode(), "has one step per episode, expected two or more"),
     ],
