@@ -71,10 +71,10 @@ class Condition:
         return sum(value is not None for value in (self.low, self.high, self.category))
 
     def __str__(self) -> str:
-        """``panel friction > 2.1``, ``1 s < outage length <= 2 s``, ``contact`` or ``policy is push``."""
+        """``friction > 2.1``, ``1 s < outage length <= 2 s``, ``contact``, ``free motion`` or ``policy is push``."""
         if self.category is not None:
             yes, no = self.covariate, f"no {self.covariate}"
-            switch = {"yes": yes, yes: yes, "no": no, no: no}
+            switch = {"yes": yes, yes: yes, "no": "free motion" if yes == "contact" else no, no: no}
             return switch.get(self.category, f"{self.covariate} is {self.category}")
         low, high = (None if end is None else f"{end:z.3g} {self.unit}".strip() for end in (self.low, self.high))
         if low is None:

@@ -20,7 +20,10 @@ test('conditions have the units of the page', () => {
   );
   assert.equal(text({ low: 3.9, covariate: 'time', unit: 's' }), 'time >\u00a03.9\u00a0s');
   assert.equal(text({ low: 0.6234, covariate: 'friction', unit: '' }), 'friction >\u00a00.623');
-  assert.equal(text({ category: 'no', covariate: 'contact' }), 'no contact');
+  assert.equal(text({ category: 'no', covariate: 'contact' }), 'free motion');
+  assert.equal(text({ category: 'no fix', covariate: 'fix' }), 'no fix');
+  assert.equal(text({ category: 'fix', covariate: 'fix' }), 'fix');
+  assert.equal(text({ category: 'no', covariate: 'blackout' }), 'no blackout');
   assert.equal(text({ category: 'yes', covariate: 'contact' }), 'contact');
   assert.equal(text({ category: 'push', covariate: 'policy' }), 'policy is push');
 });

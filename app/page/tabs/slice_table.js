@@ -138,12 +138,14 @@ const short = (number) => number.replace(/(\.\d*?)0+$/, '$1').replace(/\.$/, '')
 const factor = (value) => (value === null ? '–' : String(Number(value.toPrecision(2))));
 
 /**
- * Describes a condition in units of the page: 1 s < outage length ≤ 2 s, contact, or policy is push.
+ * Describes a condition in units of the page: 1 s < outage length ≤ 2 s, contact, free motion, or policy is push.
  * @param {Condition} condition
  */
 export function conditionText({ covariate, unit, low, high, category }) {
-  if (category === 'yes') return covariate;
-  if (category === 'no') return `no ${covariate}`;
+  const no = `no ${covariate}`;
+  if (category === 'yes' || category === covariate) return covariate;
+  if (category === 'no' && covariate === 'contact') return 'free motion';
+  if (category === 'no' || category === no) return no;
   if (category !== null) return `${covariate} is ${category}`;
   const end = (/** @type {number | null} */ value) =>
     withUnit(short(significant(value)), unit.replace('deg', '°')).replace(' ', NO_BREAK);

@@ -74,7 +74,8 @@ def test_conditions_in_words() -> None:
     assert str(Condition("puck radius", "cm", low=4.663)) == "puck radius > 4.66 cm"
     assert str(Condition("object speed", "cm/s", high=5.0)) == "object speed <= 5 cm/s"
     assert str(Condition("policy", "", category="push")) == "policy is push"
-    assert [str(Condition("contact", "", category=c)) for c in ("yes", "no")] == ["contact", "no contact"]
+    assert [str(Condition("contact", "", category=c)) for c in ("yes", "no")] == ["contact", "free motion"]
+    assert [str(Condition("fix", "", category=c)) for c in ("fix", "no fix")] == ["fix", "no fix"]
 
 
 def test_a_planted_slice_in_words(traces: list[Trace]) -> None:
