@@ -25,6 +25,7 @@ QUANTITIES = {
     "effector_step": "effector displacement per step",
 }
 MEASURES = {"std": "standard deviation"}
+UNITS = {"Nm": "N m"}
 
 
 def component_ranges(episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
@@ -43,7 +44,7 @@ class ReferenceData:
 
     Attributes:
         episodes: number of episodes. steps: length of the longest one.
-        statistics: values used for standardization in the published code. Forces and torques have sensor axes.
+        statistics: values used for standardisation in the published code. Forces and torques have sensor axes.
     """
 
     episodes: int
@@ -99,8 +100,8 @@ def comparison_table(ours: Statistics, reference: Statistics) -> tuple[list[str]
             paper = other[i] if isinstance(other, list) else other
             ratio = None if paper is None else number / paper
             label = f"{QUANTITIES.get(subject, subject.replace('_', ' '))} {axis}".rstrip()
-            rows.append([label, MEASURES.get(measure, measure), unit, number, paper, ratio])
-    columns = ["quantity", "measure", "unit", "this dataset", "paper", "this / paper"]
+            rows.append([label, MEASURES.get(measure, measure), UNITS.get(unit, unit), number, paper, ratio])
+    columns = ["quantity", "measure", "unit", "this data set", "paper", "this / paper"]
     count = len(columns) if reference else columns.index("paper")
     return columns[:count], [row[:count] for row in rows]
 

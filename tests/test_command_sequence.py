@@ -32,7 +32,7 @@ def test_collect_compares_statistics_with_the_paper(run: Run, folder: Path, task
     code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
     assert code == 0
     head, _, _, title, *rows = out.splitlines()
-    assert re.split("  +", title.strip()) == ["quantity", "measure", "unit", "this dataset", "paper", "this / paper"]
+    assert re.split("  +", title.strip()) == ["quantity", "measure", "unit", "this data set", "paper", "this / paper"]
     assert head.startswith("one.h5")
     row = next(row for row in rows if row.startswith("  steps in contact"))
     assert float(row.split()[-2]) == PAPER_DATA[task].statistics["contact_fraction"]

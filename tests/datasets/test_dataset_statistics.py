@@ -55,7 +55,7 @@ def test_statistics_without_haptics() -> None:
 def test_comparison_table_has_one_number_in_each_cell() -> None:
     ours = {"contact_fraction": 0.5, "range_std_m/s": 3.0, "effector_step_std_mm": [2.0, 1.0, 3.0]}
     columns, rows = comparison_table(ours, {"contact_fraction": 0.25, "effector_step_std_mm": [4.0, 1.0, 1.0]})
-    assert columns == ["quantity", "measure", "unit", "this dataset", "paper", "this / paper"]
+    assert columns == ["quantity", "measure", "unit", "this data set", "paper", "this / paper"]
     assert rows == [
         ["steps in contact", "share", "", 0.5, 0.25, 2.0],
         ["range", "standard deviation", "m/s", 3.0, None, None],
@@ -67,7 +67,7 @@ def test_comparison_table_has_one_number_in_each_cell() -> None:
 
 def test_comparison_table_without_published_data_has_no_columns_for_them() -> None:
     columns, rows = comparison_table({"contact_fraction": 0.5}, {})
-    assert columns == ["quantity", "measure", "unit", "this dataset"]
+    assert columns == ["quantity", "measure", "unit", "this data set"]
     assert rows == [["steps in contact", "share", "", 0.5]]
 
 
