@@ -224,8 +224,8 @@ class _Fitted:
         noise, bias = float(np.sqrt(variance)), float(np.sqrt(max(between, 0.0)))
         fit = self.option.channel, self.coefficients, self.constants, self.option.heading, self.landmark
         spread = float(self.option.slopes(rows, self.errors).std())
-        explained = self.explained(rows)
-        return ChannelModel(*fit, noise, bias, self.degree, spread, explained, _limits(rows, self.degree, len(self.landmark) > 0))
+        explained, limits = self.explained(rows), _limits(rows, self.degree, len(self.landmark) > 0)
+        return ChannelModel(*fit, noise, bias, self.degree, spread, explained, limits)
 
 
 def _limits(rows: Sequence[Rows], degree: int, has_landmark: bool) -> Array:

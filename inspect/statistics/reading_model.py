@@ -130,8 +130,8 @@ class ChannelModel:
         bias: standard deviation between these episodes of the mean of this noise, beyond that of its average.
         degree: of the ``monomials`` that are the features; 0 for others.
         gain_spread: standard deviation between these episodes of the slope of the readings on the expected ones.
-        explained: share of the variance of the readings within these episodes that the labels explain; NaN in records of
-            earlier versions.
+        explained: share of the variance of the readings within these episodes that the labels explain; NaN in records
+            of earlier versions.
         limits: (2, V) range in the record of the V values that the monomials are products of, or of the V = F features;
             V is 0 without limits, as of landmarks and in records of earlier versions.
     """

@@ -38,6 +38,9 @@ UNCHANGED_BY_DRIFT = ("dynamics spread/", "measurement function/", "process nois
 OF_DYNAMICS = ("dynamics.", "process_noise.", "control.", "labels.", "data.", "particles.few")
 """Starts of the names of causes that change them as well: moments of few particles are not exact."""
 
+RESAMPLING = ("particles.deprived", "resampling.biased")
+"""Causes that show in the share of particles with offspring, of an external filter relative to that by its weights."""
+
 DRIFT = Cause(
     "dynamics.drift",
     "Dynamics biased, differently in each episode",
@@ -168,8 +171,9 @@ def in_predictions(cause: Cause, has_true_starts: bool, inputs: Collection[str],
         images: modality by the component of causes in image sensors, whose networks have another R for other images.
     """
     cause = _in_predictions_of_run(cause)
-    of_weights = (replace(s, statistics=s.statistics.replace("ancestors/", "relative ancestors/")) for s in cause.symptoms)
-    cause = replace(cause, symptoms=tuple(of_weights))
+    if cause.name in RESAMPLING:
+        own = (replace(s, statistics=s.statistics.replace("ancestors/", "relative ancestors/")) for s in cause.symptoms)
+        cause = replace(cause, symptoms=tuple(own))
     if has_true_starts:
         cause = _with_true_starts(cause)
     if cause.component in inputs:

@@ -59,7 +59,7 @@ def _labels(task: Task) -> tuple[Cause, ...]:
     sensors = [Symptom(f"reading lag/{key}/*", -1, optional=True) for key in modelled_sensors(task)]
     (offset,) = (cause for cause in data.CAUSES if cause.name == "labels.offset")
     objects, *_, common = offset.symptoms
-    shift = Symptom("label shift/*", unmeasured=(objects,))  # without it, a moved camera shows the object elsewhere, too
+    shift = Symptom("label shift/*", unmeasured=(objects,))  # a moved camera also shows the object elsewhere
     biases = [offset_of(modality, 0.3) for modality in task.modalities]
     return (
         replace(delay, symptoms=(lag, replace(dynamics, optional=True), controls, *sensors)),

@@ -65,9 +65,9 @@ def with_slopes(
     """The profile and the episodes' statistics with slopes that neither noise nor the size of the motion changes.
 
     Process noise in the true changes decreases ``dynamics response``, noise in the controls the inverse of
-    ``dynamics slope``, both the more the slower the motion. A wrong gain changes both by its factor. So the slope is that
-    of the two which is nearer to the healthy one, relative to the healthy medians, or the healthy one between them. The
-    responses are left out.
+    ``dynamics slope``, both the more the slower the motion. A wrong gain changes both by its factor. So the slope is
+    that of the two which is nearer to the healthy one, relative to the healthy medians, or the healthy one between
+    them. The responses are left out.
     """
     columns, result = dict(profile.statistics), [dict(row) for row in rows]
     for name in [name for name in columns if name.startswith("dynamics response/")]:

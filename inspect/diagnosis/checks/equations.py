@@ -141,8 +141,8 @@ def reported_particle_statistics(trace: Trace) -> dict[str, float]:
     """Of the particles that an external filter reports: those of ``equation_statistics`` that need no equations of it.
 
     ``prior ess`` is of the steps after a resampling, of all steps if there is none: not every filter resamples always.
-    ``offspring`` (``relative_spread``) and ``relative ancestors``, the share of particles with offspring relative to its
-    largest one by the weights w, the mean of min(1, M w), are of the steps with a resampling.
+    ``offspring`` (``relative_spread``) and ``relative ancestors``, the share of particles with offspring relative to
+    its largest one by the weights w, the mean of min(1, M w), are of the steps with a resampling.
     ``lost weights``: share of the steps without resampling after which the weights are not kept.
     ``likelihood share``, of each measurement model: the power to which its likelihood is in the ratio of the posterior
     to the prior weights, 1 if it is a factor of them and 0 if the weights ignore it. ``estimate mean`` and

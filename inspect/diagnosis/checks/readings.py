@@ -65,7 +65,7 @@ EXPLAINED = {"level": "reading bias", "drift": "reading bias", "size": "reading 
 kinds that take their place. It also changes the noise of all readings, but not that around the expected ones."""
 
 UNCERTAIN = 1.0
-"""Largest standard error of a short delay, steps; that of a sensor is larger where its expected readings hardly vary."""
+"""Largest standard error of a short delay, steps; it is larger where the expected readings hardly vary."""
 
 FITS = 9.0
 """Largest mean square error of readings that fit, relative to the square of the noise."""
@@ -111,7 +111,8 @@ def reading_statistics(episode: Episode, models: Sequence[ReadingModel]) -> dict
         line = _line(*compared.pairs(), compared.steps() / len(episode), model.gain_spreads)
         for i, channel in enumerate(model.channels):
             axis = axis_name(model.key, channel, count)
-            values |= {f"reading {kind}/{axis}/all": float(line[kind][i] / model.noise[i]) for kind in ("bias", "drift")}
+            for kind in ("bias", "drift"):
+                values[f"reading {kind}/{axis}/all"] = float(line[kind][i] / model.noise[i])
     for model in (model for model in models if is_expected(model, episode)):
         compared = model.compare(episode)
         delay, errors = delayed_errors(compared, episode.dt)

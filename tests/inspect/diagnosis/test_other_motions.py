@@ -38,7 +38,8 @@ def swing(seed: int, size: float = 1.0, scale: float = 1.0, bias: float = 0.0, m
     tilt = 0.5 * size * np.sin(0.2 * np.arange(STEPS) + rng.uniform(0.0, 6.0))
     gravity = 9.81 * np.stack([np.sin(tilt), np.cos(tilt)], 1) + rng.normal(0.0, NOISE, (STEPS, 2))
     controls = scale * (velocity + rng.normal(0.0, measured, STEPS))
-    return Episode(TASK, np.stack([place, tilt], 1), controls[:, None], {"level": gravity + (0.0, bias)})
+    gravity[:, 1] += bias
+    return Episode(TASK, np.stack([place, tilt], 1), controls[:, None], {"level": gravity})
 
 
 @cache
