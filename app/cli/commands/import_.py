@@ -23,8 +23,7 @@ def import_(
     ),
     output: Path | None = opt.option(
         "RUN.trace|RUN.live|DATA.h5|DIR",
-        "Trace, data set, or run for the folder 'live' of a workspace; or a folder of traces, or of runs if it is "
-        "named 'live'.",
+        "Trace, data set, or run for a workspace's folder 'live'; or folder of traces (of runs, if named 'live').",
         None,
         "-o",
         "--output",
