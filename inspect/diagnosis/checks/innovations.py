@@ -97,8 +97,8 @@ def measurement_noise(trace: Trace, nu: Array, s: Array) -> dict[str, float]:
     modalities that are always used together, they only give the mean of all, ``measurement noise//all``, at the steps
     at which all are used: it would change with the share of rejected measurements. Known ones do not replace it, since
     a measurement that only a faulty filter rejects is known there, and not in its record. Several updates at once lack
-    the covariances between the measurements in ``det S``: where the filter also reports the single-modality updates from
-    the common prediction, each has an equation of its own.
+    the covariances between the measurements in ``det S``: where the filter also reports the single-modality updates
+    from the common prediction, each has an equation of its own.
 
     Only of filters that report their prediction and whose beliefs have a covariance of full rank.
 
