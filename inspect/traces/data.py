@@ -44,7 +44,7 @@ class Trace:
             this step, updated with one modality only. PF: the predicted particles weighted by one likelihood. EKF:
             the posterior of each filter of the bank. The prior comes from the fused belief, and so from all
             modalities; standalone runs (``inspect/standalone.py``) are less accurate. Only a bank of EKFs without
-            feedback keeps the modalities apart: its updates are the standalone estimates.
+            feedback separates the modalities: its updates are the standalone estimates.
         start_mean, start_covariance: (n,), (n, n) belief before the first step.
         weights: (T, K, W) fusion weights beta, the network's output; W is n (per component) or 1.
         effective_weights: (T, K, W) share of each modality in the posterior; sums to one over K. None where K < 2.
@@ -68,7 +68,7 @@ class Trace:
         episode_index: index in the data set.
         seed: seed of the filter and of the fault injection.
         faults: injected sensor faults; ``data_hash`` is of the episode before injection.
-        settings: JSON values: particles, versions, edits; ``standalone``: the modality of a standalone run.
+        settings: JSON values: particles, versions; ``edits``: interventions; ``standalone``: the modality of that run.
     """
 
     episode: Episode

@@ -214,7 +214,7 @@ def evaluate(
     particles: int = 300,
     start_offset: str = "",
 ) -> Metrics:
-    """Measure accuracy and consistency of a filter, its baselines and its modalities, as ``beliefscope evaluate``.
+    """Measure accuracy and consistency of a filter, its baselines and modalities, as ``beliefscope evaluate`` does.
 
     Args:
         episodes: indices; default: the held-out ones.
@@ -376,7 +376,7 @@ def serve(
     workspace: str | Path = "workspace",
     port: int = 8000,
 ) -> None:
-    """Serve the dashboard on this machine until interrupted: all pretrained filters, sample data, and these ones.
+    """Serve the dashboard on this machine until interrupted: pretrained filters, sample data, and the given ones.
 
     Args:
         filters: checkpoint files, or filters of your own (``load_filter``), which run in this process only.
