@@ -232,7 +232,7 @@ def test_inspect_reports_applicable_diagnostics_and_reasons(run: Run, folder: Pa
     code, out, _ = run("inspect 9.trace")
     assert code == 0
     assert "Particle health: not available" in out
-    assert "Likelihood maps: not available: maps needs the filter, not only its trace" in out
+    assert "Likelihood maps: not available: diagnostic maps needs the filter, not only its trace" in out
     code, _, err = run("inspect 9.trace --only particles")
     assert (code, err.splitlines()[-1]) == (2, "error: filter crossmodal-ekf has no particles")
     assert run("trace door --filter crossmodal-pf --particles 10 -o pf.trace")[0] == 0

@@ -152,8 +152,8 @@ class Entry:
         try:
             if self.needs != "trace":
                 if checkpoint is None or isinstance(checkpoint, UnavailableFilter):
-                    how = "its checkpoint, or --filter FILE.py:FUNCTION"
-                    return f"{self.name} needs the filter, not only its trace: {how}"
+                    how = "give its checkpoint, or --filter FILE.py:FUNCTION"
+                    return f"diagnostic {self.name} needs the filter, not only its trace: {how}"
                 check_origin(checkpoint, trace)
             return self.why_not(trace, checkpoint)
         except BadInput as error:  # also if an external filter lacks the requested property

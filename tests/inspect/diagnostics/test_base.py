@@ -145,7 +145,9 @@ def test_diagnostics_that_do_not_apply_to_an_lstm(name: str, why: str) -> None:
 
 def test_missing_checkpoint_is_refused() -> None:
     why = DIAGNOSTICS["maps"].refusal(plant.real("crossmodal-pf"), None)
-    assert why == "maps needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
+    assert (
+        why == "diagnostic maps needs the filter, not only its trace: give its checkpoint, or --filter FILE.py:FUNCTION"
+    )
 
 
 def test_unknown_numbers_of_a_table_are_dashes() -> None:

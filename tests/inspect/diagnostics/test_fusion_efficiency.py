@@ -217,7 +217,8 @@ def test_filter_of_one_modality_is_refused(doors: tuple[Checkpoint, list[Trace]]
     entry, single = DIAGNOSTICS["efficiency"], checkpoint("image-ekf")
     assert (
         entry.refusal(doors[1][0], None)
-        == "efficiency needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
+        == "diagnostic efficiency needs the filter, not only its trace: give its checkpoint, "
+        "or --filter FILE.py:FUNCTION"
     )
     run = plant.real("crossmodal-ekf")
     assert entry.refusal(run, single) == "filter crossmodal-ekf has one modality: it is the standalone filter"

@@ -304,5 +304,5 @@ def test_too_many_modalities_are_refused() -> None:
     assert shapley.why_not(run, checkpoint) == "filter crossmodal-ekf has 7 modalities; at most 6 are supported"
     assert (
         shapley.ENTRY.refusal(run, None)
-        == "shapley needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
+        == "diagnostic shapley needs the filter, not only its trace: give its checkpoint, or --filter FILE.py:FUNCTION"
     )
