@@ -48,7 +48,7 @@ def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
 
     page.page.keyboard.press("n")
     wait_for_step(page, second["episode"], second["step"])
-    moved = f"now episode {second['episode']}, step {second['step']}" if second["episode"] != worst["episode"] else ""
+    moved = f"is in episode {second['episode']}, step {second['step']}" if second["episode"] != worst["episode"] else ""
     assert moved in page.page.locator("#messages").text_content()
     page.page.keyboard.press("b")
     wait_for_step(page, worst["episode"], worst["step"])

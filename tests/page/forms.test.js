@@ -91,7 +91,7 @@ test('a failure in another episode is announced', () => {
   assert.equal(episodeNote({ episode: 9, step: 3 }, 9, '1 of 4'), '');
   assert.equal(
     episodeNote({ episode: 12, step: 3 }, 9, '2 of 4'),
-    'Failure 2 of 4 is in another episode: now episode 12, step 3, before episode 9. ctrl z returns.',
+    'Failure 2 of 4 is in episode 12, step 3. ctrl z returns to episode 9.',
   );
 });
 

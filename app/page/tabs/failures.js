@@ -317,7 +317,7 @@ export class Failures {
 export const episodeNote = ({ episode, step }, previous, rank) =>
   episode === previous
     ? ''
-    : `Failure ${rank} is in another episode: now episode ${episode}, step ${step}, before episode ${previous}. ctrl z returns.`;
+    : `Failure ${rank} is in episode ${episode}, step ${step}. ctrl z returns to episode ${previous}.`;
 
 /**
  * @param {FailureScore} score
