@@ -78,7 +78,7 @@ KINDS = {
     ),
     "innovation offset": ("mean of the innovations at true states, in their standard deviations,", False, 0.05),
     "ancestors": ("share of particles with offspring", False, 0.01),
-    "relative ancestors": ("share of particles with offspring, relative to that by the weights,", False, 0.02),
+    "relative ancestors": ("share of particles with offspring, relative to the expected share,", False, 0.02),
     "offspring": ("squared difference of the number of offspring from its expectation", True, 0.02),
     "outside": ("share of steps with the true state outside of the particles", False, 0.01),
     "black": ("share of lost readings", False, 0.02),

@@ -207,4 +207,5 @@ def _check_record(checkpoint: Checkpoint, data: Path | None, clean: int) -> None
         source = str(data or sample_path(checkpoint.task)) if clean >= MIN_HEALTHY else "CLEAN.h5"
         command = shlex.join(["beliefscope", *sys.argv[1:], "--profile-from", source])
         needed = f"on clean data with {MIN_HEALTHY} or more held-out episodes"
-        raise BadInput(f"{reason}; measure it {needed}, by an earlier version with --profile-filter OLD: {command}")
+        earlier = "add --profile-filter OLD for that of an earlier version"
+        raise BadInput(f"{reason}; measure it {needed} ({earlier}): {command}")

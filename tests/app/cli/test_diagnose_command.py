@@ -44,7 +44,7 @@ def test_the_command_that_measures_a_record_is_the_users(
     assert code == 2
     message, _, command = error.rpartition(": ")
     assert "no healthy record; measure it on clean data with 10 or more held-out episodes" in message
-    assert message.endswith("by an earlier version with --profile-filter OLD")
+    assert message.endswith("(add --profile-filter OLD for that of an earlier version)")
     assert command.startswith("beliefscope diagnose door")
     assert command.rstrip().endswith(clean)
 
