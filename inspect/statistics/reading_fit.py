@@ -32,7 +32,7 @@ EXPLAINED = 0.5
 """Smallest share of the variance of a channel within episodes that its model explains in other episodes."""
 
 WEAKLY_EXPLAINED = 0.05
-"""The same of a channel whose model is used to judge likelihoods and measurement functions only."""
+"""The same of a channel whose model is used to judge its level, likelihoods and measurement functions only."""
 
 SMALLEST_NOISE = 0.01
 """Smallest noise of a channel, relative to the standard deviation of its readings within episodes."""
