@@ -148,7 +148,8 @@ def compared(
 ) -> Case:
     """The statistics of traces, compared with a healthy profile."""
     scattered, grouped = with_scatter(*with_slopes(*with_adjusted(profile, rows, sensors)))
-    grouped = [without_explained(row) for row in grouped]
+    known = scattered.statistics.keys()  # a record of an earlier version may have the level of readings only
+    grouped = [without_explained({n: value for n, value in row.items() if n in known}) for row in grouped]
     comparison = compare(scattered, grouped, task=inputs.checkpoint.task)
     deviations = with_critical_values(scattered, comparison, alarm_rate)
     certain = _repeats_readings(profile, rows) or _most_deviate(scattered, grouped, deviations)
