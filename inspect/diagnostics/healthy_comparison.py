@@ -283,7 +283,7 @@ def _is_of_controls(statistic: str) -> bool:
 
 
 def _smallest_std(statistic: str) -> float:
-    """That of the statistic's kind; larger ones of torques, and of the slopes of controls on the expected ones."""
+    """That of the statistic's kind; others of torques, and of controls (``OF_CONTROLS``)."""
     kind = statistic.split("/")[0]
     _, _, smallest = KINDS.get(kind, ("", False, 1e-9))
     if kind in OF_CONTROLS and _is_of_controls(statistic):

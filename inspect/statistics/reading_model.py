@@ -180,6 +180,8 @@ class ChannelModel:
     def to_json(self) -> dict[str, Any]:
         """JSON values; the rows of the coefficients are columns."""
         values = {f.name: getattr(self, f.name) for f in fields(self)} | {"coefficients": self.coefficients.T}
+        if math.isnan(self.explained):
+            del values["explained"]
         return {name: v if isinstance(v, int) else significant(v, DIGITS) for name, v in values.items()}
 
     @classmethod

@@ -72,7 +72,7 @@ def with_slopes(
     columns, result = dict(profile.statistics), [dict(row) for row in rows]
     for name in [name for name in columns if name.startswith("dynamics response/")]:
         slope = name.replace("response", "slope", 1)
-        if slope in columns:
+        if slope in columns and (np.isfinite(columns[slope]) & np.isfinite(columns[name])).any():
             middle, of_response = (float(np.nanmedian(columns[n])) for n in (slope, name))
             columns[slope] = _nearer(columns[slope], columns[name], middle, of_response)
             for row in result:

@@ -76,6 +76,7 @@ def test_models_of_earlier_versions_have_the_slope_on_the_labels() -> None:
         assert channel.pop("explained") == pytest.approx(1.0 / (1.0 + (MOVED / 0.1) ** 2), abs=0.05)
     earlier = ReadingModel.from_json(document)
     assert math.isnan(earlier.explained[0])
+    assert earlier.to_json() == document
     slow = [reading_statistics(swing(seed, 0.4), [earlier])["reading gain/control/all"] for seed in range(10)]
     assert np.mean(slow) < 0.85
 
@@ -141,6 +142,12 @@ def test_a_gain_changes_the_slopes_on_both_changes(slope: float, response: float
     assert row == {names[0]: pytest.approx(expected), "nees/x/all": 2.0}
     assert sorted(healthy.statistics) == [names[0], "nees/x/all"]
     assert healthy.statistics[names[0]] == pytest.approx(1.1)
+
+
+def test_components_that_never_move_have_no_slope() -> None:
+    columns = {f"dynamics {kind}/x/all": np.full(20, math.nan) for kind in ("slope", "response")}
+    healthy, (row,) = with_slopes(HealthyProfile("", 20, None, columns), [dict.fromkeys(columns, math.nan)])
+    assert list(row) == list(healthy.statistics) == ["dynamics slope/x/all"]
 
 
 def test_records_of_earlier_versions_have_the_slope_alone() -> None:
