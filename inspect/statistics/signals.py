@@ -69,6 +69,18 @@ NORMAL_MAD = 0.6745
 """Median absolute deviation of the standard normal distribution."""
 
 
+def nearer_slope(slope: Array | float, opposite: Array | float, expected: Array | float) -> Array:
+    """The slope of two that is nearer to an expected one, which is taken if it is between them.
+
+    Noise in one of two signals flattens one of their regressions, the more the less they vary; a factor changes both.
+
+    Args:
+        opposite: slope by the regression in the other direction, where both are equal without noise; NaN if unknown.
+    """
+    other = np.where(np.isfinite(opposite), opposite, slope)
+    return np.where(np.less(slope, expected), np.clip(other, slope, expected), np.clip(other, expected, slope))
+
+
 def robust_line(values: Array, at: Mask) -> tuple[Array, Array]:
     """Level at step 0 and slope per step of values (T, d) over the steps ``at`` (T,), each (d,).
 

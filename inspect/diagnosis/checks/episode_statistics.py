@@ -14,6 +14,7 @@ from beliefscope.inspect.diagnosis.checks.modules import model_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.statistics.reading_model import ReadingModel
+from beliefscope.inspect.statistics.signals import nearer_slope
 from beliefscope.inspect.trace import Trace
 
 SCATTER = {
@@ -65,29 +66,22 @@ def with_slopes(
     """The profile and the episodes' statistics with slopes that neither noise nor the size of the motion changes.
 
     Process noise in the true changes decreases ``dynamics response``, noise in the controls the inverse of
-    ``dynamics slope``, both the more the slower the motion. A wrong gain changes both by its factor. So the slope is
-    that of the two which is nearer to the healthy one, relative to the healthy medians, or the healthy one between
-    them. The responses are left out.
+    ``dynamics slope``: the slope is the ``nearer_slope`` of the two to the healthy one, the responses being relative to
+    their healthy median. They are left out.
     """
     columns, result = dict(profile.statistics), [dict(row) for row in rows]
     for name in [name for name in columns if name.startswith("dynamics response/")]:
         slope = name.replace("response", "slope", 1)
         if slope in columns and (np.isfinite(columns[slope]) & np.isfinite(columns[name])).any():
             middle, of_response = (float(np.nanmedian(columns[n])) for n in (slope, name))
-            columns[slope] = _nearer(columns[slope], columns[name], middle, of_response)
+            ratio = middle / of_response if of_response else np.nan
+            columns[slope] = nearer_slope(columns[slope], columns[name] * ratio, middle)
             for row in result:
-                row[slope] = float(_nearer(row.get(slope, np.nan), row.get(name, np.nan), middle, of_response))
+                row[slope] = float(nearer_slope(row.get(slope, np.nan), row.get(name, np.nan) * ratio, middle))
         del columns[name]
         for row in result:
             row.pop(name, None)
     return replace(profile, statistics=columns), result
-
-
-def _nearer(slope: float | Array, response: float | Array, middle: float, of_response: float) -> Array:
-    """The slope, or a response times the ratio of their healthy values, if it is nearer to the healthy ``middle``."""
-    other = np.asarray(response) * (middle / of_response) if abs(of_response) > 0.0 else np.nan
-    other = np.where(np.isfinite(other), other, slope)
-    return np.where(np.less(slope, middle), np.clip(other, slope, middle), np.clip(other, middle, slope))
 
 
 def with_scatter(

@@ -27,6 +27,7 @@ from beliefscope.inspect.statistics.signals import (
     drifting_lag,
     fitted_lag,
     largest_lag,
+    nearer_slope,
 )
 
 MAX_CHANNELS = 24
@@ -219,9 +220,8 @@ def biased_interval(subject: str, episode: Episode, models: Sequence[ReadingMode
 def _pairs(compared: ComparedReadings, delay: int) -> tuple[Array, Array]:
     """``ComparedReadings.pairs``; those of controls with a slope that the size of the motion does not change.
 
-    Process noise in the labels flattens the slope of the controls on the expected ones, the more the less they vary.
-    It does not change the opposite slope, of the expected controls on the others, which the noise of measured controls
-    flattens. A scale changes both: the slope is that of the two which is nearer to 1, or 1 between them.
+    Process noise in the labels flattens the slope of the controls on the expected ones, noise of measured controls the
+    opposite one: see ``nearer_slope``.
     """
     readings, expected = compared.pairs(delay)
     if compared.model.key != CONTROL or not len(readings):
@@ -230,8 +230,7 @@ def _pairs(compared: ComparedReadings, delay: int) -> tuple[Array, Array]:
     product = (x * y).sum(0)
     slope = product / np.maximum(np.square(x).sum(0), 1e-24)
     other = compared.model.explained * np.square(y).sum(0) / np.where(product > 0.0, product, np.nan)
-    nearer = np.where(slope < 1.0, np.clip(other, slope, 1.0), np.clip(other, 1.0, slope))
-    return readings + np.where(np.isnan(other), 0.0, nearer - slope) * x, expected
+    return readings + (nearer_slope(slope, other, 1.0) - slope) * x, expected
 
 
 def _short_delay(compared: ComparedReadings) -> float:
